@@ -1,0 +1,119 @@
+"""``python -m fitting SWEEP.csv``: Prony parameters, with their uncertainty, from a measured frequency sweep."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from liverjax.errors import InputError
+
+
+def _modes(text: str) -> int | str:
+    if text == "auto":
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m fitting",
+        description="Identify a generalised Maxwell (Prony) model from a rheometer's frequency sweep.",
+        epilog="Exit code 0: done; 1: the fit did not converge (its best point is kept, marked); 2: unusable input.",
+    )
+    parser.add_argument("sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text")
+    parser.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
+    parser.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
+    parser.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
+    parser.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
+    parser.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
+    parser.add_argument("--steps", type=int, default=50, help="time steps a cycle of the simulation (default 50)")
+    parser.add_argument("--scheme", choices=("exponential", "chapter"), default="exponential", help="Prony recursion")
+    parser.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
+    parser.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
+    parser.add_argument(
+        "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
+    )
+    return parser
+
+
+def _progress(sweep_size: int):
+    """A bar on standard error, silent when that is not a terminal."""
+    from tqdm import tqdm
+
+    bar = tqdm(desc=f"torsion simulation of {sweep_size} frequencies", unit=" evaluations", disable=None, leave=False)
+
+    def update(iteration: int, cost: float) -> None:
+        bar.set_postfix(cost=f"{cost:.4g}")
+        bar.update()
+
+    return update, bar
+
+
+def identify(options: argparse.Namespace) -> int:
+    """Run the fit that the options ask for; the exit code."""
+    from fitting import fit, prony, report, rheometer, uncertainty
+    from liverjax import laws
+
+    if options.out.exists() and not options.out.is_dir():
+        raise InputError(f"--out {options.out} is a file: name a folder for the results")
+    for name in ("radius", "height"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value < 10:
+            raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} 0.004")
+    if not 4 <= options.steps <= 10000:
+        raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
+    laws.find(options.law)
+    sweep = rheometer.read_sweep(options.sweep)
+    for note in sweep.notes:
+        print(f"note: {note}", file=sys.stderr)
+    if options.modes != "auto":
+        fit.check_modes(sweep, options.modes)
+    dense = prony.refuse_impossible(sweep)
+    if options.modes == "auto":
+        closed = fit.choose_modes(sweep, dense, options.optimizer)[0]
+    else:
+        closed = fit.closed_form(sweep, options.modes, dense, options.optimizer)
+    fits = [closed]
+    if options.method == "torsion":
+        simulation = fit.Simulation(
+            radius=options.radius or fit.Simulation().radius,
+            height=options.height or fit.Simulation().height,
+            law=options.law,
+            scheme=options.scheme,
+            steps=options.steps,
+        )
+        update, bar = _progress(len(sweep.angular_frequency))
+        with bar:
+            fits.append(fit.through_torsion(sweep, closed, simulation, options.optimizer, update))
+    profile = None
+    if options.profile:
+        profile = uncertainty.profile_intervals(closed.solution, sweep, closed.uncertainty)
+    try:
+        report.write(options.out, sweep, fits, profile)
+    except OSError as error:
+        raise InputError(f"--out {options.out}: {error.strerror}; name a folder that can be written") from None
+    print(report.table(sweep, fits))
+    if profile is not None:
+        for name, (low, high) in profile.items():
+            ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
+            print(f"profile 95 %: {name} from {ends[0]} to {ends[1]}")
+    for sentence in fits[-1].warnings:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/fit.json, fit.png, fit.h5")
+    return 0 if fits[-1].converged else 1
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        return identify(options)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

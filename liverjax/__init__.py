@@ -1,0 +1,44 @@
+"""liverjax: soft-tissue mechanics as one differentiable JAX program.
+
+Importing turns on JAX's 64-bit mode unless the environment sets ``JAX_ENABLE_X64``.
+"""
+
+import os
+
+import jax
+
+if jax.__version__ in ("0.10.2", "0.11.0"):
+    raise ImportError(
+        f"jax {jax.__version__} silently miscompiles element loops on CPU: install another release, "
+        "e.g. pip install 'jax!=0.10.2,!=0.11.0'"
+    )
+if "JAX_ENABLE_X64" not in os.environ:
+    jax.config.update("jax_enable_x64", True)
+
+from liverjax import laws, mjed, reference, shapes, viscosity
+from liverjax.errors import InputError
+from liverjax.laws import Law
+from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
+from liverjax.struct import param, static, struct
+from liverjax.viscosity import Prony
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "InputError",
+    "Law",
+    "Prony",
+    "TetMesh",
+    "check_mesh",
+    "laws",
+    "mjed",
+    "param",
+    "read_mesh",
+    "reference",
+    "shapes",
+    "static",
+    "struct",
+    "tet_mesh",
+    "viscosity",
+    "write_mesh",
+]

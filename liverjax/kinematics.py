@@ -1,0 +1,119 @@
+"""Deformation gradients and invariants, every component an array over the elements.
+
+A vector is a tuple of three arrays and a matrix a tuple of three such rows, each array of shape (E,). Written out
+like this XLA vectorises over elements; batched 3 x 3 products would not (tiny matrices, no fusion).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+Vector = tuple[Any, Any, Any]
+Matrix = tuple[Vector, Vector, Vector]
+
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Invariants(NamedTuple):
+    """What a strain energy may depend on, each of shape (E,); `None` where the law does not ask for it."""
+
+    I1: Any = None
+    I2: Any = None
+    J: Any = None
+
+
+def dot(a: Vector, b: Vector) -> Any:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def add(*vectors: Vector) -> Vector:
+    """Sum of vectors."""
+    return tuple(sum(c[1:], c[0]) for c in zip(*vectors, strict=True))
+
+
+def scale(s: Any, a: Vector) -> Vector:
+    """Scalar times vector."""
+    return (s * a[0], s * a[1], s * a[2])
+
+
+def matvec(A: Matrix, v: Vector) -> Vector:
+    """Matrix times vector."""
+    return (dot(A[0], v), dot(A[1], v), dot(A[2], v))
+
+
+def transpose(A: Matrix) -> Matrix:
+    """Transposed matrix."""
+    return tuple(zip(*A, strict=True))
+
+
+def matmul(A: Matrix, B: Matrix) -> Matrix:
+    """Matrix product."""
+    columns = transpose(B)
+    return tuple(tuple(dot(row, c) for c in columns) for row in A)
+
+
+def cofactor(F: Matrix) -> Matrix:
+    """cof F = J F^-T from three cross products of the columns of F: no inverse, finite at J = 0."""
+    c0, c1, c2 = transpose(F)
+    return transpose((cross(c1, c2), cross(c2, c0), cross(c0, c1)))
+
+
+def determinant(F: Matrix) -> Any:
+    """J = det F."""
+    c0, c1, c2 = transpose(F)
+    return dot(c0, cross(c1, c2))
+
+
+def right_cauchy_green(F: Matrix) -> Matrix:
+    """C = F^T F, its six entries computed once."""
+    c = transpose(F)
+    xx, yy, zz, xy, xz, yz = (dot(c[a], c[b]) for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+
+def invariants(names: tuple[str, ...], F: Matrix, C: Matrix | None) -> Invariants:
+    """The invariants in `names` and no other. `C` is needed for I2 only."""
+    values = {}
+    if "I1" in names or "I2" in names:
+        values["I1"] = sum(dot(row, row) for row in F)
+    if "I2" in names:
+        trace_C2 = sum(dot(row, row) for row in C)
+        values["I2"] = 0.5 * (values["I1"] * values["I1"] - trace_C2)
+    if "J" in names:
+        values["J"] = determinant(F)
+    return Invariants(**{n: values[n] for n in names})
+
+
+def unpack(F: jax.Array) -> Matrix:
+    """Array (..., 3, 3) to a tuple matrix of arrays (...)."""
+    return tuple(tuple(F[..., i, j] for j in range(3)) for i in range(3))
+
+
+def pack(A: Matrix) -> jax.Array:
+    """Tuple matrix of arrays (...) to an array (..., 3, 3)."""
+    return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in A], axis=-2)
+
+
+def node_values(x: jax.Array, tetrahedra: jax.Array) -> tuple[Vector, Vector, Vector, Vector]:
+    """Values (V, 3) at the four nodes of every element."""
+    return tuple(tuple(x[:, c][tetrahedra[:, a]] for c in range(3)) for a in range(4))
+
+
+def deformation_gradient(mesh, x: jax.Array) -> Matrix:
+    """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, since the shape vectors of an element add up to zero.
+
+    Args:
+        mesh: `TetMesh`.
+        x: current positions (V, 3) [m]. A difference of displacements works as well (the gradient of a field).
+    """
+    x0, *others = node_values(x, mesh.tetrahedra)
+    edges = [tuple(a - b for a, b in zip(node, x0, strict=True)) for node in others]
+    D = mesh.shape_vectors
+    return tuple(tuple(sum(edges[a][i] * D[a, j] for a in range(3)) for j in range(3)) for i in range(3))

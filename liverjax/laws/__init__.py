@@ -1,0 +1,127 @@
+"""Material laws: Table 1 of the chapter, and how to make one by name."""
+
+import dataclasses
+import difflib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.errors import InputError
+from liverjax.laws.arruda_boyce import ArrudaBoyce
+from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.laws.mooney_rivlin import MooneyRivlin
+from liverjax.laws.neo_hookean import NeoHookean, NeoHookeanCompressible
+from liverjax.laws.saint_venant_kirchhoff import SaintVenantKirchhoff
+from liverjax.laws.volumetric import VOLUMETRIC
+from liverjax.struct import replace
+
+__all__ = [
+    "LAWS",
+    "ArrudaBoyce",
+    "Law",
+    "MooneyRivlin",
+    "NeoHookean",
+    "NeoHookeanCompressible",
+    "SaintVenantKirchhoff",
+    "Sum",
+    "Volumetric",
+    "create",
+    "isochoric_part",
+    "parameters",
+    "scaled",
+    "summands",
+    "typical",
+    "volumetric_part",
+]
+
+#: Name in scene files and command lines -> class.
+LAWS: dict[str, type[Law]] = {
+    "neo_hookean": NeoHookean,
+    "neo_hookean_compressible": NeoHookeanCompressible,
+    "saint_venant_kirchhoff": SaintVenantKirchhoff,
+    "mooney_rivlin": MooneyRivlin,
+    "arruda_boyce": ArrudaBoyce,
+}
+
+
+def find(name: str) -> type[Law]:
+    """The class of a law's name; `InputError` offering the nearest known name."""
+    if name not in LAWS:
+        near = difflib.get_close_matches(name, LAWS, n=1, cutoff=0.3)
+        hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(LAWS)}"
+        raise InputError(f"law {name!r} is not known: {hint}")
+    return LAWS[name]
+
+
+def parameters(law: type[Law] | Law) -> list[dataclasses.Field]:
+    """The numeric fields of a law, in order, with their `unit`, bounds and `about` in `metadata`."""
+    return [f for f in dataclasses.fields(law) if not f.metadata.get("static")]
+
+
+def create(name: str, **values: Any) -> Law:
+    """A law by its name, its parameters checked against their bounds.
+
+    Args:
+        name: a key of `LAWS`.
+        values: parameters in the units that ``python -m liverjax laws`` lists; sequences become tuples.
+
+    Raises:
+        InputError: unknown law or parameter, missing or out-of-bounds value.
+    """
+    cls = find(name)
+    known = {f.name: f for f in dataclasses.fields(cls)}
+    for key in values:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
+            raise InputError(f"law {name} has no parameter {key!r}: did you mean {near[0]}?")
+    for key, field in known.items():
+        if key not in values and field.default is dataclasses.MISSING:
+            raise InputError(f"law {name} needs parameter {key} [{field.metadata.get('unit', '')}]: give {key} = …")
+    for key, value in values.items():
+        _check_value(f"law {name}: {key}", known[key].metadata, value)
+    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+def _check_value(where: str, metadata: Any, value: Any) -> None:
+    if metadata.get("static"):
+        if value not in VOLUMETRIC:
+            raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")
+        return
+    if value is None:
+        return
+    try:
+        numbers = np.atleast_1d(np.asarray(value, dtype=float))
+    except (TypeError, ValueError):
+        raise InputError(f"{where} = {value!r} is not a number: give a value in {metadata['unit']}") from None
+    above, lower, upper = metadata.get("above"), metadata.get("lower"), metadata.get("upper")
+    if not np.all(np.isfinite(numbers)):
+        raise InputError(f"{where} = {value} is not finite: give a number in {metadata['unit']}")
+    if above is not None and np.any(numbers <= above):
+        raise InputError(f"{where} = {value} must be above {above:g} {metadata['unit']}: give a larger value")
+    if lower is not None and np.any(numbers < lower):
+        raise InputError(f"{where} = {value} must be at least {lower:g} {metadata['unit']}: give a larger value")
+    if upper is not None and np.any(numbers > upper):
+        raise InputError(f"{where} = {value} must be at most {upper:g} {metadata['unit']}: give a smaller value")
+
+
+def typical(name: str) -> Law:
+    """The law with the parameters of a soft tissue of 770 Pa ground-state shear modulus (synthetic, not fitted)."""
+    values = {f.name: f.metadata["typical"] for f in parameters(find(name))}
+    law = find(name)(**values)
+    return scaled(law, 770.0 / law.shear_modulus())
+
+
+def scaled(law: Law, factor: Any) -> Law:
+    """The law with its energy times `factor`: every parameter in Pa is multiplied, every other one kept."""
+
+    def one(s: Law) -> Law:
+        moduli = {f.name: getattr(s, f.name) for f in parameters(s) if f.metadata["unit"] == "Pa"}
+        return replace(s, **{k: _times(v, factor) for k, v in moduli.items() if v is not None})
+
+    parts = tuple(one(s) for s in summands(law))
+    return parts[0] if len(parts) == 1 else Sum(laws=parts)
+
+
+def _times(value: Any, factor: Any) -> Any:
+    return tuple(v * factor for v in value) if isinstance(value, tuple) else jnp.multiply(value, factor)

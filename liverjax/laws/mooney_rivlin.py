@@ -1,0 +1,76 @@
+"""Generalised Mooney-Rivlin up to third order."""
+
+from typing import Any, ClassVar
+
+from liverjax.laws.base import Law
+from liverjax.struct import param, static, struct
+
+_POWERS = {"c10": (1, 0), "c01": (0, 1), "c20": (2, 0), "c11": (1, 1), "c02": (0, 2)} | {
+    "c30": (3, 0),
+    "c21": (2, 1),
+    "c12": (1, 2),
+    "c03": (0, 3),
+}
+
+
+def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Any:
+    """coefficient * prod x^n without a power of zero (whose derivative is not a number)."""
+    value = coefficient
+    for x, n in factors:
+        for _ in range(n):
+            value = value * x
+    return value
+
+
+@struct
+class MooneyRivlin(Law):
+    """W = sum c_ij (Ibar1 - 3)^i (Ibar2 - 3)^j + U(J), i + j <= 3.
+
+    Chapter, Table 1. Coefficients that are not given do not exist: they cost nothing and cannot be fitted.
+    """
+
+    c10: Any = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
+    c01: Any = param("Pa", "coefficient of (Ibar2 - 3)", typical=85.0)
+    c20: Any = param("Pa", "coefficient of (Ibar1 - 3)^2", default=None)
+    c11: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)", default=None)
+    c02: Any = param("Pa", "coefficient of (Ibar2 - 3)^2", default=None)
+    c30: Any = param("Pa", "coefficient of (Ibar1 - 3)^3", default=None)
+    c21: Any = param("Pa", "coefficient of (Ibar1 - 3)^2 (Ibar2 - 3)", default=None)
+    c12: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)^2", default=None)
+    c03: Any = param("Pa", "coefficient of (Ibar2 - 3)^3", default=None)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static("quadratic", "quadratic, log or simo")
+    invariants: ClassVar = ("I1", "I2", "J")
+
+    def _terms(self):
+        return [(getattr(self, name), i, j) for name, (i, j) in _POWERS.items() if getattr(self, name) is not None]
+
+    def isochoric_energy(self, I1, I2):
+        """Polynomial in the deviations from rest."""
+        a, b = I1 - 3, I2 - 3
+        return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self._terms())
+
+    def isochoric_derivatives(self, I1, I2):
+        """Derivatives of the monomials; terms that vanish identically are left out."""
+        a, b = I1 - 3, I2 - 3
+        first, second = {}, {}
+
+        def put(table, key, value):
+            table[key] = table[key] + value if key in table else value
+
+        for c, i, j in self._terms():
+            if i:
+                put(first, "I1", c * _monomial(i, (a, i - 1), (b, j)))
+            if j:
+                put(first, "I2", c * _monomial(j, (a, i), (b, j - 1)))
+            if i > 1:
+                put(second, ("I1", "I1"), c * _monomial(i * (i - 1), (a, i - 2), (b, j)))
+            if i and j:
+                put(second, ("I1", "I2"), c * _monomial(i * j, (a, i - 1), (b, j - 1)))
+            if j > 1:
+                put(second, ("I2", "I2"), c * _monomial(j * (j - 1), (a, i), (b, j - 2)))
+        return first, second
+
+    def shear_modulus(self):
+        """2 (c10 + c01) [Pa]."""
+        return 2 * (self.c10 + self.c01)

@@ -1,0 +1,66 @@
+"""Neo-Hookean laws: Table 1 of the chapter (with C1 = mu/2) and the plain compressible form."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from liverjax.laws.base import Law
+from liverjax.struct import param, static, struct
+
+
+@struct
+class NeoHookean(Law):
+    """W = mu/2 (Ibar1 - 3) + U(J).
+
+    Chapter, Table 1 (C1 = mu/2), written on isochoric invariants for compressible tetrahedra.
+    """
+
+    mu: Any = param("Pa", "shear modulus", above=0.0, typical=770.0)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static("quadratic", "quadratic, log or simo")
+    invariants: ClassVar = ("I1", "J")
+
+    def isochoric_energy(self, I1, I2):
+        """mu/2 (Ibar1 - 3)."""
+        return 0.5 * self.mu * (I1 - 3)
+
+    def isochoric_derivatives(self, I1, I2):
+        """Constant slope."""
+        return {"I1": 0.5 * self.mu}, {}
+
+    def shear_modulus(self):
+        """mu [Pa]."""
+        return self.mu
+
+
+@struct
+class NeoHookeanCompressible(Law):
+    """W = mu/2 (I1 - 3) - mu ln J + lambda/2 ln^2 J.
+
+    The compressible form of the literature (Bonet and Wood 2008, eq. 6.27), infinite at J = 0.
+    """
+
+    mu: Any = param("Pa", "shear modulus", above=0.0, typical=770.0)
+    lame_lambda: Any = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
+    invariants: ClassVar = ("I1", "J")
+
+    def strain_energy(self, I):
+        """Whole energy."""
+        ln = jnp.log(I.J)
+        return 0.5 * self.mu * (I.I1 - 3) - self.mu * ln + 0.5 * self.lame_lambda * ln**2
+
+    def energy_derivatives(self, I):
+        """W_1 = mu/2, W_J = (lambda ln J - mu)/J, W_JJ = (lambda (1 - ln J) + mu)/J^2."""
+        ln = jnp.log(I.J)
+        inverse_J = 1 / I.J
+        slope = (self.lame_lambda * ln - self.mu) * inverse_J
+        curvature = (self.lame_lambda * (1 - ln) + self.mu) * inverse_J * inverse_J
+        return {"I1": 0.5 * self.mu, "J": slope}, {("J", "J"): curvature}
+
+    def shear_modulus(self):
+        """mu [Pa]."""
+        return self.mu
+
+    def bulk_modulus(self):
+        """lambda + 2/3 mu [Pa]."""
+        return self.lame_lambda + 2 / 3 * self.mu

@@ -1,0 +1,37 @@
+"""Saint Venant-Kirchhoff."""
+
+from typing import Any, ClassVar
+
+from liverjax.laws.base import Law
+from liverjax.struct import param, struct
+
+
+@struct
+class SaintVenantKirchhoff(Law):
+    """W = lambda/2 (tr E)^2 + mu tr E^2.
+
+    Chapter, Table 1: tr E = (I1 - 3)/2 and tr E^2 = (I1^2 - 2 I2 - 2 I1 + 3)/4, so J does not enter at all. Softens and
+    collapses in compression (stretch below about 0.6).
+    """
+
+    mu: Any = param("Pa", "second Lame coefficient, the shear modulus", above=0.0, typical=770.0)
+    lame_lambda: Any = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
+    invariants: ClassVar = ("I1", "I2")
+
+    def strain_energy(self, I):
+        """Whole energy, as a form of deviations from rest (nothing large cancels)."""
+        a, b = I.I1 - 3, I.I2 - 3
+        return self.lame_lambda / 8 * a * a + self.mu / 4 * (a * a + 4 * a - 2 * b)
+
+    def energy_derivatives(self, I):
+        """W_1 = lambda/4 (I1 - 3) + mu/2 (I1 - 1), W_2 = -mu/2, W_11 = lambda/4 + mu/2."""
+        first = {"I1": 0.25 * self.lame_lambda * (I.I1 - 3) + 0.5 * self.mu * (I.I1 - 1), "I2": -0.5 * self.mu}
+        return first, {("I1", "I1"): 0.25 * self.lame_lambda + 0.5 * self.mu}
+
+    def shear_modulus(self):
+        """mu [Pa]."""
+        return self.mu
+
+    def bulk_modulus(self):
+        """lambda + 2/3 mu [Pa]."""
+        return self.lame_lambda + 2 / 3 * self.mu

@@ -1,0 +1,32 @@
+"""Volumetric energies U(J) and their two derivatives."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from liverjax.errors import InputError
+
+
+def _quadratic(K, J):
+    return 0.5 * K * (J - 1) ** 2, K * (J - 1), K * jnp.ones_like(J)
+
+
+def _log(K, J):
+    ln = jnp.log(J)
+    return 0.5 * K * ln**2, K * ln / J, K * (1 - ln) / J**2
+
+
+def _simo(K, J):
+    # J^2 - 1 = (J - 1)(J + 1): no cancellation at rest.
+    return 0.25 * K * ((J - 1) * (J + 1) - 2 * jnp.log(J)), 0.5 * K * (J - 1) * (J + 1) / J, 0.5 * K * (1 + 1 / J**2)
+
+
+#: Name -> function of (K, J) giving U, U', U'': K/2 (J-1)^2, K/2 ln^2 J, K/4 (J^2 - 1 - 2 ln J).
+VOLUMETRIC = {"quadratic": _quadratic, "log": _log, "simo": _simo}
+
+
+def volumetric(kind: str, K: Any, J: Any) -> tuple[Any, Any, Any]:
+    """U, dU/dJ and d2U/dJ2 [Pa] of bulk modulus K [Pa]; `InputError` for an unknown kind."""
+    if kind not in VOLUMETRIC:
+        raise InputError(f"volumetric = {kind!r} is not known: use one of {', '.join(VOLUMETRIC)}")
+    return VOLUMETRIC[kind](K, J)

@@ -1,0 +1,142 @@
+"""Meshes of linear tetrahedra: positions, constant shape vectors, node sets; read and written by meshio."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.errors import InputError
+from liverjax.struct import param, struct
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+
+
+@struct
+class TetMesh:
+    """Linear tetrahedra with their reference geometry; a pytree whose arrays are leaves.
+
+    Made by `tet_mesh`; `shape_vectors` and `volumes` follow from points and tetrahedra, also under `jax.grad`.
+    """
+
+    points: jax.Array = param("m", "reference positions (V, 3)")
+    tetrahedra: jax.Array = param("1", "node numbers (E, 4), positively oriented")
+    shape_vectors: jax.Array = param("1/m", "D_a = grad N_a of nodes a = 1, 2, 3, shape (3, 3, E); D_0 = -(sum)")
+    volumes: jax.Array = param("m^3", "reference volumes (E,)")
+    node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
+
+    @property
+    def number_of_nodes(self) -> int:
+        """V."""
+        return self.points.shape[0]
+
+    @property
+    def number_of_elements(self) -> int:
+        """E."""
+        return self.tetrahedra.shape[0]
+
+
+def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = None) -> TetMesh:
+    """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`): traceable.
+
+    The shape vectors are the rows of the inverse edge matrix, written as cross products over six times the volume.
+    """
+    points = jnp.asarray(points, dtype=float)
+    tetrahedra = jnp.asarray(tetrahedra, dtype=jnp.int32)
+    corner = points[tetrahedra]
+    e = corner[:, 1:] - corner[:, :1]
+    normals = jnp.stack([jnp.cross(e[:, 1], e[:, 2]), jnp.cross(e[:, 2], e[:, 0]), jnp.cross(e[:, 0], e[:, 1])])
+    six_volumes = (e[:, 0] * normals[0]).sum(-1)
+    sets = {k: jnp.asarray(v, dtype=jnp.int32) for k, v in (node_sets or {}).items()}
+    return TetMesh(
+        points=points,
+        tetrahedra=tetrahedra,
+        shape_vectors=jnp.transpose(normals / six_volumes[None, :, None], (0, 2, 1)),
+        volumes=six_volumes / 6,
+        node_sets=sets,
+    )
+
+
+def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
+    """Refuse a mesh that no simulation can use; host side, before any compile.
+
+    Raises:
+        InputError: no elements, node numbers out of range, positions that are not finite, flat or inverted elements,
+            nodes of no element.
+    """
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    if tets.size == 0:
+        raise InputError(f"{name}: there are no tetrahedra; export a volume mesh, not a surface")
+    if tets.min() < 0 or tets.max() >= len(points):
+        raise InputError(f"{name}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them")
+    if not np.all(np.isfinite(points)):
+        bad = int(np.argwhere(~np.isfinite(points).all(axis=1))[0, 0])
+        raise InputError(f"{name}: the position of node {bad} is {points[bad]}; give finite coordinates")
+    volumes = np.asarray(mesh.volumes)
+    edge = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=-1).max(axis=1)
+    bad = np.flatnonzero(~(volumes > 1e-12 * edge**3))
+    if len(bad):
+        raise InputError(
+            f"{name}: {len(bad)} of {len(tets)} tetrahedra are flat or inverted (first: {bad[0]}, volume "
+            f"{volumes[bad[0]]:.3g} m^3); swap two of their nodes or remesh"
+        )
+    unused = np.setdiff1d(np.arange(len(points)), tets)
+    if len(unused):
+        raise InputError(f"{name}: {len(unused)} nodes belong to no tetrahedron (first: {unused[0]}); remove them")
+
+
+def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
+    """Read any file meshio reads that holds linear tetrahedra; node sets come along.
+
+    Args:
+        path: mesh file.
+        unit: length unit of the file, one of `UNITS`.
+
+    Raises:
+        InputError: unreadable file, no or other-than-linear cells, unit unknown, unusable mesh.
+    """
+    import meshio
+
+    if unit not in UNITS:
+        raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"mesh file {path}: {'is a folder' if path.is_dir() else 'no such file'}; give a mesh file")
+    try:
+        data = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parser meets, some exit
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh"
+        ) from None
+    tets = [block.data for block in data.cells if block.type == "tetra"]
+    if not tets:
+        kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
+        raise InputError(f"mesh file {path}: it holds {kinds} but no linear tetrahedra; export 4-node tetrahedra")
+    mesh = tet_mesh(np.asarray(data.points)[:, :3] * UNITS[unit], np.vstack(tets), _node_sets(data))
+    check_mesh(mesh, f"mesh file {path}")
+    return mesh
+
+
+def _node_sets(data: Any) -> dict[str, np.ndarray]:
+    """meshio's point sets, and integer point data named ``set:NAME`` (how `write_mesh` keeps them in VTU)."""
+    sets = {name: np.asarray(nodes, dtype=np.int32) for name, nodes in (data.point_sets or {}).items()}
+    for name, values in data.point_data.items():
+        if name.startswith("set:"):
+            sets[name.removeprefix("set:")] = np.flatnonzero(values).astype(np.int32)
+    return sets
+
+
+def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any] | None = None) -> None:
+    """Write a mesh [m] with meshio; node sets are kept as 0/1 point data ``set:NAME``, which every format carries."""
+    import meshio
+
+    data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
+    for name, nodes in mesh.node_sets.items():
+        mask = np.zeros(mesh.number_of_nodes, dtype=np.int32)
+        mask[np.asarray(nodes)] = 1
+        data[f"set:{name}"] = mask
+    cells = [("tetra", np.asarray(mesh.tetrahedra))]
+    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data).write(path)

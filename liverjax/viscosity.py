@@ -1,0 +1,166 @@
+"""Prony viscohyperelasticity (chapter, section 4.2): S_v = S_h - sum_k gamma_k, one symmetric tensor of memory a mode.
+
+Both recursions have the form gamma^n = a S^n + c S^(n-1) + b gamma^(n-1):
+
+* ``"exponential"``: exact for a stress linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
+  c = g (q - e), b = e. Second order in dt.
+* ``"chapter"``: backward Euler as printed, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). First order in dt.
+
+The memory advances once an accepted step; inside a step `recall` is a constant.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax import mjed
+from liverjax.errors import InputError
+from liverjax.kinematics import Matrix, matmul
+from liverjax.laws.base import Law, isochoric_part, volumetric_part
+from liverjax.struct import param, static, struct
+
+SCHEMES = ("exponential", "chapter")
+PARTS = ("all", "isochoric")
+_SIX = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+@struct
+class Prony:
+    """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the instantaneous law relaxes to 1 - sum g_k of its stress."""
+
+    ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,)", lower=0.0, upper=1.0)
+    relaxation_times: Any = param("s", "tau_k (N,)", above=0.0)
+    part: str = static("all", "all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)")
+    scheme: str = static("exponential", "exponential or chapter")
+
+
+class History(NamedTuple):
+    """Memory of every element at the end of a step."""
+
+    gamma: jax.Array  # (N, 6, E) [Pa]
+    stress: jax.Array | None  # S^n (6, E) [Pa]; the chapter's scheme does not need it
+
+
+class Recall(NamedTuple):
+    """What the memory contributes to a step, constant during its Newton iterations."""
+
+    past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
+    now: Any  # 1 - sum_k a_k
+
+
+def check(prony: Prony, law: Law) -> None:
+    """Refuse a viscosity that no step can use; host side.
+
+    Raises:
+        InputError: unknown scheme or part, lengths that differ, values out of bounds, ratios adding up to 1 or more,
+            isochoric relaxation of a law without isochoric split.
+    """
+    import numpy as np
+
+    g, tau = np.atleast_1d(np.asarray(prony.ratios, float)), np.atleast_1d(np.asarray(prony.relaxation_times, float))
+    if prony.scheme not in SCHEMES:
+        raise InputError(f"viscosity scheme = {prony.scheme!r} is not known: use one of {', '.join(SCHEMES)}")
+    if prony.part not in PARTS:
+        raise InputError(f"viscosity part = {prony.part!r} is not known: use one of {', '.join(PARTS)}")
+    if g.shape != tau.shape:
+        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one of each a mode")
+    if not (np.all(np.isfinite(tau)) and np.all(tau > 0)):
+        raise InputError(f"viscosity relaxation_times = {tau.tolist()} must be positive and finite: give seconds")
+    if not (np.all(g >= 0) and g.sum() < 1):
+        raise InputError(f"viscosity ratios = {g.tolist()} must be >= 0 and add up to less than 1: lower them")
+    if prony.part == "isochoric" and isochoric_part(law) is None:
+        raise InputError(
+            f"viscosity part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
+            "use part = 'all' or a law with bulk"
+        )
+
+
+def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """a, b, c (N,) of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s]."""
+    g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
+    r = dt / tau
+    if prony.scheme == "chapter":
+        return g * r / (1 + r), 1 / (1 + r), jnp.zeros_like(g)
+    a = g * _one_minus_q(r)
+    return a, jnp.exp(-r), -g * jnp.expm1(-r) - a
+
+
+def _one_minus_q(r: jax.Array) -> jax.Array:
+    """1 - (1 - exp(-r))/r without cancellation: its Taylor series below r = 0.1 (truncation 0.1^10/11!)."""
+    small = jnp.minimum(r, 0.1)
+    series = jnp.zeros_like(r)
+    for k in range(10, 0, -1):
+        series = small / (k + 1) * (1 - series)
+    large = jnp.maximum(r, 0.1)
+    return jnp.where(r < 0.1, series, 1 + jnp.expm1(-large) / large)
+
+
+def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array:
+    """gamma_k / S_h at angular frequency omega [rad/s] on the steady cycle, complex, shape (N, ...).
+
+    With `dt` [s] that of the recursion (the discrete formula, exact for it), without that of continuous time,
+    g/(1 + i omega tau). The modulus is G*/G0 = 1 - sum over modes.
+    """
+    omega = jnp.asarray(omega)
+    g, tau = (jnp.reshape(jnp.asarray(v), (-1,) + (1,) * omega.ndim) for v in (prony.ratios, prony.relaxation_times))
+    if dt is None:
+        return g / (1 + 1j * omega * tau)
+    a, b, c = coefficients(Prony(ratios=g, relaxation_times=tau, scheme=prony.scheme), dt)
+    back = jnp.exp(-1j * omega * dt)
+    return (a + c * back) / (1 - b * back)
+
+
+def initial_history(prony: Prony, number_of_elements: int, dtype: Any = float) -> History:
+    """Memory of a body at rest: zero."""
+    modes = jnp.asarray(prony.ratios).shape[0]
+    gamma = jnp.zeros((modes, 6, number_of_elements), dtype)
+    return History(gamma, None if prony.scheme == "chapter" else jnp.zeros((6, number_of_elements), dtype))
+
+
+def recall(prony: Prony, history: History, dt: Any) -> Recall:
+    """The constant part of the next step's stress, from the memory at its beginning."""
+    a, b, c = coefficients(prony, dt)
+    past = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
+    if history.stress is not None:
+        past = past + jnp.sum(c) * history.stress
+    return Recall(_matrix(past), 1 - jnp.sum(a))
+
+
+def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> History:
+    """Memory at the end of an accepted step with deformation gradient F."""
+    a, b, c = coefficients(prony, dt)
+    S = relaxing_stress(prony, law, F)
+    columns = (slice(None), None, None)
+    gamma = a[columns] * S + b[columns] * history.gamma
+    if history.stress is None:
+        return History(gamma, None)
+    return History(gamma + c[columns] * history.stress, S)
+
+
+def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
+    """The second Piola-Kirchhoff stress that relaxes, (6, E) [Pa]: S_h, or its isochoric part."""
+    s = mjed.state(_relaxing(prony, law), F)
+    S = mjed.second_piola(F, mjed.stress(s))
+    return jnp.stack([S[i][j] for i, j in _SIX])
+
+
+def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
+    """P_v = (1 - sum a) P_h - F past (part "all"), or with the volumetric stress added in full ("isochoric")."""
+    P = mjed.first_piola(_relaxing(prony, law), F)
+    remembered = matmul(F, memory.past)
+    P = tuple(tuple(memory.now * P[i][j] - remembered[i][j] for j in range(3)) for i in range(3))
+    rest = volumetric_part(law) if prony.part == "isochoric" else None
+    if rest is None:
+        return P
+    U = mjed.first_piola(rest, F)
+    return tuple(tuple(P[i][j] + U[i][j] for j in range(3)) for i in range(3))
+
+
+def _relaxing(prony: Prony, law: Law) -> Law:
+    return law if prony.part == "all" else isochoric_part(law)
+
+
+def _matrix(six: jax.Array) -> Matrix:
+    xx, yy, zz, xy, xz, yz = six
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
