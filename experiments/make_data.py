@@ -14,9 +14,11 @@ from fitting.prony import Maxwell, moduli
 DATA = Path(__file__).parent.parent / "data"
 
 LION = """\
-# Storage and loss moduli of lion's mane mushroom "steak" (Hericium erinaceus), a soft fibrous tissue, by oscillatory torsion.
+# Storage and loss moduli of lion's mane mushroom "steak" (Hericium erinaceus), a soft fibrous tissue, in oscillatory
+# torsion.
 # Mean and standard deviation (n - 1) over ten in-plane samples at each of 31 angular frequencies.
-# Instrument: TA Instruments DHR, 8 mm parallel plates (radius 4 mm), gap about {gap:.1f} mm (mean), 25 C, rim strain about 0.25-0.5 %.
+# Instrument: TA Instruments DHR, 8 mm parallel plates (radius 4 mm), mean gap {gap:.1f} mm, 25 C, rim strain about
+# 0.25-0.5 %.
 # Source: raw sweeps of the Living Matter Lab, repository CANN, folder ARTMEAT/LionsManeMushroomSteak/Rheology
 # (doi 10.64898/2026.01.19.700477); this table was computed from them by experiments/make_data.py.
 # Units: rad/s and Pa. Above about 30 rad/s the instrument's inertia begins to show.
@@ -24,8 +26,8 @@ angular_frequency_rad_s,storage_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_Pa
 """
 
 PORCINE = """\
-# MODEL-IMPLIED, not measured: storage and loss moduli of porcine liver that the parameters of data/porcine_liver_prony.toml
-# imply at 16 frequencies, log-spaced from 0.1 to 4 Hz. The measured points exist in print only as a picture.
+# MODEL-IMPLIED, not measured: storage and loss moduli of porcine liver that data/porcine_liver_prony.toml
+# implies at 16 frequencies, log-spaced from 0.1 to 4 Hz. The measured points exist in print only as a picture.
 # Source: Marchesseau, Chatelin, Delingette 2017 (HAL hal-01536406), Table 2 and the generalised Maxwell model of its
 # section 5.2; computed by experiments/make_data.py. Units: Hz and Pa.
 frequency_Hz,storage_modulus_Pa,loss_modulus_Pa

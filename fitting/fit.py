@@ -63,8 +63,8 @@ def check_modes(sweep: Sweep, modes: int) -> None:
         raise InputError(f"--modes {modes} must be at least 1, or auto")
     if modes > largest:
         raise InputError(
-            f"{sweep.source or 'sweep'}: {len(sweep.angular_frequency)} frequencies cannot determine the {2 * modes + 1} "
-            f"parameters of {modes} modes; use at most --modes {largest}"
+            f"{sweep.source or 'sweep'}: {len(sweep.angular_frequency)} frequencies cannot determine the "
+            f"{2 * modes + 1} parameters of {modes} modes; use at most --modes {largest}"
         )
 
 
@@ -109,7 +109,7 @@ def _fit(method, sweep, found, storage, loss, extra, running, compiling, details
 
 
 def identifiable(fit: Fit) -> bool:
-    """Every mode is needed and none has merged: ratios and times known to better than 50 %, times a factor 1.5 apart."""
+    """Every mode is needed and none has merged: parameters known to 50 %, times a factor 1.5 apart."""
     n, u = fit.modes, fit.uncertainty
     known = np.all(u.standard_errors[1:] < 0.5 * u.values[1:])
     tau = u.values[n + 1 :]
@@ -269,7 +269,7 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
     for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):
         if abs(d) > e and abs(d) > 1e-6 * abs(v):
             out.append(
-                f"{name}: the simulation's discretisation moves it by {100 * d / v:.2g} %, more than its standard error "
-                f"({100 * e / v:.2g} %); raise --steps or trust the closed form"
+                f"{name}: the simulation's discretisation moves it by {100 * d / v:.2g} %, more than its "
+                f"standard error ({100 * e / v:.2g} %); raise --steps or trust the closed form"
             )
     return out

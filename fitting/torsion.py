@@ -125,7 +125,7 @@ def rig_from_mesh(
     )
 
 
-# -- kinematics of the rig: generalised coordinates (u of free nodes, lift, arc = radius * angle) ------------------------
+# -- kinematics of the rig: generalised coordinates (u of free nodes, lift, arc = radius * angle) ----------------------
 
 
 def _positions(rig: Rig, u: jax.Array, lift: Any, angle: Any) -> jax.Array:
@@ -276,7 +276,7 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, elastic: _Elasti
         if mass is not None:
             a = _acceleration(motion, x, dt)
             motion = (x, motion[1] + 0.5 * dt * (motion[2] + a), a)
-        u, lift, angle = _unpack(rig, q)
+        _, lift, angle = _unpack(rig, q)
         torque = load[-1] * rig.radius if by_torque else forces(q)[-1] * rig.radius
         return (q, history, motion), (angle, torque, lift, statistics)
 

@@ -160,26 +160,26 @@ def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
     equilibrium = u.values[0] * (1 - g.sum())
     if not equilibrium > 2 * u.equilibrium_error or 1 - g.sum() < 0.01:
         out.append(
-            f"the ratios add up to {g.sum():.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told from zero "
-            "(a fluid); measure at lower frequencies"
+            f"the ratios add up to {g.sum():.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
+            "from zero (a fluid); measure at lower frequencies"
         )
     if modes > int(np.ceil(decades)) + 1:
         out.append(
-            f"the sweep spans {decades:.2g} decades, too short for {modes} modes (about one mode a decade and one more); "
-            "use fewer modes or a wider sweep"
+            f"the sweep spans {decades:.2g} decades, too short for {modes} modes (about one mode a decade and one "
+            "more); use fewer modes or a wider sweep"
         )
     if sweep.storage_sd is not None:
         r = np.asarray(found.residuals)
         actual = float(np.sqrt(np.mean(r**2)))
         if actual < 0.3:
             out.append(
-                f"the fit is {1 / max(actual, 1e-12):.2g} times closer than the given deviations: they are probably the spread "
-                "between samples, common to all frequencies; the standard errors take them as independent noise"
+                f"the fit is {1 / max(actual, 1e-12):.2g} times closer than the given deviations: they are "
+                "probably the spread between samples, common to all frequencies; the standard errors take them as independent noise"
             )
         elif u.noise > 1.5:
             out.append(
-                f"the residuals are {u.noise:.2g} times the given deviations: the model misses something or the deviations "
-                "are too small; the standard errors are enlarged by that factor"
+                f"the residuals are {u.noise:.2g} times the given deviations: the model misses something or the "
+                "deviations are too small; the standard errors are enlarged by that factor"
             )
     return out
 

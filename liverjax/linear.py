@@ -62,7 +62,7 @@ def differentiable_solve(
     tolerance: Any,
     max_iterations: int,
 ) -> jax.Array:
-    """`conjugate_gradients` as a linear map of `b`: its derivatives are further solves, never those of the iterations."""
+    """`conjugate_gradients` as a linear map of `b`: its derivatives are further solves, not those of iterations."""
 
     def solve(matvec, b):
         return conjugate_gradients(matvec, b, precondition, tolerance, max_iterations)[0]

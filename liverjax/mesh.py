@@ -130,7 +130,7 @@ def _node_sets(data: Any) -> dict[str, np.ndarray]:
 
 
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any] | None = None) -> None:
-    """Write a mesh [m] with meshio; node sets are kept as 0/1 point data ``set:NAME``, which every format carries."""
+    """Write a mesh [m] with meshio; node sets are kept as 0/1 point data ``set:NAME``, in formats that carry data."""
     import meshio
 
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
@@ -139,4 +139,6 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any
         mask[np.asarray(nodes)] = 1
         data[f"set:{name}"] = mask
     cells = [("tetra", np.asarray(mesh.tetrahedra))]
-    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data).write(path)
+    # meshio takes .msh for an ANSYS file; in this field it is Gmsh's.
+    file_format = "gmsh" if Path(path).suffix == ".msh" else None
+    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data).write(path, file_format=file_format)

@@ -184,7 +184,7 @@ def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
     forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(3)], *forces]
     columns = []
     for i in range(3):
-        # Chained scatters: concatenated or stacked first, XLA:CPU recomputes the stress for every update (4 times slower).
+        # Chained scatters: after a concatenate XLA:CPU recomputes the stress for every update (4 times slower).
         column = jnp.zeros(mesh.points.shape[0], dtype=mesh.points.dtype)
         for a in range(4):
             column = column.at[mesh.tetrahedra[:, a]].add(forces[a][i])

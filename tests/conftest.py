@@ -1,0 +1,48 @@
+"""Strict numerics for every test: 64 bit, no silent rank promotion; data of other programs where it is present."""
+
+import os
+from pathlib import Path
+
+import jax
+import matplotlib
+import numpy as np
+import pytest
+
+import liverjax as lj
+
+matplotlib.use("Agg")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+ROOT = Path(__file__).parent.parent
+#: Results of other programs and measured data that are not part of the project.
+SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    assert jax.config.jax_enable_x64
+
+
+@pytest.fixture
+def febio() -> Path:
+    """Folder of FEBio's results."""
+    folder = SHARED / "reference" / "febio"
+    if not folder.is_dir():
+        pytest.skip("results of FEBio are not here")
+    return folder
+
+
+@pytest.fixture
+def distorted_box():
+    """A small mesh and positions that stretch, shear and rotate every element differently."""
+    mesh = lj.shapes.box((1.0, 1.2, 0.8), (2, 2, 2))
+    rng = np.random.default_rng(0)
+    A = np.eye(3) + 0.25 * rng.standard_normal((3, 3))
+    x = np.asarray(mesh.points) @ A.T + 0.04 * rng.standard_normal(mesh.points.shape)
+    return mesh, jax.numpy.asarray(x)
+
+
+@pytest.fixture
+def table_2() -> lj.Prony:
+    """Viscosity of the chapter's Table 2."""
+    return lj.Prony(ratios=jax.numpy.array([0.235, 0.333]), relaxation_times=jax.numpy.array([0.27, 0.03]))

@@ -1,0 +1,143 @@
+"""Every shipped law: hand-derived derivatives against automatic differentiation, rest state, bounds, user laws."""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.kinematics import Invariants
+from liverjax.laws.base import autodiff_derivatives
+
+LAWS = {name: lj.laws.typical(name) for name in lj.laws.LAWS}
+LAWS |= {
+    "mooney_rivlin, third order": lj.laws.MooneyRivlin(
+        c10=300.0, c01=85.0, c20=40.0, c11=-7.0, c02=11.0, c30=5.0, c21=3.0, c12=-2.0, c03=1.0, bulk=7700.0
+    ),
+    "neo_hookean, log": lj.laws.NeoHookean(mu=770.0, bulk=7700.0, volumetric="log"),
+    "neo_hookean, simo": lj.laws.NeoHookean(mu=770.0, bulk=7700.0, volumetric="simo"),
+    "neo_hookean, isochoric": lj.laws.NeoHookean(mu=770.0, bulk=None),
+    "sum": lj.laws.NeoHookean(mu=500.0, bulk=700.0) + lj.laws.SaintVenantKirchhoff(mu=100.0, lame_lambda=300.0),
+}
+
+
+def random_gradients(n: int) -> np.ndarray:
+    """Near rigid, stretched to 3, and compressed to J = 0.1, each under random rotations."""
+    rng = np.random.default_rng(1)
+    stretches = np.concatenate(
+        [
+            1 + 1e-4 * rng.standard_normal((n // 4, 3)),
+            rng.uniform(0.4, 3.0, (n // 2, 3)),
+            rng.uniform(0.3, 2.0, (n - n // 4 - n // 2, 3)),
+        ]
+    )
+    flat = n - n // 4 - n // 2
+    stretches[-flat:, 2] = 0.1 / stretches[-flat:, :2].prod(axis=1)  # J = 0.1
+    Q1, Q2 = (np.linalg.qr(rng.standard_normal((n, 3, 3)))[0] for _ in range(2))
+    F = np.einsum("nij,nj,nkj->nik", Q1, stretches, Q2)
+    return F * np.sign(np.linalg.det(F))[:, None, None]
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_stress_and_tangent_against_autodiff(name):
+    law, F = LAWS[name], jnp.asarray(random_gradients(20000))
+    P, A = law.first_piola(F), law.tangent(F)
+    P_ref, A_ref = lj.reference.first_piola(law, F), lj.reference.tangent(law, F)
+    # Relative to the size of the terms that make up an entry: near rest the stress itself is their small difference.
+    size_A = jnp.abs(A_ref).max(axis=(1, 2, 3, 4))
+    size_P = jnp.abs(P_ref).max(axis=(1, 2)) + law.shear_modulus()
+    assert (jnp.abs(P - P_ref).max(axis=(1, 2)) / size_P).max() < 1e-11
+    assert (jnp.abs(A - A_ref).max(axis=(1, 2, 3, 4)) / size_A).max() < 1e-11
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_rest_state_and_stated_moduli(name):
+    law = LAWS[name]
+    I = jnp.eye(3)
+    G, K = law.shear_modulus(), law.bulk_modulus()
+    assert abs(law.energy(I)) < 1e-12 * G
+    assert jnp.abs(law.first_piola(I)).max() < 1e-12 * (G + K)
+    A = law.tangent(I)
+    assert np.isclose(A[0, 1, 0, 1], G, rtol=1e-12)
+    assert np.isclose(A[0, 0, 0, 0], K + 4 / 3 * G, rtol=1e-12)
+    assert np.isclose(A[0, 0, 1, 1], K - 2 / 3 * G, rtol=1e-12, atol=1e-9 * G)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_objective_and_symmetric(name):
+    law, F = LAWS[name], jnp.asarray(random_gradients(64))
+    Q = jnp.asarray(np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0])
+    Q = Q * jnp.sign(jnp.linalg.det(Q))
+    assert np.allclose(law.energy(jnp.einsum("ij,njk->nik", Q, F)), law.energy(F), rtol=1e-9)
+    A = law.tangent(F)
+    assert jnp.abs(A - jnp.transpose(A, (0, 3, 4, 1, 2))).max() < 1e-12 * jnp.abs(A).max()
+
+
+def test_user_law_needs_only_its_energy():
+    @lj.struct
+    class Mine(lj.Law):
+        """W = mu/2 (J^(-2/3) I1 - 3) + bulk/2 (J - 1)^2."""
+
+        mu: Any = lj.param("Pa")
+        bulk: Any = lj.param("Pa")
+        volumetric: str = lj.static("quadratic")
+        invariants: ClassVar = ("I1", "J")
+
+        def strain_energy(self, I):
+            return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + self.bulk / 2 * (I.J - 1) ** 2
+
+    mine, shipped = Mine(mu=770.0, bulk=7700.0), lj.laws.NeoHookean(mu=770.0, bulk=7700.0)
+    F = jnp.asarray(random_gradients(100))
+    assert np.allclose(mine.tangent(F), shipped.tangent(F), rtol=1e-9, atol=1e-9)
+    first, second = autodiff_derivatives(shipped, Invariants(I1=jnp.array([3.5]), J=jnp.array([0.9])))
+    by_hand = shipped.energy_derivatives(Invariants(I1=jnp.array([3.5]), J=jnp.array([0.9])))
+    for key, value in by_hand[1].items():
+        assert np.isclose(second[key][0], value[0], rtol=1e-12)
+    assert np.isclose(first["J"][0], by_hand[0]["J"][0], rtol=1e-12)
+
+
+def test_a_planted_mistake_is_caught():
+    class Wrong(lj.laws.NeoHookean):
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": -0.5 * self.mu}, {}
+
+    wrong = lj.struct(Wrong)(mu=770.0, bulk=7700.0)
+    F = jnp.asarray(random_gradients(8))
+    assert np.abs(wrong.first_piola(F) - lj.reference.first_piola(wrong, F)).max() > 100
+
+
+def test_only_invariants_asked_for_are_computed():
+    # Structure, not multiplication with zero: neo-Hookean never forms C = F^T F nor I2.
+    F = jnp.eye(3)
+    text = str(jax.make_jaxpr(LAWS["neo_hookean"].energy)(F))
+    more = str(jax.make_jaxpr(LAWS["mooney_rivlin"].energy)(F))
+    assert text.count("mul") < more.count("mul")
+    first, second = LAWS["saint_venant_kirchhoff"].energy_derivatives(Invariants(I1=jnp.array(3.0), I2=jnp.array(3.0)))
+    assert "J" not in first and set(second) == {("I1", "I1")}
+
+
+def test_parts_of_a_split_law_add_up():
+    law, F = LAWS["arruda_boyce"], jnp.asarray(random_gradients(16))
+    whole = lj.laws.isochoric_part(law).energy(F) + lj.laws.volumetric_part(law).energy(F)
+    assert np.allclose(whole, law.energy(F), rtol=1e-12)
+    assert lj.laws.isochoric_part(LAWS["saint_venant_kirchhoff"]) is None
+    assert lj.laws.volumetric_part(LAWS["saint_venant_kirchhoff"]) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "sentence"),
+    [
+        ("neo_hokean", {}, "did you mean neo_hookean"),
+        ("neo_hookean", {"mu": 1.0}, "needs parameter bulk"),
+        ("neo_hookean", {"mu": -1.0, "bulk": 1.0}, "must be above 0 Pa"),
+        ("neo_hookean", {"mu": float("nan"), "bulk": 1.0}, "not finite"),
+        ("neo_hookean", {"mu": "soft", "bulk": 1.0}, "not a number"),
+        ("neo_hookean", {"mu": 1.0, "bulck": 1.0}, "did you mean bulk"),
+        ("neo_hookean", {"mu": 1.0, "bulk": 1.0, "volumetric": "cubic"}, "use one of quadratic"),
+    ],
+)
+def test_create_refuses_in_one_sentence(name, values, sentence):
+    with pytest.raises(lj.InputError, match=sentence):
+        lj.laws.create(name, **values)

@@ -1,0 +1,90 @@
+"""Meshes: geometry, conformity, files, refusals."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.kinematics import deformation_gradient, pack
+
+SHAPES = {
+    "box": lambda: lj.shapes.box((1.0, 2.0, 3.0), (2, 3, 4)),
+    "cylinder": lambda: lj.shapes.cylinder(0.01, 0.004, 0.0025),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_generated_mesh_is_conforming(name):
+    mesh = SHAPES[name]()
+    lj.check_mesh(mesh)
+    t = np.asarray(mesh.tetrahedra)
+    faces = np.sort(np.concatenate([t[:, [0, 1, 2]], t[:, [0, 1, 3]], t[:, [0, 2, 3]], t[:, [1, 2, 3]]]), axis=1)
+    count = Counter(map(tuple, faces))
+    assert set(count.values()) == {1, 2}
+    # Euler's formula of a ball's boundary: triangles = 2 * (boundary nodes) - 4.
+    outer = [f for f, n in count.items() if n == 1]
+    assert len(outer) == 2 * len(np.unique(outer)) - 4
+
+
+def test_volumes():
+    assert np.isclose(SHAPES["box"]().volumes.sum(), 6.0, rtol=1e-14)
+    # A regular polygon of 6 n corners: area (6 n / 2) r^2 sin(2 pi / 6 n), approached at second order.
+    for rings, size in ((4, 0.0025), (8, 0.00125)):
+        corners = 6 * rings
+        area = corners / 2 * 1e-4 * np.sin(2 * np.pi / corners)
+        assert np.isclose(lj.shapes.cylinder(0.01, 0.004, size).volumes.sum(), area * 0.004, rtol=1e-13)
+
+
+def test_affine_field_has_its_gradient():
+    mesh = SHAPES["cylinder"]()
+    A = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.05, 0.0, 1.2]])
+    F = pack(deformation_gradient(mesh, jnp.asarray(mesh.points @ A.T)))
+    assert np.abs(np.asarray(F) - A).max() < 1e-12
+
+
+def test_shape_vectors_follow_positions_under_grad():
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    grad = jax.grad(lambda p: lj.tet_mesh(p, mesh.tetrahedra).volumes.sum())(mesh.points)
+    # d(volume)/d(scale) = 3 V.
+    assert np.isclose((grad * mesh.points).sum(), 3.0)
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".msh", ".vtk"])
+def test_files_keep_geometry_and_node_sets(tmp_path, suffix):
+    mesh = SHAPES["box"]()
+    path = tmp_path / f"mesh{suffix}"
+    lj.write_mesh(path, mesh)
+    back = lj.read_mesh(path, unit="mm")
+    assert np.allclose(back.points, 1e-3 * mesh.points, rtol=1e-12)
+    assert np.array_equal(back.tetrahedra, mesh.tetrahedra)
+    assert np.array_equal(back.node_sets["z_max"], mesh.node_sets["z_max"])
+
+
+def _refused(match, make):
+    with pytest.raises(lj.InputError, match=match) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_refusals(tmp_path):
+    points, tets = np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3]])
+    _refused("1 of 1 tetrahedra are flat or inverted", lambda: lj.check_mesh(inverted))
+    _refused("name node 7", lambda: lj.check_mesh(lj.tet_mesh(points, [[0, 1, 2, 7]])))
+    _refused("no tetrahedron", lambda: lj.check_mesh(lj.tet_mesh(np.vstack([points, [5, 5, 5]]), tets)))
+    _refused("finite coordinates", lambda: lj.check_mesh(lj.tet_mesh(points * np.nan, tets)))
+    _refused("no such file", lambda: lj.read_mesh(tmp_path / "none.vtu"))
+    _refused("is a folder", lambda: lj.read_mesh(tmp_path))
+    _refused("unit = 'inch'", lambda: lj.read_mesh(tmp_path / "none.vtu", unit="inch"))
+    (tmp_path / "junk.vtu").write_text("not a mesh")
+    _refused("cannot read it", lambda: lj.read_mesh(tmp_path / "junk.vtu"))
+    (tmp_path / "junk.xyz").write_text("not a mesh")
+    _refused("cannot read it", lambda: lj.read_mesh(tmp_path / "junk.xyz"))
+    _refused("radius = -1", lambda: lj.shapes.cylinder(-1.0, 1.0, 0.1))
+    _refused("cells", lambda: lj.shapes.box((1.0, 1.0, 1.0), (1, 0, 1)))
+    import meshio
+
+    meshio.Mesh(points, [("triangle", tets[:, :3])]).write(tmp_path / "surface.vtu")
+    _refused("holds triangle but no linear tetrahedra", lambda: lj.read_mesh(tmp_path / "surface.vtu"))

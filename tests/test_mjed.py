@@ -1,0 +1,77 @@
+"""MJED on meshes against automatic differentiation, standard finite elements and FEBio."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import mjed, reference
+
+LAWS = list(lj.laws.LAWS)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_force_and_stiffness_against_both_references(name, distorted_box):
+    mesh, x = distorted_box
+    law = lj.laws.typical(name)
+    f, K = mjed.internal_force(mesh, law, x), mjed.stiffness_matrix(mesh, law, x)
+    scale_f, scale_K = np.abs(f).max(), np.abs(K).max()
+    for force in (reference.internal_force, reference.standard_internal_force):
+        assert np.abs(force(mesh, law, x) - f).max() < 1e-11 * scale_f
+    for stiffness in (reference.stiffness_matrix, reference.standard_stiffness_matrix):
+        assert np.abs(stiffness(mesh, law, x) - K).max() < 1e-11 * scale_K
+    assert np.abs(K - K.T).max() < 1e-13 * scale_K
+    assert np.isclose(mjed.energy(mesh, law, x), reference.energy(mesh, law, x), rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_rigid_motion_makes_no_force(name):
+    mesh, law = lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2)), lj.laws.typical(name)
+    Q = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))[0]
+    Q *= np.sign(np.linalg.det(Q))
+    x = np.asarray(mesh.points) @ Q.T + np.array([3.0, -1.0, 2.0])
+    # Roundoff of the positions (4 m) over the cell (0.5 m), times stress scale K and face area 0.25 m^2, 24 faces.
+    limit = 24 * 0.25 * 4 / 0.5 * np.finfo(float).eps * (law.bulk_modulus() + law.shear_modulus())
+    assert np.abs(mjed.internal_force(mesh, law, x)).max() < limit
+
+
+def test_regularised_stiffness_keeps_the_trace(distorted_box):
+    mesh, _ = distorted_box
+    law, x = lj.laws.typical("neo_hookean"), mesh.points * jnp.array([[0.7, 0.9, 0.8]])
+    plain = mjed.element_matrices(mesh, law, x)
+    changed = mjed.element_matrices(mesh, law, x, regularised=True)
+    diagonal = np.arange(0, 144, 13)
+    assert np.allclose(plain[:, diagonal].sum(axis=1), changed[:, diagonal].sum(axis=1), rtol=1e-12)
+    assert np.abs(plain - changed).max() > 1e-2 * np.abs(plain).max()
+
+
+#: FEBio's energies (README of its results): lambda = 3080, mu = 770, k = 7700, U = k/2 ln^2 J.
+FEBIO_LAWS = {
+    "neo-Hookean": lj.laws.NeoHookeanCompressible(mu=770.0, lame_lambda=3080.0),
+    "StVenantKirchhoff": lj.laws.SaintVenantKirchhoff(mu=770.0, lame_lambda=3080.0),
+    "Mooney-Rivlin": lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=7700.0, volumetric="log"),
+}
+
+
+def test_cauchy_stress_against_febio(febio):
+    cases = [m for m in json.loads((febio / "stress_at_F.json").read_text()) if m["material"] in FEBIO_LAWS]
+    assert len(cases) >= 15
+    for case in cases:
+        law = FEBIO_LAWS[case["material"]]
+        F, theirs = jnp.asarray(case["F"]), np.asarray(case["sigma"])
+        ours = law.first_piola(F) @ F.T / jnp.linalg.det(F)
+        assert np.abs(ours - theirs).max() < 1e-11 * law.bulk_modulus()
+        assert np.isclose(law.energy(F), case["W"], rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["neo-Hookean", "Mooney-Rivlin"])
+def test_febio_solution_is_in_equilibrium_here(febio, name):
+    points = np.loadtxt(febio / "cube3_nodes.csv", delimiter=",")
+    tets = np.loadtxt(febio / "cube3_tets.csv", delimiter=",", dtype=int)
+    rows = np.loadtxt(febio / f"a_{name}_nodes.csv", delimiter=",")
+    mesh = lj.tet_mesh(points, tets)
+    f = np.asarray(mjed.internal_force(mesh, FEBIO_LAWS[name], jnp.asarray(points + rows[:, 1:4])))
+    # Internal force = the support's force on the body at held nodes, nothing elsewhere.
+    assert np.abs(f - rows[:, 4:7]).max() < 1e-9 * np.abs(rows[:, 4:7]).max()
