@@ -18,8 +18,7 @@ import numpy as np
 from liverjax import mjed, newton, shapes, viscosity
 from liverjax.errors import InputError
 from liverjax.kinematics import deformation_gradient
-from liverjax.laws import Law
-from liverjax.linear import differentiable_solve
+from liverjax.laws import Law, isochoric_part, volumetric_part
 from liverjax.mesh import TetMesh, tet_mesh
 from liverjax.struct import param, static, struct
 from liverjax.viscosity import Prony
@@ -157,10 +156,10 @@ def _pack(rig: Rig, u: jax.Array, axial: jax.Array, arc: jax.Array) -> jax.Array
 
 
 def _rest_stiffness(rig: Rig, law: Law) -> jax.Array:
-    """Elastic tangent at rest in the rig's coordinates, dense (n, n); used only to precondition."""
+    """Elastic tangent at rest in the rig's coordinates, dense (n, n) [N/m]."""
     mesh = rig.mesh
     V = mesh.points.shape[0]
-    dofs = (3 * mesh.tetrahedra[:, :, None] + jnp.arange(3)).reshape(-1, 12)
+    dofs = (3 * mesh.tetrahedra[:, :, None] + jnp.arange(3)[None, None]).reshape(-1, 12)
     entries = mjed.element_matrices(mesh, law, mesh.points).reshape(-1, 12, 12)
     dense = jnp.zeros((3 * V, 3 * V), mesh.points.dtype).at[dofs[:, :, None], dofs[:, None, :]].add(entries)
     first, n = 3 * rig.bottom, 3 * (V - rig.top)
@@ -175,31 +174,21 @@ def _rest_stiffness(rig: Rig, law: Law) -> jax.Array:
     return jnp.block([[dense[first:n, first:n], K_fp], [K_fp.T, K_pp]])
 
 
-class _Elastic(NamedTuple):
-    """The linear elastic answer of the rig: coordinates per unit arc length, and force per arc length [N/m]."""
+class _Response(NamedTuple):
+    """The linear answer of the rig: coordinates per unit arc length (real or complex), and force per arc length."""
 
     shape: jax.Array  # (n,), its last entry 1
-    stiffness: jax.Array
-    inverse: jax.Array  # of the rest stiffness without the angle (n-1, n-1): a preconditioner, no derivative
-    inverse_full: jax.Array  # with the angle
+    stiffness: jax.Array  # [N/m]
 
 
-def _elastic(rig: Rig, law: Law) -> _Elastic:
-    K = jax.lax.stop_gradient(_rest_stiffness(rig, law))
-    inverse, inverse_full = jnp.linalg.inv(K[:-1, :-1]), jnp.linalg.inv(K)
+def _response(column: jax.Array) -> _Response:
+    """From the displacements that a unit force along the arc causes."""
+    return _Response(column / column[-1], 1 / column[-1])
 
-    def force(q):
-        x = _positions(rig, *_unpack(rig, q))
-        return _pack(rig, *_generalised(rig, x, mjed.internal_force(rig.mesh, law, x)))
 
-    _, product = jax.linearize(force, jnp.zeros(K.shape[0], K.dtype))
-    unit = jnp.zeros(K.shape[0], K.dtype).at[-1].set(1.0)
-    column = product(unit)
-    inner = differentiable_solve(
-        lambda v: product(jnp.append(v, 0.0))[:-1], -column[:-1], lambda r: inverse @ r, 1e-13, 200
-    )
-    shape = jnp.append(inner, 1.0)
-    return _Elastic(shape, product(shape)[-1], inverse, inverse_full)
+def _exact_stiffness(rig: Rig, law: Law) -> Any:
+    """Force per arc length of the true elastic cylinder, pi r^2 G / (2 h) [N/m]."""
+    return jnp.pi * rig.radius**2 * law.shear_modulus() / (2 * rig.height)
 
 
 @jax.jit
@@ -208,11 +197,32 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
 
     Moduli divided by it are free of that bias in the linear range.
     """
-    return _factor(rig, law, _elastic(rig, law))
+    inverse = jnp.linalg.inv(_rest_stiffness(rig, law))
+    return _response(inverse[:, -1]).stiffness / _exact_stiffness(rig, law)
 
 
-def _factor(rig: Rig, law: Law, elastic: _Elastic) -> jax.Array:
-    return elastic.stiffness * rig.radius**2 / (jnp.pi * rig.radius**4 * law.shear_modulus() / (2 * rig.height))
+class _Linearised(NamedTuple):
+    """The rig at rest, before any frequency is known."""
+
+    inverse: jax.Array  # of the elastic stiffness (n, n)
+    isochoric: jax.Array | None  # the part of the stiffness that relaxes and the part that does not, where they differ
+    volumetric: jax.Array | None
+
+
+def _linearise(rig: Rig, law: Law, prony: Prony | None) -> _Linearised:
+    if prony is None or prony.part == "all":
+        return _Linearised(jnp.linalg.inv(_rest_stiffness(rig, law)), None, None)
+    isochoric, volumetric = (_rest_stiffness(rig, part(law)) for part in (isochoric_part, volumetric_part))
+    return _Linearised(jnp.linalg.inv(isochoric + volumetric), isochoric, volumetric)
+
+
+def _steady(rest: _Linearised, modulus: Any) -> _Response:
+    """Response on the steady cycle where the relaxing stress is `modulus` times the elastic one (complex)."""
+    if rest.isochoric is None:
+        elastic = _response(rest.inverse[:, -1])
+        return _Response(elastic.shape, elastic.stiffness * modulus)
+    K = modulus * rest.isochoric + rest.volumetric
+    return _response(jnp.linalg.solve(K, jnp.zeros(K.shape[0], K.dtype).at[-1].set(1.0)))
 
 
 def torque_for_strain(rig: Rig, modulus: Any, strain: Any) -> Any:
@@ -223,20 +233,21 @@ def torque_for_strain(rig: Rig, modulus: Any, strain: Any) -> Any:
 # -- time stepping -----------------------------------------------------------------------------------------------------
 
 
-def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, elastic: _Elastic) -> Run:
+def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearised) -> tuple[Run, jax.Array]:
+    """The run, and the bias of the mesh at this frequency (complex where only the isochoric part relaxes)."""
     mesh, by_torque = rig.mesh, drive.by == "torque"
     n_steps = drive.steps * drive.cycles
     dt = 2 * jnp.pi / (omega * drive.steps)
-    k = elastic.stiffness
     modulus = 1.0 if prony is None else 1 - jnp.sum(viscosity.complex_ratios(prony, omega, dt), axis=0)
+    steady = _steady(rest, modulus)
     # A sin(w t) = Re(-i A e^(i w t)); the complex arc of the linearised discrete problem.
-    arc = -1j * amplitude * (1 / (k * rig.radius * modulus) if by_torque else rig.radius)
-    inverse = elastic.inverse_full if by_torque else elastic.inverse
+    arc = -1j * amplitude * (1 / (steady.stiffness * rig.radius) if by_torque else rig.radius)
+    inverse = jax.lax.stop_gradient(rest.inverse if by_torque else _without_last(rest.inverse))
     mass = None if rig.density is None else _nodal_mass(mesh, rig.density)
 
     def predicted(t):
         """Coordinates of the linear solution at time t."""
-        return elastic.shape * jnp.real(arc * jnp.exp(1j * omega * t))
+        return jnp.real(steady.shape * (arc * jnp.exp(1j * omega * t)))
 
     def full(q, t):
         return q if by_torque else jnp.append(q, rig.radius * amplitude * jnp.sin(omega * t))
@@ -266,7 +277,7 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, elastic: _Elasti
             lambda v: solved_part(forces(full(v, t)) - load),
             solved_part(guess),
             lambda r: inverse @ r,
-            k * jnp.abs(arc),
+            jnp.abs(steady.stiffness * arc),
             drive.options,
         )
         q = full(q, t)
@@ -280,45 +291,53 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, elastic: _Elasti
         torque = load[-1] * rig.radius if by_torque else forces(q)[-1] * rig.radius
         return (q, history, motion), (angle, torque, lift, statistics)
 
-    q, history, motion = _initial(rig, law, prony, omega, dt, drive, elastic.shape, arc, mass)
+    q, history, motion = _initial(rig, law, prony, omega, dt, drive, steady.shape, arc, mass)
     times = dt * jnp.arange(1, n_steps + 1)
     _, (angle, torque, lift, statistics) = jax.lax.scan(step, (q, history, motion), times)
     _, lift_0, angle_0 = _unpack(rig, q)
-    torque_0 = 0.0 if by_torque else rig.radius * k * jnp.real(arc * modulus) * (drive.start == "cycle")
-    return Run(
+    torque_0 = 0.0 if by_torque else rig.radius * jnp.real(steady.stiffness * arc) * (drive.start == "cycle")
+    run = Run(
         jnp.append(0.0, times),
         jnp.append(angle_0, angle),
         jnp.append(torque_0, torque),
         jnp.append(lift_0, lift),
         statistics,
     )
+    return run, steady.stiffness / (modulus * _exact_stiffness(rig, law))
+
+
+def _without_last(inverse: jax.Array) -> jax.Array:
+    """Inverse of a symmetric matrix without its last row and column, from the whole inverse (Schur complement)."""
+    b = inverse[:-1, -1]
+    return inverse[:-1, :-1] - jnp.outer(b, b) / inverse[-1, -1]
 
 
 def _initial(rig, law, prony, omega, dt, drive, shape, arc, mass):
     """Coordinates, memory and motion at time 0: at rest, or on the cycle of the linearised problem."""
     on_cycle = drive.start == "cycle"
     mesh = rig.mesh
-    q = shape * jnp.real(arc) if on_cycle else jnp.zeros_like(shape)
+    q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
     if prony is not None and on_cycle:
 
         def S(q):
             return viscosity.relaxing_stress(prony, law, deformation_gradient(mesh, _positions(rig, *_unpack(rig, q))))
 
-        S_shape = jax.jvp(S, (jnp.zeros_like(q),), (shape,))[1]
-        memory = jnp.real(viscosity.complex_ratios(prony, omega, dt) * arc)
-        gamma = memory[:, None, None] * S_shape
-        history = viscosity.History(gamma, None if history.stress is None else S_shape * jnp.real(arc))
+        _, slope = jax.linearize(S, jnp.zeros_like(q))
+        S_shape = slope(jnp.real(shape * arc)) + 1j * slope(jnp.imag(shape * arc))
+        ratios = viscosity.complex_ratios(prony, omega, dt)
+        gamma = jnp.real(ratios[:, None, None] * S_shape[None])
+        history = viscosity.History(gamma, None if history.stress is None else jnp.real(S_shape))
     motion = None
     if mass is not None:
 
         def positions(q):
             return _positions(rig, *_unpack(rig, q))
 
-        field = jax.jvp(positions, (jnp.zeros_like(q),), (shape,))[1]
+        _, field = jax.linearize(positions, jnp.zeros_like(q))
         on = 1.0 if on_cycle else 0.0
-        velocity, acceleration = jnp.real(1j * omega * arc) * on, jnp.real(-(omega**2) * arc) * on
-        motion = (positions(q), field * velocity, field * acceleration)
+        velocity, acceleration = (field(on * jnp.real(c * shape * arc)) for c in (1j * omega, -(omega**2)))
+        motion = (positions(q), velocity, acceleration)
     return q, history, motion
 
 
@@ -349,7 +368,7 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Any, amplitude: An
         amplitude: [N m] if driven by torque, [rad] if by angle.
         drive: static.
     """
-    return _oscillate(rig, law, prony, omega, amplitude, drive, _elastic(rig, law))
+    return _oscillate(rig, law, prony, omega, amplitude, drive, _linearise(rig, law, prony))[0]
 
 
 def demodulate(run: Run, omega: Any, drive: Drive) -> tuple[jax.Array, jax.Array]:
@@ -372,16 +391,16 @@ def moduli(
 
     Args:
         omega, amplitude: (n,) or numbers, broadcast; see `oscillate`.
-        corrected: divide by `geometry_factor`.
+        corrected: divide by the bias of the mesh, `geometry_factor` (at each frequency its own where only the
+            isochoric part relaxes, since the bulk then weighs more as the modulus falls).
     """
-    elastic = _elastic(rig, law)
+    rest = _linearise(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
-    bias = _factor(rig, law, elastic) if corrected else 1.0
 
     def one(omega, amplitude):
-        run = _oscillate(rig, law, prony, omega, amplitude, drive, elastic)
+        run, bias = _oscillate(rig, law, prony, omega, amplitude, drive, rest)
         torque, angle = demodulate(run, omega, drive)
-        G = 2 * rig.height / (jnp.pi * rig.radius**4) * torque / angle / bias
+        G = 2 * rig.height / (jnp.pi * rig.radius**4) * torque / angle / (bias if corrected else 1.0)
         defect = jnp.abs(run.angle[-1] - run.angle[-1 - drive.steps]) / jnp.abs(angle)
         worst = newton.NewtonStatistics(*(jnp.max(field) for field in run.statistics))
         return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, worst)

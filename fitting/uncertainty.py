@@ -174,7 +174,8 @@ def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
         if actual < 0.3:
             out.append(
                 f"the fit is {1 / max(actual, 1e-12):.2g} times closer than the given deviations: they are "
-                "probably the spread between samples, common to all frequencies; the standard errors take them as independent noise"
+                "probably the spread between samples, common to all frequencies; the standard "
+                "errors take them as independent noise"
             )
         elif u.noise > 1.5:
             out.append(

@@ -82,18 +82,19 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
     r = dt / tau
     if prony.scheme == "chapter":
         return g * r / (1 + r), 1 / (1 + r), jnp.zeros_like(g)
-    a = g * _one_minus_q(r)
-    return a, jnp.exp(-r), -g * jnp.expm1(-r) - a
+    one_minus_q, q_minus_e = _weights(r)
+    return g * one_minus_q, jnp.exp(-r), g * q_minus_e
 
 
-def _one_minus_q(r: jax.Array) -> jax.Array:
-    """1 - (1 - exp(-r))/r without cancellation: its Taylor series below r = 0.1 (truncation 0.1^10/11!)."""
-    small = jnp.minimum(r, 0.1)
+def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """1 - q and q - e without cancellation; below r = 1 by the Taylor series of 1 - q (truncated at 1/20!)."""
+    small, large = jnp.minimum(r, 1.0), jnp.maximum(r, 1.0)
     series = jnp.zeros_like(r)
-    for k in range(10, 0, -1):
+    for k in range(18, 0, -1):
         series = small / (k + 1) * (1 - series)
-    large = jnp.maximum(r, 0.1)
-    return jnp.where(r < 0.1, series, 1 + jnp.expm1(-large) / large)
+    q = -jnp.expm1(-large) / large
+    one_minus_q = jnp.where(r < 1, series, 1 - q)
+    return one_minus_q, jnp.where(r < 1, -jnp.expm1(-small) - series, q - jnp.exp(-large))
 
 
 def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array:
@@ -102,10 +103,12 @@ def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array
     With `dt` [s] that of the recursion (the discrete formula, exact for it), without that of continuous time,
     g/(1 + i omega tau). The modulus is G*/G0 = 1 - sum over modes.
     """
-    omega = jnp.asarray(omega)
-    g, tau = (jnp.reshape(jnp.asarray(v), (-1,) + (1,) * omega.ndim) for v in (prony.ratios, prony.relaxation_times))
+    omega = jnp.asarray(omega)[None]
+    column = (-1,) + (1,) * (omega.ndim - 1)
+    g, tau = (jnp.reshape(jnp.asarray(v), column) for v in (prony.ratios, prony.relaxation_times))
     if dt is None:
         return g / (1 + 1j * omega * tau)
+    dt = jnp.broadcast_to(dt, omega.shape[1:])[None]
     a, b, c = coefficients(Prony(ratios=g, relaxation_times=tau, scheme=prony.scheme), dt)
     back = jnp.exp(-1j * omega * dt)
     return (a + c * back) / (1 - b * back)
@@ -132,10 +135,10 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> His
     a, b, c = coefficients(prony, dt)
     S = relaxing_stress(prony, law, F)
     columns = (slice(None), None, None)
-    gamma = a[columns] * S + b[columns] * history.gamma
+    gamma = a[columns] * S[None] + b[columns] * history.gamma
     if history.stress is None:
         return History(gamma, None)
-    return History(gamma + c[columns] * history.stress, S)
+    return History(gamma + c[columns] * history.stress[None], S)
 
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:

@@ -71,6 +71,7 @@ def _refused(match, make):
 
 def test_refusals(tmp_path):
     points, tets = np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3]])
+    inverted = lj.tet_mesh(points, tets[:, [0, 2, 1, 3]])
     _refused("1 of 1 tetrahedra are flat or inverted", lambda: lj.check_mesh(inverted))
     _refused("name node 7", lambda: lj.check_mesh(lj.tet_mesh(points, [[0, 1, 2, 7]])))
     _refused("no tetrahedron", lambda: lj.check_mesh(lj.tet_mesh(np.vstack([points, [5, 5, 5]]), tets)))

@@ -1,0 +1,85 @@
+"""Linear and nonlinear solvers: residuals, counts, codes, implicit derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax import newton, status
+from liverjax.linear import conjugate_gradients, differentiable_solve
+
+RNG = np.random.default_rng(0)
+_B = RNG.standard_normal((20, 20))
+A = jnp.asarray(_B @ _B.T + 20 * np.eye(20))
+b = jnp.asarray(RNG.standard_normal(20))
+
+
+def _none(r):
+    return r
+
+
+def test_conjugate_gradients_report_what_they_did():
+    x, s = conjugate_gradients(lambda v: A @ v, b, _none, 1e-12, 100)
+    assert np.allclose(A @ x, b, atol=1e-10) and s.iterations <= 21
+    assert np.isclose(s.residual, jnp.linalg.norm(b - A @ x) / jnp.linalg.norm(b))
+    _, s = conjugate_gradients(lambda v: A @ v, b, _none, 1e-12, 3)
+    assert s.iterations == 3 and s.residual > 1e-6
+    exact = jnp.linalg.inv(A)
+    _, s = conjugate_gradients(lambda v: A @ v, b, lambda r: exact @ r, 1e-10, 100)
+    assert s.iterations == 1
+    zero, s = conjugate_gradients(lambda v: A @ v, 0 * b, _none, 1e-10, 100)
+    assert s.iterations == 0 and not zero.any()
+    # An indefinite matrix is noticed instead of followed.
+    _, s = conjugate_gradients(lambda v: -(A @ v), b, _none, 1e-10, 100)
+    assert s.iterations <= 1 and s.residual > 0.1
+
+
+def test_differentiable_solve():
+    def f(scale, b):
+        x = differentiable_solve(lambda v: scale * (A @ v), b, _none, 1e-13, 200)
+        return jnp.sum(x**3)
+
+    def g(scale, b):
+        return jnp.sum(jnp.linalg.solve(scale * A, b) ** 3)
+
+    for argument in (0, 1):
+        assert np.allclose(jax.grad(f, argument)(1.3, b), jax.grad(g, argument)(1.3, b), rtol=1e-9)
+    assert np.isclose(jax.jvp(lambda s: f(s, b), (1.3,), (1.0,))[1], jax.grad(g)(1.3, b), rtol=1e-9)
+
+
+def _solve(p, start=None, **options):
+    """A x + p x^3 = b."""
+    start = jnp.zeros_like(b) if start is None else start
+    settings = newton.NewtonOptions(**({"tolerance": 1e-13} | options))
+    return newton.solve(lambda x: A @ x + p * x**3 - b, start, _none, jnp.linalg.norm(b), settings)
+
+
+def test_newton_converges_and_is_differentiable_both_ways():
+    x, s = _solve(10.0)
+    assert s.status == status.CONVERGED and s.residual <= 1e-13 and 1 <= s.iterations < 10
+    assert np.allclose(A @ x + 10 * x**3, b, atol=1e-11)
+    for p in (0.5, 10.0):
+        by_rule = jax.grad(lambda p: jnp.sum(_solve(p)[0]))(p)
+        forward = jax.jvp(lambda p: jnp.sum(_solve(p)[0]), (p,), (1.0,))[1]
+        H = jnp.linalg.inv(A + jnp.diag(3 * p * _solve(p)[0] ** 2))
+        exact = -jnp.sum(H @ _solve(p)[0] ** 3)
+        assert np.isclose(by_rule, exact, rtol=1e-9) and np.isclose(forward, exact, rtol=1e-9)
+
+
+def test_newton_tells_the_truth_when_it_fails():
+    _, s = _solve(10.0, max_iterations=1, tolerance=1e-16)
+    assert s.status == status.STALLED and "smaller steps" in status.advice(s.status)
+    _, s = newton.solve(lambda x: jnp.log(x), jnp.array([-1.0]), _none, 1.0)
+    assert s.status == status.NOT_FINITE and "inverted" in status.advice(s.status)
+
+
+def test_newton_halves_a_step_that_overshoots():
+    # From 3 the full Newton step for atan leaves every bound.
+    x, s = newton.solve(jnp.arctan, jnp.array([3.0]), _none, 1.0, newton.NewtonOptions(tolerance=1e-12))
+    assert s.status == status.CONVERGED and abs(x[0]) < 1e-12
+
+
+def test_lanes_do_not_disturb_each_other():
+    p = jnp.array([0.1, jnp.nan, 20.0])
+    x, s = jax.vmap(_solve)(p)
+    assert s.status.tolist() == [status.CONVERGED, status.NOT_FINITE, status.CONVERGED]
+    assert np.allclose(x[0], _solve(0.1)[0]) and np.allclose(x[2], _solve(20.0)[0])

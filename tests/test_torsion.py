@@ -1,0 +1,222 @@
+"""The simulated rheometer: discrete and continuous formulas, orders, gradients, other programs, extremes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting import torsion
+from fitting.torsion import Drive
+from liverjax import viscosity
+from liverjax.struct import replace
+
+OMEGA = 2 * np.pi * np.array([0.1, 1.0, 4.0])
+STRAIN = 1e-4
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return torsion.make_rig(cell_size=0.004)
+
+
+@pytest.fixture(scope="module")
+def law():
+    return lj.laws.typical("neo_hookean")
+
+
+@pytest.fixture(scope="module")
+def prony():
+    return lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
+
+
+def _complex(m: torsion.Moduli) -> np.ndarray:
+    return np.asarray(m.storage) + 1j * np.asarray(m.loss)
+
+
+def _discrete(prony, omega, steps):
+    omega = jnp.asarray(omega)
+    return 770 * (1 - np.asarray(viscosity.complex_ratios(prony, omega, 2 * jnp.pi / omega / steps).sum(axis=0)))
+
+
+def _amplitude(rig, by):
+    return torsion.torque_for_strain(rig, 500.0, STRAIN) if by == "torque" else STRAIN * rig.height / rig.radius
+
+
+@pytest.mark.parametrize(("scheme", "by"), [("exponential", "torque"), ("chapter", "torque"), ("exponential", "angle")])
+def test_cycle_answers_the_discrete_formula(rig, law, prony, scheme, by):
+    prony = replace(prony, scheme=scheme)
+    m = torsion.moduli(rig, law, prony, OMEGA, _amplitude(rig, by), Drive(by=by, cycles=3))
+    assert np.abs(_complex(m) / _discrete(prony, OMEGA, 50) - 1).max() < 1e-6
+    assert m.statistics.status.max() == 0 and m.statistics.residual.max() < 1e-9
+    assert m.defect.max() < 1e-6
+    # One cycle is enough for a fit: it starts on the cycle, what is left is of the order of the strain.
+    one = torsion.moduli(rig, law, prony, OMEGA, _amplitude(rig, by), Drive(by=by))
+    assert np.abs(_complex(one) / _discrete(prony, OMEGA, 50) - 1).max() < 0.1 * STRAIN
+
+
+def test_from_rest_the_transient_dies_to_the_same_answer(rig, law, prony):
+    drive = Drive(by="angle", start="rest", cycles=12)
+    m = torsion.moduli(rig, law, prony, OMEGA[1:2], _amplitude(rig, "angle"), drive)
+    assert np.abs(_complex(m) / _discrete(prony, OMEGA[1:2], 50) - 1).max() < 1e-6
+
+
+@pytest.mark.parametrize(("scheme", "order"), [("exponential", 2), ("chapter", 1)])
+def test_observed_order_in_time(rig, law, prony, scheme, order):
+    prony = replace(prony, scheme=scheme)
+    exact = 770 * (1 - viscosity.complex_ratios(prony, OMEGA[2:]).sum(axis=0))
+    errors = []
+    for steps in (25, 50, 100):
+        drive = Drive(by="angle", cycles=2, steps=steps)
+        m = torsion.moduli(rig, law, prony, OMEGA[2:], _amplitude(rig, "angle"), drive)
+        errors.append(abs(_complex(m) - exact)[0])
+    rates = np.log2(np.asarray(errors[:-1]) / np.asarray(errors[1:]))
+    assert np.all(np.abs(rates - order) < 0.15), rates
+
+
+def test_geometry_factor_converges_at_second_order(law):
+    # cell sizes that divide the sample evenly, so that every mesh is twice as fine in each direction
+    excess = [float(torsion.geometry_factor(torsion.make_rig(cell_size=0.004 / n), law)) - 1 for n in (1, 2, 4)]
+    rates = np.log2(np.asarray(excess[:-1]) / np.asarray(excess[1:]))
+    assert excess[-1] < 0.05 and rates[-1] > 1.7, (excess, rates)
+
+
+def test_correction_removes_the_mesh_bias(law, prony):
+    meshes = [torsion.make_rig(cell_size=c) for c in (0.004, 0.0025)]
+    raw, corrected = (
+        [
+            _complex(torsion.moduli(r, law, prony, OMEGA[1:2], _amplitude(r, "torque"), Drive(), corrected=c))[0]
+            for r in meshes
+        ]
+        for c in (False, True)
+    )
+    assert abs(raw[0] / raw[1] - 1) > 0.1
+    assert abs(corrected[0] / corrected[1] - 1) < 0.1 * STRAIN
+
+
+def test_relaxing_the_isochoric_part_alone(rig, law, prony):
+    # Torsion changes no volume, so relaxing the isochoric part alone answers the same formula, once the bias of the
+    # mesh is taken at each frequency (with the elastic one it would be 26 % off on this coarse mesh).
+    m = torsion.moduli(
+        rig, law, replace(prony, part="isochoric"), OMEGA, _amplitude(rig, "angle"), Drive(by="angle", cycles=3)
+    )
+    difference = np.abs(_complex(m) / _discrete(prony, OMEGA, 50) - 1).max()
+    assert difference < 1e-6
+
+
+LAWS_OWN = {"neo_hookean": {"bulk": 1.0}, "mooney_rivlin": {"c10": 1.0, "c01": 1.0}}
+
+
+@pytest.mark.parametrize("name", LAWS_OWN)
+def test_gradients_against_central_differences(rig, name):
+    """V-shaped error curve: falls with the step (truncation), rises again (roundoff), lowest below 1e-6."""
+    base = lj.laws.typical(name)
+    own = list(LAWS_OWN[name])
+    drive = Drive(options=torsion.newton.NewtonOptions(tolerance=1e-12))
+    amplitude = torsion.torque_for_strain(rig, 500.0, 1e-3)
+
+    @jax.jit
+    def moduli(p):
+        law = lj.laws.scaled(base, p[0])
+        law = replace(law, **{k: getattr(law, k) * p[5 + i] for i, k in enumerate(own)})
+        prony = lj.Prony(ratios=p[1:3], relaxation_times=p[3:5])
+        m = torsion.moduli(rig, law, prony, OMEGA[1:], amplitude, drive, corrected=False)
+        return jnp.concatenate([m.storage, m.loss])
+
+    p = jnp.array([1.0, 0.235, 0.333, 0.27, 0.03] + [1.0] * len(own))
+    J = np.asarray(jax.jit(jax.jacfwd(moduli))(p))
+    for k in range(len(p)):
+        errors = []
+        for h in (1e-2, 1e-3, 1e-4, 1e-5, 1e-7):
+            up, down = (moduli(p.at[k].multiply(1 + s * h)) for s in (1, -1))
+            difference = np.asarray(up - down) / (2 * h * float(p[k]))
+            errors.append(np.abs(difference - J[:, k]).max() / np.abs(J[:, k]).max())
+        assert min(errors) < 1e-6, (k, errors)
+        best = int(np.argmin(errors))
+        # The moduli are linear in stiffnesses: there no truncation falls, roundoff alone rises.
+        assert errors[-1] > errors[best] and (errors[0] > errors[best] or errors[0] < 1e-9), (k, errors)
+
+
+def test_reverse_mode_agrees_with_forward_mode(rig, law, prony):
+    def loss(tau):
+        m = torsion.moduli(rig, law, replace(prony, relaxation_times=tau), OMEGA[1:2], _amplitude(rig, "torque"))
+        return m.loss[0]
+
+    tau = prony.relaxation_times
+    assert np.allclose(jax.jit(jax.grad(loss))(tau), jax.jit(jax.jacfwd(loss))(tau), rtol=1e-8)
+
+
+def test_torque_history_against_febio(febio, prony):
+    points, rows = (
+        np.loadtxt(febio / "cyl_nodes.csv", delimiter=","),
+        np.loadtxt(febio / "c_torsion_f1Hz.csv", delimiter=","),
+    )
+    mesh = lj.tet_mesh(points, np.loadtxt(febio / "cyl_tets.csv", delimiter=",", dtype=int))
+    rig = torsion.rig_from_mesh(mesh, 0.010, 0.004)
+    law = lj.laws.NeoHookeanCompressible(mu=770.0, lame_lambda=3080.0)
+    drive = Drive(steps=100, cycles=3, by="angle", start="rest")
+    run = torsion.oscillate(rig, law, prony, 2 * np.pi, 4e-4, drive)
+    assert np.allclose(run.time, rows[:, 0], atol=1e-12)
+    # FEBio turns the plate by u = theta (-y, x, 0), without the cosine: a difference of theta^2/2 = 8e-8.
+    assert np.abs(run.torque - rows[:, 2]).max() < 1e-6 * np.abs(rows[:, 2]).max()
+
+
+def test_inertia_against_the_torsional_wave(law, prony):
+    """A tall sample: M = pi r^4/2 G* k cot(k h) theta, k = omega sqrt(rho/G*); at 41 mm inertia is no small thing."""
+    height, omega = 0.041, 2 * np.pi * 2.0
+    rig = torsion.make_rig(0.010, height, cell_size=0.0035, density=1060.0)
+    drive = Drive(steps=50, cycles=8, by="angle")
+    m = torsion.moduli(rig, law, prony, omega, STRAIN * height / 0.010, drive)
+    G = 770 * (1 - complex(viscosity.complex_ratios(prony, omega).sum()))
+    k = omega * np.sqrt(1060.0 / G)
+    exact = G * k * height / np.tan(k * height)
+    assert abs(exact / G - 1) > 0.15
+    # second-order in time (50 steps) and space (12 layers): about (k h / 12)^2 of the inertial part
+    assert abs(_complex(m)[0] - exact) < 0.02 * abs(G)
+    still = torsion.moduli(replace(rig, density=None), law, prony, omega, STRAIN * height / 0.010, Drive(by="angle"))
+    assert abs(_complex(still)[0] / G - 1) < 5e-3
+
+
+def test_state_holds_only_the_physics_there_is(rig, law, prony):
+    def carried(rig, prony):
+        drive = Drive()
+        mass = None if rig.density is None else jnp.ones(rig.mesh.number_of_nodes)
+        state = torsion._initial(rig, law, prony, 1.0, 0.1, drive, jnp.ones(n), jnp.array(1j), mass)
+        return [leaf.shape for leaf in jax.tree.leaves(state)]
+
+    n, E = 3 * (rig.mesh.number_of_nodes - rig.bottom - rig.top) + 1, rig.mesh.number_of_elements
+    assert carried(rig, None) == [(n,)]
+    assert carried(rig, replace(prony, scheme="chapter")) == [(n,), (2, 6, E)]
+    assert len(carried(replace(rig, density=1000.0), None)) == 1 + 3
+
+
+def test_strain_sweep_finds_where_linearity_ends(rig):
+    strains = np.array([1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2])
+    soft = lj.laws.NeoHookean(mu=770.0, bulk=7.7e4)
+    m = torsion.strain_sweep(rig, soft, None, strains, drive=Drive(steps=20, by="angle"))
+    # Rivlin: the torque of an incompressible neo-Hookean (and Mooney-Rivlin) cylinder is linear in the twist.
+    assert m.statistics.status.max() == 0
+    assert np.abs(np.asarray(m.storage) / 770 - 1).max() < 0.01
+    assert torsion.linearity_limit(strains, m.storage) == np.inf
+    assert np.allclose(m.strain, strains, rtol=1e-12)
+    stiff = lj.laws.typical("saint_venant_kirchhoff")
+    m = torsion.strain_sweep(rig, stiff, None, strains, drive=Drive(steps=20, by="angle"))
+    limit = torsion.linearity_limit(strains, m.storage, deviation=0.02)
+    assert 0.01 < limit < 0.2
+    assert np.isclose(m.storage[0], 770, rtol=1e-6)
+
+
+def test_free_plate_rises(law):
+    rig = torsion.make_rig(cell_size=0.004, free_height=True)
+    angle = 0.2 * 0.004 / 0.010
+    run = torsion.oscillate(rig, law, None, 1.0, angle, Drive(steps=20, by="angle"))
+    assert run.statistics.status.max() == 0
+    half = torsion.oscillate(rig, law, None, 1.0, angle / 2, Drive(steps=20, by="angle"))
+    # Poynting effect: even in the twist, of second order. (This mesh is chiral: it adds a small odd part.)
+    even, even_half = ((r.lift[5] + r.lift[15]) / 2 for r in (run, half))
+    assert even > 0 and np.isclose(even / even_half, 4, rtol=0.02)
+
+
+def test_impossible_geometry_is_refused():
+    with pytest.raises(lj.InputError, match=r"radius = -0\.01 must be positive"):
+        torsion.make_rig(-0.01, 0.004)
