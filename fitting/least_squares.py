@@ -42,7 +42,7 @@ GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
 def _steps(J: jax.Array, r: jax.Array, damping: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Damped step, the gain of cost it promises, and that of the undamped step; one singular value decomposition."""
     scale = jnp.maximum(jnp.linalg.norm(J, axis=0), 1e-300)
-    U, s, Vt = jnp.linalg.svd(J / scale, full_matrices=False)
+    U, s, Vt = jnp.linalg.svd(J / scale[None], full_matrices=False)
     beta = U.T @ r
     weight = s / (s * s + damping)
     gain = jnp.sum(beta * beta * s * weight * (1 - 0.5 * s * weight))
@@ -167,5 +167,5 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     r, J = with_jacobian(residuals)(found.x, *data)
     s = accept(begin(found.x, r.shape[0]), r, J)
     _, _, left = _steps(J, r, s.damping)
-    near = left <= 1e-4 * jnp.maximum(r @ r, ZERO * r.shape[0])
+    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the latter: exact to any data's digits
     return solution(s._replace(iterations=found.nit, converged=s.converged | near))

@@ -29,9 +29,10 @@ class Maxwell(NamedTuple):
 
 def moduli(model: Maxwell, omega: jax.Array) -> tuple[jax.Array, jax.Array]:
     """G' and G'' [Pa] at angular frequencies omega (n,) [rad/s]."""
-    x = omega[:, None] * model.relaxation_times
-    loss = jnp.sum(model.ratios * x / (1 + x * x), axis=-1)
-    storage = 1 - jnp.sum(model.ratios / (1 + x * x), axis=-1)
+    x = omega[:, None] * model.relaxation_times[None]
+    ratios = model.ratios[None]
+    loss = jnp.sum(ratios * x / (1 + x * x), axis=-1)
+    storage = 1 - jnp.sum(ratios / (1 + x * x), axis=-1)
     return model.shear_modulus * storage, model.shear_modulus * loss
 
 

@@ -281,6 +281,7 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
             drive.options,
         )
         q = full(q, t)
+        torque = load[-1] * rig.radius if by_torque else forces(q)[-1] * rig.radius
         x = _positions(rig, *_unpack(rig, q))
         if prony is not None:
             history = viscosity.advance(prony, history, law, deformation_gradient(mesh, x), dt)
@@ -288,7 +289,6 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
             a = _acceleration(motion, x, dt)
             motion = (x, motion[1] + 0.5 * dt * (motion[2] + a), a)
         _, lift, angle = _unpack(rig, q)
-        torque = load[-1] * rig.radius if by_torque else forces(q)[-1] * rig.radius
         return (q, history, motion), (angle, torque, lift, statistics)
 
     q, history, motion = _initial(rig, law, prony, omega, dt, drive, steady.shape, arc, mass)
@@ -392,7 +392,8 @@ def moduli(
     Args:
         omega, amplitude: (n,) or numbers, broadcast; see `oscillate`.
         corrected: divide by the bias of the mesh, `geometry_factor` (at each frequency its own where only the
-            isochoric part relaxes, since the bulk then weighs more as the modulus falls).
+            isochoric part relaxes, since the bulk then weighs more as the modulus falls). With a density the
+            inertial part is divided as well: refine the mesh there instead.
     """
     rest = _linearise(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))

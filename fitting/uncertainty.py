@@ -17,7 +17,7 @@ class Uncertainty(NamedTuple):
 
     names: tuple[str, ...]
     values: np.ndarray  # (2N + 1,)
-    covariance: np.ndarray  # (2N + 1, 2N + 1); infinite where the data leave a direction free
+    covariance: np.ndarray  # (2N + 1, 2N + 1); huge where the data leave a direction free
     standard_errors: np.ndarray
     correlation: np.ndarray
     equilibrium_error: float  # of G0 (1 - sum g) [Pa]
@@ -55,11 +55,11 @@ def estimate(found: Solution, deviations_given: bool) -> Uncertainty:
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
     to_natural = np.asarray(jax.jacfwd(parameter_vector)(found.u)) / scale
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        half = noise * (to_natural @ Vt.T) / np.where(s > 1e-14 * s[0], s, 0.0)
-        covariance = half @ half.T
-        errors = np.sqrt(np.diag(covariance))
-        correlation = covariance / np.outer(errors, errors)
+    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
+    half = noise * (to_natural @ Vt.T) / np.maximum(s, 1e-14 * s[0])
+    covariance = half @ half.T
+    errors = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.maximum(np.outer(errors, errors), 1e-300)
     values = np.asarray(parameter_vector(found.u))
     modes = (len(u) - 1) // 2
     # d(G0 (1 - sum g)): through the square root of the covariance, which keeps it non-negative.

@@ -1,0 +1,127 @@
+"""The command lines: contract of files and exit codes, one sentence for unusable input."""
+
+import json
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from fitting.__main__ import main
+from liverjax.__main__ import main as liverjax_main
+
+PORCINE = ROOT / "data" / "porcine_liver_frequency_sweep.csv"
+LION = ROOT / "data" / "lions_mane_frequency_sweep.csv"
+
+
+def _contract(content: dict, modes: int) -> None:
+    names = "shear_modulus equilibrium_modulus ratios relaxation_times standard_errors correlation modes method"
+    names += " mean_relative_error max_relative_error warnings run_time_s compile_time_s versions"
+    assert set(names.split()) <= set(content)
+    assert content["modes"] == modes == len(content["ratios"]) == len(content["relaxation_times"])
+    assert content["relaxation_times"] == sorted(content["relaxation_times"], reverse=True)
+    errors = content["standard_errors"]
+    assert set(errors) == {"shear_modulus", "equilibrium_modulus", "ratios", "relaxation_times"}
+    assert np.shape(content["correlation"]) == (2 * modes + 1, 2 * modes + 1)
+    G0, g = content["shear_modulus"], content["ratios"]
+    assert np.isclose(content["equilibrium_modulus"], G0 * (1 - sum(g)))
+    assert {"jax", "numpy", "liverjax"} <= set(content["versions"])
+
+
+def test_main_job_as_a_new_user(tmp_path):
+    """The README's command on the model-implied sweep: through the simulation, closed form beside it."""
+    run = subprocess.run(
+        [sys.executable, "-m", "fitting", str(PORCINE), "--out", str(tmp_path / "fit")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    content = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    _contract(content, 2)
+    assert content["method"] == "torsion" and content["closed_form"]["method"] == "closed-form"
+    values = [content["shear_modulus"], *content["ratios"], *content["relaxation_times"]]
+    assert np.allclose(values, [770, 0.235, 0.333, 0.27, 0.03], rtol=5e-3)
+    assert "closed-form" in run.stdout and "torsion" in run.stdout and "Traceback" not in run.stderr
+    assert "%|" not in run.stderr  # no progress bar where there is no terminal
+    assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
+    with h5py.File(tmp_path / "fit" / "fit.h5") as file:
+        assert file["torsion/covariance"].shape == (5, 5)
+        assert file["data/storage"].attrs["unit"] == "Pa"
+
+
+def test_closed_form_on_measured_data(tmp_path, capsys):
+    code = main([str(LION), "--method", "closed-form", "--profile", "--out", str(tmp_path)])
+    assert code == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    _contract(content, content["modes"])
+    assert content["method"] == "closed-form" and content["profile_intervals_95"]
+    assert "profile 95 %" in capsys.readouterr().out
+
+
+def test_bfgs_option(tmp_path):
+    code = main(
+        [str(PORCINE), "--method", "closed-form", "--modes", "2", "--optimizer", "bfgs", "--out", str(tmp_path)]
+    )
+    assert code == 0
+    assert np.isclose(json.loads((tmp_path / "fit.json").read_text())["shear_modulus"], 770, rtol=1e-4)
+
+
+def test_unconverged_fit_exits_1_and_keeps_its_best_point(tmp_path, monkeypatch, capsys):
+    from fitting import fit
+
+    few = fit.levenberg_marquardt
+    monkeypatch.setattr(fit, "levenberg_marquardt", lambda *a: few(*a, max_iterations=1))
+    assert main([str(PORCINE), "--method", "closed-form", "--modes", "2", "--out", str(tmp_path)]) == 1
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert content["converged"] is False and content["shear_modulus"] > 0
+    assert "did not converge" in content["warnings"][0]
+    assert "not converged" in capsys.readouterr().out
+
+
+HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"
+BAD = {
+    "no file": (None, [], "no such file"),
+    "column": ("frequency_Hz,storage_modulus_Pa\n1,2\n2,3\n", [], "no column for loss"),
+    "nan": (HEADER + "1,300,30\n2,nan,40\n", [], "not finite"),
+    "negative loss": (HEADER + "1,300,30\n2,310,-40\n", [], "is not positive"),
+    "too many modes": (HEADER + "1,300,30\n2,310,40\n3,320,50\n", ["--modes", "3"], "use at most --modes 2"),
+    "zero modes": (HEADER + "1,300,30\n2,310,40\n", ["--modes", "0"], "at least 1"),
+    "exchanged": (HEADER + "0.1,30,300\n1,60,400\n10,90,500\n", [], "are the two columns exchanged"),
+    "law": (HEADER + "1,300,30\n2,310,40\n", ["--law", "neohookean"], "did you mean neo_hookean"),
+    "radius": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "-1"], "--radius -1.0 cannot be"),
+    "height in mm": (HEADER + "1,300,30\n2,310,40\n", ["--height", "nan"], "--height nan cannot be"),
+    "steps": (HEADER + "1,300,30\n2,310,40\n", ["--steps", "1"], "--steps 1 is out of range"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_unusable_input_exits_2_with_one_sentence(name, tmp_path, capsys):
+    text, options, sentence = BAD[name]
+    path = tmp_path / "sweep.csv"
+    if text is not None:
+        path.write_text(text)
+    assert main([str(path), *options, "--out", str(tmp_path / "fit")]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note")]
+    assert len(lines) == 1 and lines[0].startswith("error: ") and sentence in lines[0]
+    assert not (tmp_path / "fit").exists()
+
+
+def test_output_folder_that_is_a_file(tmp_path, capsys):
+    (tmp_path / "fit").write_text("mine")
+    assert main([str(PORCINE), "--out", str(tmp_path / "fit")]) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module", ["fitting", "liverjax"])
+def test_help(module):
+    run = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0 and "usage" in run.stdout
+
+
+def test_laws_lists_every_parameter(capsys):
+    assert liverjax_main(["laws"]) == 0
+    out = capsys.readouterr().out
+    assert "arruda_boyce" in out and "chain_length" in out and "[Pa]  > 0" in out

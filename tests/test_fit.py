@@ -1,0 +1,211 @@
+"""Identification: recovery, statistics, other optimisers, choice of modes, what the user is told."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from conftest import ROOT
+
+from fitting import fit, prony, uncertainty
+from fitting.least_squares import bfgs, levenberg_marquardt
+from fitting.prony import Maxwell
+from fitting.rheometer import Sweep, read_sweep
+from liverjax import InputError
+
+TRUTH = np.array([770.0, 0.235, 0.333, 0.27, 0.03])
+OMEGA = 2 * np.pi * np.geomspace(0.1, 4.0, 16)
+
+
+def sweep(noise: float = 0.0, seed: int = 0, model: np.ndarray = TRUTH, omega: np.ndarray = OMEGA) -> Sweep:
+    n = (len(model) - 1) // 2
+    maxwell = Maxwell(jnp.asarray(model[0]), jnp.asarray(model[1 : n + 1]), jnp.asarray(model[n + 1 :]))
+    rng = np.random.default_rng(seed)
+    storage, loss = (
+        np.asarray(v) * (1 + noise * rng.standard_normal(len(omega))) for v in prony.moduli(maxwell, jnp.asarray(omega))
+    )
+    return Sweep(omega, storage, loss)
+
+
+def parameters(f: fit.Fit) -> np.ndarray:
+    return f.uncertainty.values
+
+
+def test_parametrisation_has_an_inverse():
+    for model in (TRUTH, np.array([1e4, 0.5, 1.0]), np.array([1.0, 0.1, 0.2, 0.3, 9.0, 1.0, 1e-3])):
+        n = (len(model) - 1) // 2
+        u = prony.unconstrained(
+            Maxwell(jnp.asarray(model[0]), jnp.asarray(model[1 : n + 1]), jnp.asarray(model[n + 1 :]))
+        )
+        assert np.allclose(uncertainty.parameter_vector(u), model, rtol=1e-12)
+
+
+def test_noise_free_sweep_is_recovered():
+    f = fit.closed_form(sweep(), 2)
+    assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() < 1e-6
+
+
+def test_given_deviations_change_the_weights_not_the_answer():
+    s = sweep()
+    f = fit.closed_form(s._replace(storage_sd=0.02 * s.storage, loss_sd=5.0 + 0 * s.loss), 2)
+    assert np.abs(parameters(f) / TRUTH - 1).max() < 1e-6
+    assert f.uncertainty.noise == 1.0
+
+
+@pytest.fixture(scope="module")
+def draws():
+    """200 seeded sweeps with 2 % noise on every modulus: parameters and standard errors."""
+    sweeps = [sweep(0.02, seed) for seed in range(200)]
+    starts = np.stack([prony.starts(s, 2, prony.spectrum(s, per_decade=4), count=4) for s in sweeps])
+    storage, loss = np.stack([s.storage for s in sweeps]), np.stack([s.loss for s in sweeps])
+
+    @jax.jit
+    def all_fits(starts, storage, loss):
+        def one(u, G1, G2):
+            return levenberg_marquardt(prony.residuals, u, jnp.asarray(OMEGA), G1, G2, jnp.concatenate([G1, G2]))
+
+        return jax.vmap(jax.vmap(one, in_axes=(0, None, None)))(starts, storage, loss)
+
+    found = all_fits(starts, storage, loss)
+    best = np.argmin(np.asarray(found.cost), axis=1)
+    rows = [jax.tree.map(lambda leaf, k=k, i=i: leaf[k, i], found) for k, i in enumerate(best)]
+    spreads = [uncertainty.estimate(r, deviations_given=False) for r in rows]
+    return np.stack([s.values for s in spreads]), np.stack([s.standard_errors for s in spreads]), spreads
+
+
+def test_spreads_are_the_best_possible(draws):
+    values, errors, _ = draws
+    # mathematics: G0 1.5 %, g1 1.8 %, g2 2.1 %, tau1 2.3 %, tau2 7.4 % (relative standard deviations)
+    stated = np.array([1.5, 1.8, 2.1, 2.3, 7.4]) / 100
+    assert np.all(np.abs(values.std(axis=0) / TRUTH / stated - 1) < 0.2)
+    # and the standard errors know it, draw by draw
+    assert np.all(np.abs(np.median(errors, axis=0) / TRUTH / stated - 1) < 0.2)
+
+
+def test_intervals_cover(draws):
+    values, errors, spreads = draws
+    inside = np.abs(values - TRUTH) < spreads[0].quantile * errors
+    assert np.all((inside.mean(axis=0) >= 0.90) & (inside.mean(axis=0) <= 0.99)), inside.mean(axis=0)
+
+
+def test_profile_likelihood():
+    s = sweep(0.02, 3)
+    f = fit.closed_form(s, 2)
+    intervals = uncertainty.profile_intervals(f.solution, s, f.uncertainty)
+    for j, name in enumerate(f.uncertainty.names):
+        low, high = intervals[name]
+        half = f.uncertainty.quantile * f.uncertainty.standard_errors[j]
+        value = f.uncertainty.values[j]
+        # Nearly quadratic here: the profile differs from the linearised interval by its skewness only.
+        assert np.isclose(value - low, half, rtol=0.35) and np.isclose(high - value, half, rtol=0.35), (name, low, high)
+        assert low < TRUTH[j] < high
+
+
+@pytest.mark.parametrize("modes", [1, 2, 3])
+def test_lions_mane_no_worse_than_scipy_from_50_starts(modes):
+    s = read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
+    scales = np.concatenate(s.deviations)
+    residuals = jax.jit(lambda u: prony.residuals(u, jnp.asarray(s.angular_frequency), s.storage, s.loss, scales))
+    jacobian = jax.jit(jax.jacfwd(residuals))
+    rng = np.random.default_rng(0)
+    low, high = -np.log(s.angular_frequency[-1]) - 1, -np.log(s.angular_frequency[0]) + 1
+    best = np.inf
+    for _ in range(50):
+        tau = np.exp(np.sort(rng.uniform(low, high, modes))[::-1])
+        g = rng.dirichlet(np.ones(modes + 1))[:modes]
+        start = prony.unconstrained(
+            Maxwell(jnp.asarray(s.storage.max() * rng.uniform(1, 3)), jnp.asarray(g), jnp.asarray(tau))
+        )
+        best = min(best, scipy.optimize.least_squares(residuals, start, jac=jacobian).cost)
+    f = fit.closed_form(s, modes)
+    assert f.converged and float(f.solution.cost) <= best * (1 + 1e-9)
+
+
+def test_bfgs_finds_the_same_minimum():
+    s = sweep(0.02, 1)
+    f = fit.closed_form(s, 2)
+    data = (jnp.asarray(s.angular_frequency), s.storage, s.loss, np.concatenate(s.deviations))
+    start = prony.starts(s, 2, prony.spectrum(s), count=2)[0]
+    found = jax.jit(lambda u, *d: bfgs(prony.residuals, u, *d))(start, *data)
+    assert bool(found.converged)
+    assert np.isclose(found.cost, f.solution.cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_auto_finds_the_two_modes_of_table_2(noise):
+    s = sweep(noise, 5)
+    chosen, tried = fit.choose_modes(s, prony.spectrum(s))
+    assert chosen.modes == 2 and len(tried) <= 3
+
+
+def test_modes_limited_by_points():
+    s = sweep(omega=OMEGA[:3])
+    with pytest.raises(InputError, match="use at most --modes 2"):
+        fit.closed_form(s, 3)
+
+
+def warned(f: fit.Fit, words: str) -> bool:
+    return any(words in sentence for sentence in f.warnings)
+
+
+def test_user_is_told_what_the_data_do_not_tell():
+    f = fit.closed_form(sweep(0.01, 2), 2)
+    assert warned(f, "relaxation_times[1]") and warned(f, "outside the 0.0398-1.59 s")
+    assert not warned(f, "merged") and not warned(f, "equilibrium")
+    three = fit.closed_form(sweep(0.01, 2), 3)
+    assert warned(three, "use fewer modes") or warned(three, "merged")
+    fluid = fit.closed_form(sweep(0.01, 2, np.array([1000.0, 0.9999, 0.1])), 1)
+    assert warned(fluid, "cannot be told from zero")
+    narrow = fit.closed_form(sweep(0.01, 2, omega=2 * np.pi * np.geomspace(1, 2, 12)), 3)
+    assert warned(narrow, "too short for 3 modes")
+    s = sweep(0.01, 2)
+    wide = fit.closed_form(s._replace(storage_sd=0.4 * s.storage, loss_sd=0.4 * s.loss), 2)
+    assert warned(wide, "closer than the given deviations")
+    small = fit.closed_form(s._replace(storage_sd=1e-3 * s.storage, loss_sd=1e-3 * s.loss), 2)
+    assert warned(small, "times the given deviations") and small.uncertainty.noise > 5
+
+
+def test_merged_modes_are_named():
+    f = fit.closed_form(sweep(0.0, 0), 2)
+    u = prony.unconstrained(Maxwell(jnp.array(770.0), jnp.array([0.3, 0.2]), jnp.array([0.12, 0.1])))
+    moved = f.solution._replace(u=u)
+    sentences = uncertainty.cautions(sweep(), uncertainty.estimate(moved, False), moved)
+    assert any("have merged" in s and "use 1 mode" in s for s in sentences)
+
+
+def test_better_than_pyvisco_on_the_noise_free_table_2_sweep():
+    # PyVisco 2.1.3 answers G0 603 Pa and tau 0.108 and 0.450 s here: 22 %, 260 % and 67 % off.
+    f = fit.closed_form(sweep(), 2)
+    theirs = np.array([603.0, 0.450, 0.108]) / TRUTH[[0, 3, 4]] - 1
+    ours = parameters(f)[[0, 3, 4]] / TRUTH[[0, 3, 4]] - 1
+    assert np.all(np.abs(ours) < 1e-6 * np.abs(theirs))
+    # It also says 'converged' to exchanged columns; to a NaN and a negative modulus, see test_rheometer.
+    s = sweep()
+    with pytest.raises(InputError, match="are the two columns exchanged"):
+        fit.closed_form(s._replace(storage=s.loss, loss=s.storage), 2)
+
+
+@pytest.fixture(scope="module")
+def coarse_torsion():
+    s = sweep()
+    closed = fit.closed_form(s, 2)
+    return s, closed, fit.through_torsion(s, closed, fit.Simulation(cell_size=0.004))
+
+
+def test_torsion_fit_recovers_table_2(coarse_torsion):
+    _, _, f = coarse_torsion
+    assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() < 5e-3
+    assert f.details["geometry_factor"] > 1.3  # a mesh this coarse is far too stiff, and corrected
+
+
+def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
+    _, _, f = coarse_torsion
+    assert warned(f, "discretisation moves it by")
+
+
+def test_chapter_recursion_biases_the_fit():
+    s = sweep(omega=OMEGA[::3])
+    closed = fit.closed_form(s, 2)
+    f = fit.through_torsion(s, closed, fit.Simulation(cell_size=0.004, scheme="chapter"))
+    # First order: at 50 steps a cycle its G'' is 5 % off at 4 Hz, which the parameters have to absorb.
+    assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() > 0.02

@@ -1,0 +1,188 @@
+"""Reading sweeps: units, instruments' exports, and one sentence for everything that cannot be read."""
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from fitting.rheometer import read_sweep
+from liverjax import InputError
+
+HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"
+ROWS = "0.1,300,30\n1,400,60\n10,500,90\n"
+
+
+def _write(tmp_path, text, name="sweep.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(text.encode(encoding) if isinstance(text, str) else text)
+    return path
+
+
+def test_plain_csv(tmp_path):
+    s = read_sweep(_write(tmp_path, "# a comment\n" + HEADER + ROWS + "# the end\n"))
+    assert np.allclose(s.angular_frequency, 2 * np.pi * np.array([0.1, 1, 10]))
+    assert s.storage.tolist() == [300, 400, 500] and s.loss.tolist() == [30, 60, 90]
+    assert s.storage_sd is None and s.notes == ()
+    assert all(np.array_equal(a, b) for a, b in zip(s.deviations, (s.storage, s.loss), strict=True))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "angular_frequency_rad_s,storage_modulus_kPa,loss_modulus_kPa",
+        "angular_frequency_rad_s;storage_modulus_kPa;loss_modulus_kPa",
+        "Angular frequency [rad/s]\tStorage modulus [kPa]\tLoss modulus [kPa]",
+        "omega (rad/s), G' (kPa), G'' (kPa)",
+        '"Angular Frequency (rad/s)","Storage Modulus (kPa)","Loss Modulus (kPa)"',
+    ],
+)
+def test_units_and_delimiters(tmp_path, header):
+    delimiter = max("\t;,", key=header.count)
+    text = header + "\n" + ROWS.replace(",", delimiter)
+    s = read_sweep(_write(tmp_path, text))
+    assert np.allclose(s.angular_frequency, [0.1, 1, 10]) and np.allclose(s.storage, [3e5, 4e5, 5e5])
+
+
+def test_deviations(tmp_path):
+    header = "frequency_Hz,storage_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_Pa,loss_modulus_sd_Pa\n"
+    text = header + "1,400,4,60,6\n2,500,5,70,7\n"
+    s = read_sweep(_write(tmp_path, text))
+    assert s.storage_sd.tolist() == [4, 5] and s.loss_sd.tolist() == [6, 7]
+    one = "frequency_Hz,storage_modulus_Pa,storage_sd_Pa,loss_modulus_Pa\n1,400,4,60\n2,500,5,70\n"
+    with pytest.raises(InputError, match="give both or none"):
+        read_sweep(_write(tmp_path, one))
+
+
+def test_sorting_and_repeats_are_said(tmp_path):
+    s = read_sweep(_write(tmp_path, HEADER + "10,500,90\n0.1,300,30\n0.1,310,31\n"))
+    assert s.storage.tolist() == [300, 310, 500]
+    assert any("sorted" in n for n in s.notes) and any("1 frequencies are repeated" in n for n in s.notes)
+
+
+TRIOS = """\
+Filename\tliver 3
+Instrument name\tDHR-3
+rundate\t3/6/2020
+[Parameters]
+Geometry\tParallel plate
+Diameter\t20 mm
+[step]
+Amplitude sweep - 1
+Angular frequency\tStorage modulus\tLoss modulus\tOscillation strain\tStep time
+rad/s\tPa\tPa\t%\ts
+6.28319\t401\t61\t0.01\t10
+6.28319\t400\t60\t0.1\t20
+[step]
+Frequency sweep - 2
+Step time\tAngular frequency\tStorage modulus\tLoss modulus\tTan(delta)
+s\trad/s\tMPa\tMPa\t
+10\t0.628319\t3e-4\t3e-5\t0.1
+20\t6.28319\t4e-4\t6e-5\t0.15
+30\t62.8319\t5e-4\t9e-5\t0.18
+[step]
+Conditioning end
+Step time\tTemperature
+s\t°C
+"""
+
+RHEOCOMPASS = """\
+Project:\tLiver\t\t\t
+Test:\tFrequency sweep 1\t\t\t
+Result:\tFrequency sweep 1\t\t\t
+
+Interval and data points:\t1\t3\t\t
+Interval data:\tPoint No.\tAngular Frequency\tStorage Modulus\tLoss Modulus
+\t\t\t\t
+\t\t[rad/s]\t[Pa]\t[Pa]
+\t1\t0,628319\t300\t30
+\t2\t6,28319\t400\t60
+\t3\t62,8319\t5,0E+2\t90
+"""
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("text", [TRIOS, RHEOCOMPASS], ids=["trios", "rheocompass"])
+def test_instrument_exports(tmp_path, text, encoding):
+    s = read_sweep(_write(tmp_path, text, "export.txt", encoding))
+    assert np.allclose(s.angular_frequency, 2 * np.pi * np.array([0.1, 1, 10]), rtol=1e-5)
+    assert np.allclose(s.storage, [300, 400, 500]) and np.allclose(s.loss, [30, 60, 90])
+    if text is TRIOS:
+        assert "2 tables" in s.notes[0]
+
+
+BAD = {
+    "empty": ("", "is empty"),
+    "blank": ("  \n\n", "is empty"),
+    "prose": ("Dear colleague,\nplease find the data attached.\n", "no header names frequency_Hz"),
+    "binary": (b"\x89PNG\r\n\0\0\0\0", "not a text file"),
+    "no numbers": (HEADER, "no numbers below the header"),
+    "no frequency": ("time_s,storage_modulus_Pa,loss_modulus_Pa\n1,2,3\n", "no column for frequency"),
+    "no loss": ("frequency_Hz,storage_modulus_Pa\n1,2\n", "no column for loss"),
+    "unit": (HEADER.replace("loss_modulus_Pa", "loss_modulus_psi") + ROWS, "unit 'psi' of column loss_modulus_psi"),
+    "frequency unit": (HEADER.replace("_Hz", "_rpm") + ROWS, "unit 'rpm'"),
+    "negative": (HEADER + ROWS.replace("60", "-60"), "line 3: loss_modulus_Pa = -60 is not positive"),
+    "zero": (HEADER + ROWS.replace("60", "0"), "loss_modulus_Pa = 0 is not positive"),
+    "nan": (HEADER + ROWS.replace("400", "nan"), "line 3: storage_modulus_Pa = nan is not finite"),
+    "inf": (HEADER + ROWS.replace("400", "inf"), "is not finite"),
+    "negative frequency": (HEADER + ROWS.replace("0.1", "-0.1"), "frequency_Hz = -0.1 is not positive"),
+    "text": (HEADER + ROWS.replace("400", "soft"), "line 3: storage_modulus_Pa = 'soft' is not a number"),
+    "short row": (HEADER + "0.1,300,30\n1,400\n", "line 3: loss_modulus_Pa = missing is not a number"),
+    "one point": (HEADER + "1,400,60\n", "give at least two"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_get_one_sentence(tmp_path, name):
+    content, sentence = BAD[name]
+    with pytest.raises(InputError) as caught:
+        read_sweep(_write(tmp_path, content))
+    message = str(caught.value)
+    assert sentence in message and "sweep.csv" in message and "\n" not in message
+
+
+def test_missing_file_and_folder(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_sweep(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="is a folder"):
+        read_sweep(tmp_path)
+
+
+def test_random_damage_is_refused_or_read_but_never_a_traceback(tmp_path):
+    rng = np.random.default_rng(0)
+    original = (ROOT / "data" / "lions_mane_frequency_sweep.csv").read_bytes()
+    for _ in range(200):
+        data = bytearray(original)
+        for _ in range(rng.integers(1, 30)):
+            k = int(rng.integers(len(data)))
+            action = rng.integers(3)
+            if action == 0:
+                data[k] = int(rng.integers(256))
+            elif action == 1:
+                del data[k : k + int(rng.integers(1, 200))]
+            else:
+                data[k:k] = bytes(rng.integers(0, 256, 5, dtype=np.uint8))
+        path = _write(tmp_path, bytes(data))
+        try:
+            sweep = read_sweep(path)
+        except InputError as error:
+            assert "\n" not in str(error)
+        else:
+            assert np.all(np.isfinite(sweep.storage)) and np.all(sweep.loss > 0)
+
+
+def test_shipped_tables_name_their_source():
+    for path in sorted((ROOT / "data").glob("*.csv")):
+        head = [line for line in path.read_text().splitlines() if line.startswith("#")]
+        assert "Source" in " ".join(head) and "Units" in " ".join(head)
+        assert len(read_sweep(path).angular_frequency) >= 16
+
+
+def test_lions_mane_table_is_the_mean_of_the_raw_sweeps():
+    from conftest import SHARED
+
+    folder = SHARED / "data" / "lions_mane"
+    if not folder.is_dir():
+        pytest.skip("the raw sweeps are not here")
+    raw = np.stack([np.loadtxt(f, delimiter=",", skiprows=2) for f in sorted(folder.glob("*.csv"))])
+    s = read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
+    assert np.allclose(s.storage, raw[:, :, 1].mean(axis=0), rtol=1e-5)
+    assert np.allclose(s.loss_sd, raw[:, :, 2].std(axis=0, ddof=1), rtol=1e-5)
