@@ -1,0 +1,58 @@
+"""What every experiment does alike: time a compiled function, record the environment, write JSON and PNG."""
+
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from fitting.report import BLUE, GREEN, GREY, ORANGE, versions
+
+RESULTS = Path(__file__).parent / "results"
+COLOURS = (BLUE, ORANGE, GREEN, GREY)
+plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.grid": True, "grid.alpha": 0.3, "savefig.dpi": 150})
+
+
+class Timing(NamedTuple):
+    """Seconds: compilation, and the median of the rounds."""
+
+    compile: float
+    run: float
+
+
+def timed(function: Callable, *arguments: Any, rounds: int = 5) -> tuple[Any, Timing]:
+    """Result and timing of a jitted function; compile time apart, median of `rounds` runs after a first one."""
+    begin = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    compiling = time.perf_counter() - begin
+    result = jax.block_until_ready(compiled(*arguments))
+    seconds = []
+    for _ in range(rounds):
+        begin = time.perf_counter()
+        jax.block_until_ready(compiled(*arguments))
+        seconds.append(time.perf_counter() - begin)
+    return result, Timing(compiling, statistics.median(seconds))
+
+
+def environment() -> dict[str, Any]:
+    """Where the numbers come from, without naming a machine."""
+    return versions() | {"cores": os.cpu_count(), "architecture": platform.machine(), "backend": jax.default_backend()}
+
+
+def save(name: str, content: dict[str, Any], figure: Any = None) -> None:
+    """Write results/NAME.json and, with a figure, results/NAME.png."""
+    RESULTS.mkdir(exist_ok=True)
+    text = json.dumps(content | {"environment": environment()}, indent=1, allow_nan=False)
+    (RESULTS / f"{name}.json").write_text(text + "\n")
+    if figure is not None:
+        figure.savefig(RESULTS / f"{name}.png")
+        plt.close(figure)
