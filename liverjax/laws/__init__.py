@@ -10,22 +10,29 @@ import numpy as np
 from liverjax.errors import InputError
 from liverjax.laws.arruda_boyce import ArrudaBoyce
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.laws.exponential_invariants import FungDemiray, VerondaWestmann
 from liverjax.laws.mooney_rivlin import MooneyRivlin
 from liverjax.laws.neo_hookean import NeoHookean, NeoHookeanCompressible
 from liverjax.laws.saint_venant_kirchhoff import SaintVenantKirchhoff
+from liverjax.laws.stable_neo_hookean import StableNeoHookean
 from liverjax.laws.volumetric import VOLUMETRIC
+from liverjax.laws.yeoh import Yeoh
 from liverjax.struct import replace
 
 __all__ = [
     "LAWS",
     "ArrudaBoyce",
+    "FungDemiray",
     "Law",
     "MooneyRivlin",
     "NeoHookean",
     "NeoHookeanCompressible",
     "SaintVenantKirchhoff",
+    "StableNeoHookean",
     "Sum",
+    "VerondaWestmann",
     "Volumetric",
+    "Yeoh",
     "create",
     "isochoric_part",
     "parameters",
@@ -39,9 +46,13 @@ __all__ = [
 LAWS: dict[str, type[Law]] = {
     "neo_hookean": NeoHookean,
     "neo_hookean_compressible": NeoHookeanCompressible,
+    "stable_neo_hookean": StableNeoHookean,
     "saint_venant_kirchhoff": SaintVenantKirchhoff,
     "mooney_rivlin": MooneyRivlin,
+    "yeoh": Yeoh,
     "arruda_boyce": ArrudaBoyce,
+    "fung_demiray": FungDemiray,
+    "veronda_westmann": VerondaWestmann,
 }
 
 

@@ -1,0 +1,35 @@
+"""Yeoh, the reduced polynomial."""
+
+from typing import Any, ClassVar
+
+from liverjax.laws.base import Law
+from liverjax.struct import param, static, struct
+
+
+@struct
+class Yeoh(Law):
+    """W = sum_k c_k (Ibar1 - 3)^k + U(J), k = 1 … 3.
+
+    Chapter, Table 1 (reduced polynomial model).
+    """
+
+    c1: Any = param("Pa", "coefficient of (Ibar1 - 3)", above=0.0, typical=385.0)
+    c2: Any = param("Pa", "coefficient of (Ibar1 - 3)^2", typical=150.0)
+    c3: Any = param("Pa", "coefficient of (Ibar1 - 3)^3", typical=40.0)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static("quadratic", "quadratic, log or simo")
+    invariants: ClassVar = ("I1", "J")
+
+    def isochoric_energy(self, I1, I2):
+        """Cubic in Ibar1 - 3, by Horner's rule."""
+        a = I1 - 3
+        return a * (self.c1 + a * (self.c2 + a * self.c3))
+
+    def isochoric_derivatives(self, I1, I2):
+        """c1 + 2 c2 a + 3 c3 a^2 and 2 c2 + 6 c3 a, a = Ibar1 - 3."""
+        a = I1 - 3
+        return {"I1": self.c1 + a * (2 * self.c2 + 3 * self.c3 * a)}, {("I1", "I1"): 2 * self.c2 + 6 * self.c3 * a}
+
+    def shear_modulus(self):
+        """2 c1 [Pa]."""
+        return 2 * self.c1
