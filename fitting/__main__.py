@@ -51,6 +51,17 @@ def _progress(sweep_size: int):
     return update, bar
 
 
+def _writable(out: Path) -> None:
+    """Make the folder and write into it before anything is computed."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in ("fit.json", "fit.png", "fit.h5"):
+            with (out / name).open("ab"):
+                pass
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
+
+
 def identify(options: argparse.Namespace) -> int:
     """Run the fit that the options ask for; the exit code."""
     from fitting import fit, prony, report, rheometer, uncertainty
@@ -60,8 +71,9 @@ def identify(options: argparse.Namespace) -> int:
         raise InputError(f"--out {options.out} is a file: name a folder for the results")
     for name in ("radius", "height"):
         value = getattr(options, name)
-        if value is not None and not 0 < value < 10:
-            raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} 0.004")
+        if value is not None and not 0 < value <= 0.2:
+            meant = f"{value / 1000:g}" if 0.2 < value <= 200 else "0.004"
+            raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} {meant}")
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
     laws.find(options.law)
@@ -71,6 +83,7 @@ def identify(options: argparse.Namespace) -> int:
     if options.modes != "auto":
         fit.check_modes(sweep, options.modes)
     dense = prony.refuse_impossible(sweep)
+    _writable(options.out)
     if options.modes == "auto":
         closed = fit.choose_modes(sweep, dense, options.optimizer)[0]
     else:
@@ -90,15 +103,12 @@ def identify(options: argparse.Namespace) -> int:
     profile = None
     if options.profile:
         profile = uncertainty.profile_intervals(closed.solution, sweep, closed.uncertainty)
-    try:
-        report.write(options.out, sweep, fits, profile)
-    except OSError as error:
-        raise InputError(f"--out {options.out}: {error.strerror}; name a folder that can be written") from None
+    report.write(options.out, sweep, fits, profile)
     print(report.table(sweep, fits))
     if profile is not None:
         for name, (low, high) in profile.items():
             ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
-            print(f"profile 95 %: {name} from {ends[0]} to {ends[1]}")
+            print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
     for sentence in fits[-1].warnings:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")

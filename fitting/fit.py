@@ -63,8 +63,8 @@ def check_modes(sweep: Sweep, modes: int) -> None:
         raise InputError(f"--modes {modes} must be at least 1, or auto")
     if modes > largest:
         raise InputError(
-            f"{sweep.source or 'sweep'}: {len(sweep.angular_frequency)} frequencies cannot determine the "
-            f"{2 * modes + 1} parameters of {modes} modes; use at most --modes {largest}"
+            f"{sweep.source or 'sweep'}: {largest + 1} different frequencies cannot determine the {2 * modes + 1} "
+            f"parameters of {modes} modes; use at most --modes {largest}"
         )
 
 
@@ -96,16 +96,29 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 
 def _fit(method, sweep, found, storage, loss, extra, running, compiling, details) -> Fit:
     spread = uncertainty.estimate(found, sweep.storage_sd is not None)
-    sentences = (*uncertainty.cautions(sweep, spread, found), *extra)
+    sentences = _misfit(sweep, storage, loss) + tuple(uncertainty.cautions(sweep, spread, found))
     converged = bool(found.converged)
+    if not converged and not extra:
+        extra = ("try fewer modes",)
     if not converged:
-        sentences = (
-            f"the fit did not converge in {int(found.iterations)} iterations: its best point is given; try fewer modes",
-            *sentences,
-        )
+        reason = f"the fit did not converge in {int(found.iterations)} iterations; its best point is given"
+        sentences = (f"{reason}: {extra[0]}", *sentences)
     model = Maxwell(*(np.asarray(v) for v in prony.natural(found.u)))
     details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
     return Fit(method, model, found, spread, converged, storage, loss, sentences, running, compiling, details)
+
+
+def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, ...]:
+    """A sentence where the model does not follow the data, naming the worst point."""
+    e = np.abs(np.concatenate([storage / sweep.storage, loss / sweep.loss]) - 1)
+    if e.mean() < 0.05 and e.max() < 0.3:
+        return ()
+    worst, n = int(np.argmax(e)), len(storage)
+    where = f"{'storage' if worst < n else 'loss'}_modulus at {sweep.angular_frequency[worst % n] / (2 * np.pi):.3g} Hz"
+    return (
+        f"the fit misses the data by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
+        "try more modes, or look at the data",
+    )
 
 
 def identifiable(fit: Fit) -> bool:
@@ -113,7 +126,7 @@ def identifiable(fit: Fit) -> bool:
     n, u = fit.modes, fit.uncertainty
     known = np.all(u.standard_errors[1:] < 0.5 * u.values[1:])
     tau = u.values[n + 1 :]
-    return bool(fit.converged and known and np.all(tau[:-1] / tau[1:] > 1.5))
+    return bool(fit.converged and known and np.all(tau[:-1] > 1.5 * tau[1:]))
 
 
 def information_criterion(fit: Fit) -> float:
@@ -128,21 +141,32 @@ EXACT = 1e-7
 
 
 def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) -> tuple[Fit, list[Fit]]:
-    """Raise N until the criterion rises, a mode is not identifiable, or the fit is exact; also what was tried."""
+    """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact; all that was tried.
+
+    One failure may be a local minimum: the search ends at the second in a row.
+    """
+    decades = np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
+    cap = min(max(MAX_MODES, int(decades) + 2), prony.largest_number_of_modes(sweep))
     tried: list[Fit] = []
-    chosen = None
-    compiling = running = 0.0
-    for modes in range(1, min(MAX_MODES, prony.largest_number_of_modes(sweep)) + 1):
+    chosen, failures = None, 0
+    for modes in range(1, cap + 1):
         fit = closed_form(sweep, modes, dense, optimizer)
         tried.append(fit)
-        compiling, running = compiling + fit.compile_time, running + fit.run_time
-        if chosen is not None and not (
-            identifiable(fit) and information_criterion(fit) < information_criterion(chosen)
-        ):
+        falls = chosen is None or information_criterion(fit) < information_criterion(chosen)
+        if chosen is None or (identifiable(fit) and falls):
+            chosen, failures = fit, 0
+        else:
+            failures += 1
+        if failures == 2 or np.max(fit.relative_errors(sweep)) < EXACT:
             break
-        chosen = fit
-        if np.max(fit.relative_errors(sweep)) < EXACT:
-            break
+    warnings = chosen.warnings
+    closer = min(tried, key=information_criterion)
+    if information_criterion(closer) < information_criterion(chosen) - 10:
+        a, b = (100 * np.mean(f.relative_errors(sweep)) for f in (closer, chosen))
+        warnings += (
+            f"{closer.modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but "
+            f"the data leave some of their parameters free; --modes {closer.modes} gives them all the same",
+        )
     table = [
         {
             "modes": f.modes,
@@ -152,8 +176,15 @@ def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) 
         }
         for f in tried
     ]
-    details = chosen.details | {"modes_tried": table}
-    return chosen._replace(compile_time=compiling, run_time=running, details=details), tried
+    return (
+        chosen._replace(
+            warnings=warnings,
+            compile_time=sum(f.compile_time for f in tried),
+            run_time=sum(f.run_time for f in tried),
+            details=chosen.details | {"modes_tried": table},
+        ),
+        tried,
+    )
 
 
 class Simulation(NamedTuple):
@@ -257,8 +288,10 @@ def through_torsion(
         "newton_status": status.advice(worst),
         "transient": float(np.max(m.defect)),
     }
-    fit = _fit("torsion", sweep, found, storage, loss, (), running, compiling, details)
-    return fit._replace(warnings=(*fit.warnings, *_bias(start, fit)))
+    advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
+    fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)
+    more = tuple(w for w in start.warnings if "modes would follow" in w)
+    return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:

@@ -80,9 +80,10 @@ def accept(s: State, r: jax.Array, J: jax.Array, gain: float = GAIN) -> State:
     u, r, J = (jnp.where(better, new, old) for new, old in ((s.trial, s.u), (r, s.r), (J, s.J)))
     cost = jnp.minimum(cost, jnp.where(better, cost_new, cost))
     step, predicted, left = _steps(J, r, damping)
-    # No step, however short, lowers the cost: at roundoff, which is as converged as the arithmetic allows.
+    # No step, however short, lowers the cost: at roundoff that is as converged as the arithmetic allows.
     exhausted = damping > MAX_DAMPING
-    converged = (left <= gain * cost) | (cost <= ZERO * r.shape[0]) | exhausted
+    at_roundoff = jnp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[0]))
+    converged = (left <= gain * cost) | (cost <= ZERO * r.shape[0]) | (exhausted & at_roundoff)
     return State(
         u=u,
         r=r,

@@ -64,8 +64,8 @@ def residuals(u: jax.Array, omega: jax.Array, storage: jax.Array, loss: jax.Arra
 
 
 def largest_number_of_modes(sweep: Sweep) -> int:
-    """N with 2N + 1 parameters below the 2n measured moduli."""
-    return len(sweep.angular_frequency) - 1
+    """N with 2N + 1 parameters below the 2n moduli at n different frequencies."""
+    return len(np.unique(sweep.angular_frequency)) - 1
 
 
 class Spectrum(NamedTuple):

@@ -75,8 +75,8 @@ def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | No
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
-    if profile is not None:
-        content["profile_intervals_95"] = profile
+    if profile is not None:  # of the closed form, whichever method leads
+        content.get("closed_form", content)["profile_intervals_95"] = profile
     content = _numbers(content)
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     _figure(out / "fit.png", sweep, fits)

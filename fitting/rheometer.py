@@ -5,6 +5,7 @@ of units below it, and numbers below that. Everything leaves in rad/s and Pa, so
 """
 
 import codecs
+import csv
 import os
 import re
 from pathlib import Path
@@ -14,8 +15,12 @@ import numpy as np
 
 from liverjax.errors import InputError
 
-MODULUS_UNITS = {"pa": 1.0, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9}
-FREQUENCY_UNITS = {"hz": 2 * np.pi, "rad/s": 1.0, "rad_s": 1.0, "1/s": 1.0}
+#: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
+MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
+FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1", "rad_s-1", "1/s", "s-1"), 1.0)
+DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
+#: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.
+SMALLEST, LARGEST = 1e-30, 1e30
 NEEDED = {
     "frequency": "frequency_Hz or angular_frequency_rad_s",
     "storage": "storage_modulus_Pa",
@@ -50,6 +55,12 @@ class _Column(NamedTuple):
     unit: str | None
 
 
+class _Table(NamedTuple):
+    columns: list[_Column]
+    rows: list[list[float]]  # in the order of the columns
+    numbers: list[int]  # of the lines in the file
+
+
 def read_sweep(path: str | os.PathLike) -> Sweep:
     """Read a frequency sweep.
 
@@ -63,20 +74,27 @@ def read_sweep(path: str | os.PathLike) -> Sweep:
     """
     lines = _text(Path(path)).splitlines()
     tables = _tables(str(path), lines)
-    chosen = max(tables, key=lambda t: len({row[0] for row in t[1]}))
-    columns, rows, numbers = chosen
+    table = max(tables, key=lambda t: len(set(np.asarray(t.rows)[:, _first(t.columns, "frequency")])))
     notes = []
     if len(tables) > 1:
-        notes.append(f"the file holds {len(tables)} tables; the one with most frequencies, {len(rows)} rows, is used")
-    return _sweep(str(path), columns, np.asarray(rows), numbers, notes)
+        count = len(table.rows)
+        notes.append(f"the file holds {len(tables)} tables; the one with most frequencies, {count} rows, is used")
+    return _sweep(str(path), table, notes)
+
+
+def _first(columns: list[_Column], quantity: str) -> int:
+    return next(j for j, c in enumerate(columns) if c.quantity == quantity)
 
 
 def _text(path: Path) -> str:
-    if path.is_dir():
-        raise InputError(f"{path} is a folder: give the CSV file of a frequency sweep")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the CSV file of a frequency sweep")
-    data = path.read_bytes()
+    try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder: give the CSV file of a frequency sweep")
+        if not path.exists():
+            raise InputError(f"{path}: no such file; give the CSV file of a frequency sweep")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; give the CSV file of a frequency sweep") from None
     if not data.strip():
         raise InputError(f"{path} is empty: export the sweep again")
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -89,101 +107,125 @@ def _text(path: Path) -> str:
         return data.decode("latin-1")
 
 
+def _known_unit(quantity: str, unit: str | None) -> bool:
+    return unit is None or (unit.lower() in FREQUENCY_UNITS if quantity == "frequency" else unit in MODULUS_UNITS)
+
+
 def _quantity(cell: str) -> tuple[str, str | None] | None:
     """(quantity, unit) that a header cell names, or None."""
-    name = cell.strip().strip('"').strip().lower()
-    unit = None
+    name, unit = cell, None
+    for prime, plain in (("′", "'"), ("’", "'"), ("″", "''"), ("”", "''"), ('"', "''")):
+        name = name.replace(prime, plain)
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
     if bracket:
-        name, unit = name[: bracket.start()].strip(), bracket.group(1)
-    plain = re.sub(r"[\s.\-]+", "_", name)
-    sd = bool(re.search(r"(^|_)(sd|std|stdev|standard_deviation)(_|$)", plain))
-    if re.match(r"(storage|g'(?!'))", plain):
-        quantity = "storage"
-    elif re.match(r"(loss_mod|loss_sd|loss_std|loss$|loss_[kmg]?pa$|g''|g\")", plain):
-        quantity = "loss"
-    elif re.match(r"(ang\w*_freq|omega|ω)", plain):
-        quantity = "frequency"
-        unit = unit or _suffix(plain, r"(?:ang\w*_frequency|omega|ω)") or None
-    elif re.match(r"(freq|f_hz$|f$)", plain):
-        quantity = "frequency"
-        unit = unit or _suffix(plain, r"(?:frequency|freq|f)")
+        name, unit = name[: bracket.start()], bracket.group(1)
+    words = [w for w in re.split(r"[\s_.]+", name.strip()) if w]
+    lower = [w.lower() for w in words]
+    spread = any(w in DEVIATION_WORDS for w in lower)
+    kept = [(w, l) for w, l in zip(words, lower, strict=True) if l not in DEVIATION_WORDS | {"standard", "mean"}]
+    words, lower = [w for w, _ in kept], [l for _, l in kept]
+    if not lower:
+        return None
+    if lower[0] in ("storage", "loss", "g'", "g''"):
+        quantity = "storage" if lower[0] in ("storage", "g'") else "loss"
+        stem = 2 if lower[1:2] in (["modulus"], ["mod"]) else 1
+        certain = stem == 2 or lower[0].startswith("g")
+    elif lower[0] in ("angular", "ang", "omega", "ω"):
+        quantity, certain = "frequency", True
+        stem = 2 if lower[1:2] in (["frequency"], ["freq"]) else 1
+    elif lower[0] in ("frequency", "freq", "f"):
+        quantity, certain, stem = "frequency", lower[0] != "f", 1
     else:
         return None
-    if quantity != "frequency":
-        stem = r"(?:storage|loss|g''|g'|g\")(?:_modulus)?(?:_(?:sd|std|stdev|standard_deviation))?"
-        unit = unit or _suffix(plain, stem)
-        quantity += "_sd" if sd else ""
-    return quantity, unit
+    rest = "_".join(words[stem:])
+    if unit is not None and rest:
+        return None  # "Storage compliance (1/Pa)", "Frequency point (1)"
+    unit = unit if unit is not None else (rest or None)
+    if not certain and not _known_unit(quantity, unit):
+        return None
+    return quantity + ("_sd" if spread and quantity != "frequency" else ""), unit
 
 
-def _suffix(plain: str, stem: str) -> str | None:
-    match = re.fullmatch(stem + r"_(.+)", plain)
-    return match.group(1) if match else None
+def _is_angular(column: _Column) -> bool:
+    return column.name.lower().startswith(("ang", "omega", "ω"))
 
 
 def _header(cells: list[str]) -> list[_Column]:
-    columns: dict[str, _Column] = {}
-    for k, cell in enumerate(cells):
-        found = _quantity(cell)
-        if found is None:
-            continue
-        column = _Column(k, cell.strip().strip('"').strip(), *found)
-        angular = column.quantity == "frequency" and _quantity(cell)[0] == "frequency" and "ang" in cell.lower()
-        if column.quantity not in columns or angular:  # rad/s wins where both are given
-            columns[column.quantity] = column
-    return list(columns.values())
+    """Columns by quantity; the first of known unit comes first, rad/s before Hz, others after it (to compare)."""
+    found = [(k, cell, _quantity(cell)) for k, cell in enumerate(cells)]
+    columns = [_Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
+    columns.sort(key=lambda c: (not _known_unit(c.quantity.removesuffix("_sd"), c.unit), not _is_angular(c), c.index))
+    return columns
+
+
+def _delimiter(line: str) -> str:
+    best = max("\t;,|", key=line.count)
+    return best if best in line else ("  " if "  " in line.strip() else " ")
 
 
 def _split(line: str, delimiter: str) -> list[str]:
-    return [c.strip() for c in line.split(delimiter)]
+    if delimiter in (" ", "  "):
+        return re.split(r"\s{2,}" if delimiter == "  " else r"\s+", line.strip())
+    return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-def _tables(path: str, lines: list[str]) -> list[tuple[list[_Column], list[list[float]], list[int]]]:
-    """Every table found: its columns, rows of numbers in the order of the columns (frequency first), line numbers."""
-    tables, best, k = [], [], 0
+def _tables(path: str, lines: list[str]) -> list[_Table]:
+    """Every table that holds numbers; `InputError` saying what is missing where there is none."""
+    for uncomment in (False, True):  # np.savetxt writes its header as a comment
+        tables, headers = _search(path, [line.lstrip("# ") for line in lines] if uncomment else lines)
+        if tables:
+            return tables
+        if headers:
+            break
+    if headers:
+        raise InputError(
+            f"{path}: line {headers[0]}: there are no numbers below the header; give two frequencies or more"
+        )
+    named = [{c.quantity for c in _header(_split(line, _delimiter(line)))} & set(NEEDED) for line in lines]
+    best = max(range(len(lines)), key=lambda k: len(named[k]))
+    shown = lines[best].strip()[:80]
+    if not named[best]:
+        shown = next((s.strip() for s in lines if s.strip() and not s.lstrip().startswith("#")), "only comments")[:80]
+        raise InputError(
+            f"{path}: no header names frequency_Hz, storage_modulus_Pa and loss_modulus_Pa (the first line is "
+            f"{shown!r}); add that header, separated by commas, or export the sweep as CSV"
+        )
+    missing = next(q for q in NEEDED if q not in named[best])
+    raise InputError(f"{path}: no column for {missing} in the header {shown!r}; add {NEEDED[missing]}")
+
+
+def _search(path: str, lines: list[str]) -> tuple[list[_Table], list[int]]:
+    """Tables with numbers, and the line numbers of all complete headers."""
+    tables, headers, k = [], [], 0
     while k < len(lines):
         line = lines[k]
         k += 1
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        delimiter = max("\t;,", key=line.count)
-        columns = _header(_split(line, delimiter))
-        names = {c.quantity for c in columns}
-        if len(names & set(NEEDED)) > len({c.quantity for c in best} & set(NEEDED)) or not best:
-            best = columns
-        if not set(NEEDED) <= names:
+        delimiter = _delimiter(line)
+        cells = _split(line, delimiter)
+        columns = _header(cells)
+        if not set(NEEDED) <= {c.quantity for c in columns}:
             continue
+        headers.append(k)
         columns, k = _with_unit_row(columns, lines, k, delimiter)
-        columns.sort(key=lambda c: c.quantity != "frequency")
-        rows, numbers, k = _rows(path, columns, lines, k, delimiter)
+        rows, numbers, k = _rows(path, columns, lines, k, delimiter, len(cells))
         if rows:
-            tables.append((columns, rows, numbers))
-        else:
-            raise InputError(f"{path}: line {k}: there are no numbers below the header; give at least two frequencies")
-    if tables:
-        return tables
-    found = {c.quantity for c in best}
-    missing = next(q for q in NEEDED if q not in found)
-    seen = next((s.strip() for s in lines if s.strip() and not s.lstrip().startswith("#")), "only comments")[:80]
-    if not found:
-        raise InputError(
-            f"{path}: no header names frequency_Hz, storage_modulus_Pa and loss_modulus_Pa (the first line is "
-            f"{seen!r}); add that header or export the sweep as CSV"
-        )
-    raise InputError(f"{path}: no column for {missing} in the header {seen!r}; add {NEEDED[missing]}")
+            tables.append(_Table(columns, rows, numbers))
+    return tables, headers
 
 
-def _with_unit_row(columns, lines, k, delimiter):
+def _with_unit_row(columns: list[_Column], lines: list[str], k: int, delimiter: str) -> tuple[list[_Column], int]:
     """Instruments put units in a line of their own, within the next two."""
     for ahead in range(k, min(k + 2, len(lines))):
         cells = _split(lines[ahead], delimiter)
-        units = {c.quantity: cells[c.index].strip('"[]() ').lower() for c in columns if c.index < len(cells)}
-        if units.get("storage") in MODULUS_UNITS or units.get("frequency") in FREQUENCY_UNITS:
-            return [c._replace(unit=units.get(c.quantity) or c.unit) for c in columns], ahead + 1
+        units = {c.index: cells[c.index].strip('"[]() ') for c in columns if c.index < len(cells)}
+        moduli = [units.get(c.index) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss")]
+        if any(moduli):
+            return [c._replace(unit=units.get(c.index) or c.unit) for c in columns], ahead + 1
         if any(re.match(r"[-+]?\d", cell) for cell in cells):
             break
-    return list(columns), k
+    return columns, k
 
 
 def _number(text: str, delimiter: str) -> float | None:
@@ -196,59 +238,84 @@ def _number(text: str, delimiter: str) -> float | None:
         return None
 
 
-def _rows(path, columns, lines, k, delimiter):
+def _rows(path, columns, lines, k, delimiter, width):
+    """Rows of numbers below a header, their line numbers, and where to go on."""
+    needed = [c for c in columns if c.quantity in NEEDED]
     rows, numbers = [], []
     while k < len(lines):
         line = lines[k]
-        k += 1
-        if line.lstrip().startswith("#"):
-            continue
-        cells = _split(line, delimiter)
-        if not any(cells):
-            if rows and any(_header(_split(later, delimiter)) or later.startswith("[") for later in lines[k:]):
+        if line.lstrip().startswith("#") or not line.strip(f"{delimiter} \t"):
+            k += 1
+            if rows and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
                 break  # the next table of an instrument's export
             continue
+        cells = _split(line, delimiter)
         values = [_number(cells[c.index], delimiter) if c.index < len(cells) else None for c in columns]
-        if all(v is None for v in values) and (line.startswith("[") or delimiter == "\t"):
-            break
+        here = [cells[c.index] for c in columns if c in needed and c.index < len(cells)]
+        blank = not any(re.match(r"[-+]?\.?\d|nan|inf", cell.lower()) for cell in here)
+        if blank and (not rows or line.startswith("[") or delimiter == "\t"):
+            break  # a title taken for a header, or the end of this table
+        k += 1
         for column, value in zip(columns, values, strict=True):
             if value is None:
                 shown = repr(cells[column.index]) if column.index < len(cells) else "missing"
                 raise InputError(
                     f"{path}: line {k}: {column.name} = {shown} is not a number; correct or remove the line"
                 )
+        if len([c for c in cells if c]) > width:
+            raise InputError(
+                f"{path}: line {k}: {len(cells)} cells under {width} headings; write decimals with a point"
+            )
         rows.append(values)
         numbers.append(k)
     return rows, numbers, k
 
 
-def _sweep(path: str, columns: list[_Column], rows: np.ndarray, numbers: list[int], notes: list[str]) -> Sweep:
-    values = {}
-    for j, column in enumerate(columns):
-        table = FREQUENCY_UNITS if column.quantity == "frequency" else MODULUS_UNITS
-        unit = column.unit
-        if unit is None:
-            unit = (
-                ("rad/s" if "ang" in column.name.lower() or "omega" in column.name.lower() else "hz")
-                if (column.quantity == "frequency")
-                else "pa"
-            )
-            notes.append(f"column {column.name!r} states no unit; {unit} is taken")
-        if unit.lower() not in table:
-            known = "Hz or rad_s" if column.quantity == "frequency" else "Pa, kPa or MPa"
-            raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known; use {known}")
-        for k, value in enumerate(rows[:, j]):
-            if not np.isfinite(value):
-                problem, remedy = "is not finite", "remove the line"
-            elif value <= 0:
-                problem, remedy = "is not positive", "correct the sign or remove the line"
-            else:
-                continue
-            raise InputError(f"{path}: line {numbers[k]}: {column.name} = {value:g} {problem}; {remedy}")
-        values[column.quantity] = rows[:, j] * table[unit.lower()]
+def _complete(line: str) -> bool:
+    return set(NEEDED) <= {c.quantity for c in _header(_split(line, _delimiter(line)))}
+
+
+def _si(path: str, table: _Table, j: int, notes: list[str]) -> np.ndarray:
+    """Column j in rad/s or Pa; every value checked."""
+    column, unit = table.columns[j], table.columns[j].unit
+    if unit is None:
+        unit = "Pa" if column.quantity != "frequency" else "rad/s" if _is_angular(column) else "Hz"
+        notes.append(f"column {column.name!r} states no unit; {unit} is taken")
+    if not _known_unit(column.quantity, unit):
+        known = "Hz or rad_s" if column.quantity == "frequency" else "Pa, kPa or MPa"
+        raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known; use {known}")
+    if _is_angular(column) and unit.lower() == "hz":
+        raise InputError(
+            f"{path}: column {column.name} is an angular frequency in Hz; "
+            "name it frequency_Hz or angular_frequency_rad_s"
+        )
+    values = np.asarray(table.rows)[:, j]
+    scale = FREQUENCY_UNITS[unit.lower()] if column.quantity == "frequency" else MODULUS_UNITS[unit]
+    for number, value in zip(table.numbers, values, strict=True):
+        if not np.isfinite(value):
+            problem, remedy = "is not finite", "remove the line"
+        elif value <= 0:
+            problem, remedy = "is not positive", "correct the sign or remove the line"
+        elif not SMALLEST < value * scale < LARGEST:
+            problem, remedy = "is beyond any measurement", "check the unit"
+        else:
+            continue
+        raise InputError(f"{path}: line {number}: {column.name} = {value:g} {problem}; {remedy}")
+    return values * scale
+
+
+def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
+    values: dict[str, np.ndarray] = {}
+    names: dict[str, str] = {}
+    for j, column in enumerate(table.columns):
+        q = column.quantity
+        if q not in values:
+            values[q], names[q] = _si(path, table, j, notes), column.name
+        elif _known_unit(q, column.unit) and not np.allclose(_si(path, table, j, []), values[q], rtol=0.01):
+            raise InputError(f"{path}: columns {names[q]} and {column.name} disagree; remove the wrong one")
     omega = values["frequency"]
-    if len(omega) < 2:
-        raise InputError(f"{path}: it holds {len(omega)} frequency; give at least two")
+    if len(np.unique(omega)) < 2:
+        raise InputError(f"{path}: it holds {len(np.unique(omega))} frequency; give at least two different ones")
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
             f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is there; give both or none"

@@ -74,8 +74,8 @@ class Moduli(NamedTuple):
 
 
 def cell_size_for(radius: float, height: float) -> float:
-    """Default cell [m]: about 250 nodes; geometry_factor removes what that leaves of error in the linear range."""
-    return (math.pi * radius**2 * height / 100) ** (1 / 3)
+    """Default cell [m]: 100 to 400 nodes for any shape; geometry_factor removes the error that leaves if linear."""
+    return max((math.pi * radius**2 * height / 100) ** (1 / 3), radius / 6, height / 12)
 
 
 def make_rig(
@@ -425,10 +425,15 @@ def strain_sweep(
 
 
 def linearity_limit(strains: Any, storage: Any, deviation: float = 0.05) -> float:
-    """Strain at which G' has moved by `deviation` from its value at the smallest strain; infinity if it never does."""
+    """Strain at which G' has moved by `deviation` from its value at the smallest strain; infinity if it never does.
+
+    A modulus that is not finite (a diverged run) counts as moved: the last good strain is returned.
+    """
     strains, change = np.asarray(strains), np.abs(np.asarray(storage) / np.asarray(storage)[0] - 1)
-    beyond = np.flatnonzero(change > deviation)
+    beyond = np.flatnonzero(~(change <= deviation))
     if not len(beyond):
         return math.inf
     k = beyond[0]
+    if not np.isfinite(change[k]):
+        return float(strains[k - 1])
     return float(np.exp(np.interp(deviation, change[k - 1 : k + 1], np.log(strains[k - 1 : k + 1]))))

@@ -57,10 +57,13 @@ def estimate(found: Solution, deviations_given: bool) -> Uncertainty:
     to_natural = np.asarray(jax.jacfwd(parameter_vector)(found.u)) / scale
     # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
     half = noise * (to_natural @ Vt.T) / np.maximum(s, 1e-14 * s[0])
+    values = np.asarray(parameter_vector(found.u))
     covariance = half @ half.T
     errors = np.sqrt(np.diag(covariance))
     correlation = covariance / np.maximum(np.outer(errors, errors), 1e-300)
-    values = np.asarray(parameter_vector(found.u))
+    # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
+    stuck = np.abs(to_natural * scale).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
+    errors = np.where(stuck, np.inf, errors)
     modes = (len(u) - 1) // 2
     # d(G0 (1 - sum g)): through the square root of the covariance, which keeps it non-negative.
     slope = np.concatenate([[1 - values[1 : modes + 1].sum()], np.full(modes, -values[0]), np.zeros(modes)])
@@ -70,7 +73,7 @@ def estimate(found: Solution, deviations_given: bool) -> Uncertainty:
         covariance,
         errors,
         correlation,
-        float(np.linalg.norm(slope @ half)),
+        float(np.linalg.norm(slope @ half)) if 1 - values[1 : modes + 1].sum() > 1e-10 else np.inf,
         noise,
         float(scipy.stats.t.ppf(0.975, max(1, len(r) - len(u)))),
     )
@@ -135,7 +138,13 @@ def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
     low, high, decades = 1 / omega[-1], 1 / omega[0], float(np.log10(omega[-1] / omega[0]))
     out = []
     for k in range(modes):
-        if not low <= tau[k] <= high:
+        if not low / 100 <= tau[k] <= 100 * high:
+            product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
+            out.append(
+                f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the measured "
+                f"frequencies resolve: only {product} is determined, no factor of it; use fewer modes or another band"
+            )
+        elif not low <= tau[k] <= high:
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies outside the {low:.3g}-{high:.3g} s that the measured "
                 f"frequencies resolve: it is extrapolated (standard error {_percent(tau_err[k], tau[k])}); measure at "
@@ -152,21 +161,21 @@ def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
                 "the data leave it nearly free; use fewer modes or a wider sweep"
             )
     for k in range(modes - 1):
-        if tau[k] / tau[k + 1] < 2:
+        if tau[k] < 2 * tau[k + 1]:
             out.append(
                 f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
                 f"{modes - 1} mode{'s' if modes > 2 else ''}"
             )
     equilibrium = u.values[0] * (1 - g.sum())
-    if not equilibrium > 2 * u.equilibrium_error or 1 - g.sum() < 0.01:
+    if not equilibrium > 2 * u.equilibrium_error:
         out.append(
             f"the ratios add up to {g.sum():.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
             "from zero (a fluid); measure at lower frequencies"
         )
-    if modes > int(np.ceil(decades)) + 1:
+    if modes > decades + 1 or decades < 0.3:
         out.append(
-            f"the sweep spans {decades:.2g} decades, too short for {modes} modes (about one mode a decade and one "
-            "more); use fewer modes or a wider sweep"
+            f"the sweep spans {decades:.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
+            "(about one a decade and one more); use fewer modes or a wider sweep"
         )
     if sweep.storage_sd is not None:
         r = np.asarray(found.residuals)

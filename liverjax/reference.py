@@ -27,8 +27,9 @@ def first_piola(law: Law, F: jax.Array) -> jax.Array:
 
 
 def tangent(law: Law, F: jax.Array) -> jax.Array:
-    """d2W/dF dF [Pa] of deformation gradients (n, 3, 3): (n, 3, 3, 3, 3) by forward over reverse mode."""
-    return jax.vmap(jax.jacfwd(jax.grad(law.energy)))(F)
+    """d2W/dF dF [Pa] of deformation gradients (..., 3, 3): (..., 3, 3, 3, 3) by forward over reverse mode."""
+    flat = jnp.reshape(F, (-1, 3, 3))
+    return jax.vmap(jax.jacfwd(jax.grad(law.energy)))(flat).reshape(*jnp.shape(F), 3, 3)
 
 
 @jax.jit

@@ -58,7 +58,7 @@ def test_closed_form_on_measured_data(tmp_path, capsys):
     content = json.loads((tmp_path / "fit.json").read_text())
     _contract(content, content["modes"])
     assert content["method"] == "closed-form" and content["profile_intervals_95"]
-    assert "profile 95 %" in capsys.readouterr().out
+    assert "profile 95 % (closed form)" in capsys.readouterr().out
 
 
 def test_bfgs_option(tmp_path):
@@ -91,6 +91,7 @@ BAD = {
     "zero modes": (HEADER + "1,300,30\n2,310,40\n", ["--modes", "0"], "at least 1"),
     "exchanged": (HEADER + "0.1,30,300\n1,60,400\n10,90,500\n", [], "are the two columns exchanged"),
     "law": (HEADER + "1,300,30\n2,310,40\n", ["--law", "neohookean"], "did you mean neo_hookean"),
+    "radius in mm": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "4"], "give e.g. --radius 0.004"),
     "radius": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "-1"], "--radius -1.0 cannot be"),
     "height in mm": (HEADER + "1,300,30\n2,310,40\n", ["--height", "nan"], "--height nan cannot be"),
     "steps": (HEADER + "1,300,30\n2,310,40\n", ["--steps", "1"], "--steps 1 is out of range"),

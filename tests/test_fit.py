@@ -135,7 +135,7 @@ def test_bfgs_finds_the_same_minimum():
 def test_auto_finds_the_two_modes_of_table_2(noise):
     s = sweep(noise, 5)
     chosen, tried = fit.choose_modes(s, prony.spectrum(s))
-    assert chosen.modes == 2 and len(tried) <= 3
+    assert chosen.modes == 2 and len(tried) <= 4
 
 
 def test_modes_limited_by_points():
@@ -209,3 +209,30 @@ def test_chapter_recursion_biases_the_fit():
     f = fit.through_torsion(s, closed, fit.Simulation(cell_size=0.004, scheme="chapter"))
     # First order: at 50 steps a cycle its G'' is 5 % off at 4 Hz, which the parameters have to absorb.
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() > 0.02
+
+
+def test_twelve_decades_need_more_than_six_modes():
+    tau = 10.0 ** np.arange(4, -4, -1)
+    model = np.concatenate([[1e5], np.full(8, 0.1), tau])
+    s = sweep(0.0, model=model, omega=np.geomspace(1e-6, 1e6, 60))
+    chosen, _ = fit.choose_modes(s, prony.spectrum(s))
+    assert chosen.modes == 8 and np.allclose(parameters(chosen), model, rtol=1e-4)
+
+
+def test_an_outlier_is_named():
+    s = sweep(0.0)
+    storage = s.storage.copy()
+    storage[5] *= 3
+    f = fit.closed_form(s._replace(storage=storage), 2)
+    assert warned(f, "storage_modulus at 0.342 Hz")
+
+
+def test_a_plateau_that_is_measured_is_no_fluid():
+    model = np.array([1e9, 0.5, 0.499, 1e-6, 1e-8])
+    f = fit.closed_form(sweep(0.01, 2, model, np.geomspace(1e2, 1e10, 40)), 2)
+    assert not warned(f, "cannot be told from zero")
+
+
+def test_parameters_at_a_bound_claim_no_certainty():
+    f = fit.closed_form(sweep(0.02, 4, omega=2 * np.pi * np.linspace(1, 1.01, 10)), 1)
+    assert np.all(f.uncertainty.standard_errors > 0) and warned(f, "too short")

@@ -141,3 +141,15 @@ def test_parts_of_a_split_law_add_up():
 def test_create_refuses_in_one_sentence(name, values, sentence):
     with pytest.raises(lj.InputError, match=sentence):
         lj.laws.create(name, **values)
+
+
+def test_create_under_tracing_and_optional_parameters():
+    energy = jax.grad(lambda m: lj.laws.create("neo_hookean", mu=m, bulk=7700.0).energy(1.1 * jnp.eye(3)))(770.0)
+    assert np.isfinite(energy)
+    with pytest.raises(lj.InputError, match="not a number"):
+        lj.laws.create("neo_hookean", mu="770", bulk=7700.0)
+    with pytest.raises(lj.InputError, match=r"bulk = None|not finite"):
+        lj.laws.create("neo_hookean", mu=770.0, bulk=None)
+    assert lj.laws.create("mooney_rivlin", c10=1.0, c01=1.0, c20=None, bulk=10.0).c20 is None
+    integer = np.array([[2, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assert np.allclose(LAWS["neo_hookean"].first_piola(integer), LAWS["neo_hookean"].first_piola(integer * 1.0))

@@ -48,7 +48,7 @@ def test_deviations(tmp_path):
     s = read_sweep(_write(tmp_path, text))
     assert s.storage_sd.tolist() == [4, 5] and s.loss_sd.tolist() == [6, 7]
     one = "frequency_Hz,storage_modulus_Pa,storage_sd_Pa,loss_modulus_Pa\n1,400,4,60\n2,500,5,70\n"
-    with pytest.raises(InputError, match="give both or none"):
+    with pytest.raises(InputError, match="give both"):
         read_sweep(_write(tmp_path, one))
 
 
@@ -109,6 +109,53 @@ def test_instrument_exports(tmp_path, text, encoding):
         assert "2 tables" in s.notes[0]
 
 
+VARIANTS = {
+    "sd first": (
+        "frequency_Hz,sd_storage_modulus_Pa,storage_modulus_Pa,SD_G''_Pa,loss_modulus_Pa\n1,4,400,6,60\n2,5,500,7,70\n",
+        True,
+    ),
+    "errors": (
+        "Frequency (Hz),Storage modulus error (Pa),Storage modulus (Pa),Loss modulus error (Pa),Loss modulus (Pa)\n1,4,400,6,60\n2,5,500,7,70\n",
+        True,
+    ),
+    "other columns first": (
+        "Frequency point (1),frequency_index,Frequency (Hz),Storage compliance (1/Pa),storage_temperature_C,Storage modulus (Pa),Loss modulus (Pa)\n1,1,1,9,9,400,60\n2,2,2,9,9,500,70\n",
+        False,
+    ),
+    "numpy": ("# frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n1,400,60\n2,500,70\n", False),
+    "spaces": ("frequency_Hz storage_modulus_Pa  loss_modulus_Pa\n1 400  60\n2 500  70\n".replace("  ", " "), False),
+    "primes": ("Frequency [Hz]|G′ [Pa]|G″ [Pa]\n1|400|60\n2|500|70\n", False),
+    "quoted": ('"Frequency (Hz)","Storage modulus (Pa)","Loss modulus (Pa)"\n"1","400","60"\n"2","500","70"\n', False),
+    "title": (
+        "Frequency sweep; Storage modulus; Loss modulus\nfrequency_Hz;storage_modulus_Pa;loss_modulus_Pa\n1;400;60\n2;500;70\n",
+        False,
+    ),
+    "both frequencies": (
+        "frequency_Hz,angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa\n1,6.2832,400,60\n2,12.566,500,70\n",
+        False,
+    ),
+    "aborted step": (
+        "[step]\nFrequency\tStorage modulus\tLoss modulus\nHz\tPa\tPa\n[step]\nFrequency\tStorage modulus\tLoss modulus\nHz\tPa\tPa\n1\t400\t60\n2\t500\t70\n",
+        False,
+    ),
+    "per second": (
+        "Frequency [rad s-1]\tStorage modulus [Pa]\tLoss modulus [Pa]\n6.283185307\t400\t60\n12.566370614\t500\t70\n",
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_headers_that_laboratories_write(tmp_path, name):
+    text, deviations = VARIANTS[name]
+    s = read_sweep(_write(tmp_path, text))
+    assert np.allclose(s.angular_frequency, 2 * np.pi * np.array([1, 2]), rtol=1e-4)
+    assert s.storage.tolist() == [400, 500] and s.loss.tolist() == [60, 70]
+    assert (s.storage_sd is not None) == deviations
+    if deviations:
+        assert s.storage_sd.tolist() == [4, 5] and s.loss_sd.tolist() == [6, 7]
+
+
 BAD = {
     "empty": ("", "is empty"),
     "blank": ("  \n\n", "is empty"),
@@ -126,6 +173,13 @@ BAD = {
     "negative frequency": (HEADER + ROWS.replace("0.1", "-0.1"), "frequency_Hz = -0.1 is not positive"),
     "text": (HEADER + ROWS.replace("400", "soft"), "line 3: storage_modulus_Pa = 'soft' is not a number"),
     "short row": (HEADER + "0.1,300,30\n1,400\n", "line 3: loss_modulus_Pa = missing is not a number"),
+    "milli": (HEADER.replace("storage_modulus_Pa", "storage_modulus_mPa") + ROWS, "unit 'mPa'"),
+    "angular in Hz": (HEADER.replace("frequency_Hz", "angular_frequency_Hz") + ROWS, "angular frequency in Hz"),
+    "disagree": ("angular_frequency_rad_s," + HEADER + "1,1,300,30\n2,2,400,60\n", "disagree"),
+    "decimal comma": (HEADER + '"1,5","337,8","34,7"\n', "is not a number"),
+    "decimal comma bare": (HEADER + "1,5,337,8,34,7\n", "6 cells under 3 headings"),
+    "one frequency": (HEADER + "1,300,30\n1,310,31\n1,320,33\n", "at least two different"),
+    "huge": (HEADER + ROWS.replace("400", "1e200"), "beyond any measurement"),
     "one point": (HEADER + "1,400,60\n", "give at least two"),
 }
 
@@ -144,6 +198,8 @@ def test_missing_file_and_folder(tmp_path):
         read_sweep(tmp_path / "none.csv")
     with pytest.raises(InputError, match="is a folder"):
         read_sweep(tmp_path)
+    with pytest.raises(InputError, match="name too long"):
+        read_sweep(tmp_path / ("x" * 300))
 
 
 def test_random_damage_is_refused_or_read_but_never_a_traceback(tmp_path):

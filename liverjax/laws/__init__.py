@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -90,18 +91,22 @@ def create(name: str, **values: Any) -> Law:
         if key not in values and field.default is dataclasses.MISSING:
             raise InputError(f"law {name} needs parameter {key} [{field.metadata.get('unit', '')}]: give {key} = …")
     for key, value in values.items():
+        if value is None and known[key].default is None:
+            continue  # an optional coefficient left out
         _check_value(f"law {name}: {key}", known[key].metadata, value)
     return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
 def _check_value(where: str, metadata: Any, value: Any) -> None:
     if metadata.get("static"):
-        if value not in VOLUMETRIC:
+        if not isinstance(value, str) or value not in VOLUMETRIC:
             raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")
         return
-    if value is None:
+    if isinstance(value, jax.core.Tracer):  # a number only under jit or grad: nothing to check yet
         return
     try:
+        if isinstance(value, str):
+            raise TypeError
         numbers = np.atleast_1d(np.asarray(value, dtype=float))
     except (TypeError, ValueError):
         raise InputError(f"{where} = {value!r} is not a number: give a value in {metadata['unit']}") from None

@@ -55,26 +55,32 @@ class Law:
 
     def energy(self, F: jax.Array) -> jax.Array:
         """Strain energy density [Pa], shape (...), of deformation gradients (..., 3, 3)."""
-        Fm = unpack(jnp.asarray(F))
+        Fm = unpack(_floating(F))
         return self.strain_energy(invariants(self.invariants, Fm, right_cauchy_green(Fm)))
 
     def first_piola(self, F: jax.Array) -> jax.Array:
         """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), by the hand-derived MJED terms."""
         from liverjax import mjed
 
-        return pack(mjed.first_piola(self, unpack(jnp.asarray(F))))
+        return pack(mjed.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
         """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: the block of D = e_J, e_L."""
         from liverjax import mjed
 
-        A = mjed.tangent(self, unpack(jnp.asarray(F)))
+        A = mjed.tangent(self, unpack(_floating(F)))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
 
     def __add__(self, other: "Law") -> "Sum":
         return Sum(laws=summands(self) + summands(other))
+
+
+def _floating(F: Any) -> jax.Array:
+    """`F` as an array of floating-point numbers; integers become the default precision."""
+    F = jnp.asarray(F)
+    return F if jnp.issubdtype(F.dtype, jnp.floating) else F.astype(float)
 
 
 @struct
