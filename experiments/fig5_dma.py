@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from common import BLUE, GREEN, GREY, ORANGE, plt, save, timed
+from matplotlib.ticker import NullFormatter
 
 import liverjax as lj
 from fitting import fit, prony, torsion
@@ -127,6 +128,7 @@ def figure(sweep, content) -> plt.Figure:
             steps.annotate(str(r["steps"]), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
     steps.axhline(5, color=GREY, ls=":", label="the chapter's 5 %")
     steps.set(xscale="log", yscale="log", xlabel="run time of 16 frequencies [s]", ylabel="mean error of G', G'' [%]")
+    steps.xaxis.set_minor_formatter(NullFormatter())
     steps.set_title("Time step: error against run time (steps a cycle at the points)")
     steps.legend(fontsize=7)
 
