@@ -271,8 +271,16 @@ def through_torsion(
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.max(m.statistics.status))
     found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
-    details = {
-        "optimizer": optimizer,
+    details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
+    advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
+    fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)
+    more = tuple(w for w in start.warnings if "modes would follow" in w)
+    return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
+
+
+def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
+    """What the simulation was and did, for the report."""
+    return {
         "law": simulation.law,
         "radius_m": simulation.radius,
         "height_m": simulation.height,
@@ -285,13 +293,9 @@ def through_torsion(
         "rim_strain": simulation.strain,
         "newton_iterations": int(np.max(m.statistics.iterations)),
         "newton_residual": float(np.max(m.statistics.residual)),
-        "newton_status": status.advice(worst),
+        "newton_status": status.advice(np.max(m.statistics.status)),
         "transient": float(np.max(m.defect)),
     }
-    advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
-    fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)
-    more = tuple(w for w in start.warnings if "modes would follow" in w)
-    return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:

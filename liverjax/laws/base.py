@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from liverjax.errors import InputError
 from liverjax.kinematics import Invariants, invariants, pack, right_cauchy_green, unpack
 from liverjax.laws.volumetric import volumetric
 from liverjax.struct import param, replace, static, struct
@@ -45,7 +46,7 @@ class Law:
 
     def shear_modulus(self) -> Any:
         """Ground-state shear modulus [Pa]."""
-        raise NotImplementedError(f"{type(self).__name__} states no ground-state shear modulus")
+        raise InputError(f"law {type(self).__name__} states no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
         """Ground-state bulk modulus [Pa]."""
