@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import mjed, newton, shapes, viscosity
+from liverjax import mjed, newton, shapes, terms, viscosity
 from liverjax.errors import InputError
 from liverjax.kinematics import deformation_gradient
 from liverjax.laws import Law, isochoric_part, volumetric_part
@@ -262,7 +262,7 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
         def forces(q):
             x = _positions(rig, *_unpack(rig, q))
             F = deformation_gradient(mesh, x)
-            P = mjed.first_piola(law, F) if prony is None else viscosity.first_piola(prony, memory, law, F)
+            P = terms.first_piola(law, F) if prony is None else viscosity.first_piola(prony, memory, law, F)
             f = mjed.nodal_force(mesh, P)
             if mass is not None:
                 f = f + mass[:, None] * _acceleration(motion, x, dt)

@@ -10,164 +10,17 @@ gradient of the energy, f = + dW/dx (the chapter's nodal force is its negative).
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from liverjax.kinematics import (
-    Matrix,
-    Vector,
-    add,
-    cofactor,
-    cross,
-    deformation_gradient,
-    dot,
-    invariants,
-    matmul,
-    matvec,
-    right_cauchy_green,
-    scale,
-    transpose,
-)
+from liverjax.kinematics import Matrix, deformation_gradient, dot, invariants, right_cauchy_green, transpose
 from liverjax.laws.base import Law
 from liverjax.mesh import TetMesh
-
-
-class Stress(NamedTuple):
-    """P = F S + p cof F, arrays of shape (E,): `S` a symmetric matrix or, where it is spherical, one array; p = W_J."""
-
-    S: Matrix | Any
-    p: Any
-
-
-class State(NamedTuple):
-    """What force and stiffness share at one deformation gradient."""
-
-    F: Matrix
-    C: Matrix | None
-    cof: Matrix
-    I1: Any
-    J: Any
-    first: dict
-    second: dict
-
-
-def state(law: Law, F: Matrix) -> State:
-    """Invariants that the law asks for and its scalar derivatives; C only where I2 needs it."""
-    C = right_cauchy_green(F) if "I2" in law.invariants else None
-    I = invariants(law.invariants, F, C)
-    first, second = law.energy_derivatives(I)
-    return State(F, C, cofactor(F), I.I1, I.J, first, second)
-
-
-def stress(s: State) -> Stress:
-    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) and p = W_J; absent derivatives leave no term."""
-    W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
-    if W2 is None:
-        return Stress(2 * W1, p)
-    diagonal = 2 * (W1 + s.I1 * W2)
-    C = scale(-2 * W2, s.C[0]), scale(-2 * W2, s.C[1]), scale(-2 * W2, s.C[2])
-    return Stress(tuple(tuple(C[i][j] + (diagonal if i == j else 0.0) for j in range(3)) for i in range(3)), p)
-
-
-def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
-    """P = F S + p cof F."""
-    S, p = resultant
-    FS = matmul(F, S) if isinstance(S, tuple) else tuple(scale(S, row) for row in F)
-    return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
-
-
-def second_piola(F: Matrix, resultant: Stress) -> Matrix:
-    """S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
-
-    Section 4.2 needs F^-1 here, so it is not defined at J = 0: infinite there, and of the other sign beyond.
-    """
-    S, p = resultant
-    cof = cofactor(F)
-    columns = transpose(cof)
-    p_over_J = p / dot(F[0], cof[0])
-
-    def entry(i: int, j: int) -> Any:
-        s = S[i][j] if isinstance(S, tuple) else (S if i == j else 0.0)
-        return s + p_over_J * dot(columns[i], columns[j])
-
-    return tuple(tuple(entry(min(i, j), max(i, j)) for j in range(3)) for i in range(3))
-
-
-def first_piola(law: Law, F: Matrix) -> Matrix:
-    """First Piola-Kirchhoff stress [Pa] of a tuple matrix F."""
-    s = state(law, F)
-    return piola(F, s.cof, stress(s))
-
-
-def slopes(s: State, D: Vector) -> dict[str, Vector]:
-    """FD, F (I1 Id - C) D and cof(F) D: half of dI1/dx and dI2/dx, and dJ/dx, of a node with shape vector D."""
-    FD = matvec(s.F, D)
-    v = {"I1": FD}
-    if "J" in s.first:
-        v["J"] = matvec(s.cof, D)
-    if s.C is not None:
-        v["I2"] = add(scale(s.I1, FD), scale(-1.0, matvec(s.F, matvec(s.C, D))))
-    return v
-
-
-_WEIGHT = {"I1": 2.0, "I2": 2.0, "J": 1.0}
-
-
-def block(s: State, resultant: Stress, Di: Vector, Dj: Vector, vi: dict, vj: dict, regularised: bool) -> Matrix:
-    """d2W/dx_i dx_j per reference volume: the chapter's G, H, I, Lambda, M and R of all terms at once.
-
-    Args:
-        s, resultant: `state` and `stress` of the element.
-        Di, Dj: shape vectors of the two nodes; vi, vj: their `slopes`.
-        regularised: replace G as in section 4.1.2 iii, with eps/3 where the chapter prints eps (the trace is kept).
-    """
-    second = dict(s.second)
-    W_JJ = second.pop(("J", "J"), None) if regularised else None
-    # v_a,i (x) sum_b W_ab v_b,j: one outer product an invariant.
-    partner: dict[str, Vector] = {}
-    for (a, b), W in second.items():
-        for row, column in dict.fromkeys(((a, b), (b, a))):
-            term = scale(W * (_WEIGHT[row] * _WEIGHT[column]), vj[column])
-            partner[row] = add(partner[row], term) if row in partner else term
-    W2 = s.first.get("I2")
-    if W2 is not None:  # W_2 d2I2 = 2 W_2 (… + 2 FDi (x) FDj - FDj (x) FDi - (Di.Dj) F F^T)
-        term = scale(4 * W2, vj["I1"])
-        partner["I1"] = add(partner["I1"], term) if "I1" in partner else term
-    K = [[sum((vi[a][r] * q[c] for a, q in partner.items()), 0.0) for c in range(3)] for r in range(3)]
-    if W2 is not None:
-        swapped, metric = scale(-2 * W2, vj["I1"]), -2 * W2 * dot(Di, Dj)
-        for r in range(3):
-            for c in range(3):
-                K[r][c] = K[r][c] + swapped[r] * vi["I1"][c] + metric * dot(s.F[r], s.F[c])
-    # W_1 d2I1 and the first part of W_2 d2I2 together: D_i . S D_j Id.
-    S, p = resultant
-    diagonal = dot(Di, matvec(S, Dj)) if isinstance(S, tuple) else S * dot(Di, Dj)
-    if W_JJ is not None:
-        eps = jnp.clip(1 - s.J, 0, 1)
-        diagonal = diagonal + W_JJ * eps / 3 * dot(vi["J"], vj["J"])
-        for r in range(3):
-            for c in range(3):
-                K[r][c] = K[r][c] + W_JJ * (1 - eps) * vi["J"][r] * vj["J"][c]
-    for r in range(3):
-        K[r][r] = K[r][r] + diagonal
-    if "J" in s.first:  # W_J d2J = -W_J [F (D_i x D_j)]_x
-        n = scale(p, matvec(s.F, cross(Di, Dj)))
-        for r, c, q in ((0, 1, n[2]), (2, 0, n[1]), (1, 2, n[0])):
-            K[r][c], K[c][r] = K[r][c] + q, K[c][r] - q
-    return tuple(tuple(row) for row in K)
-
-
-def tangent(law: Law, F: Matrix, regularised: bool = False) -> list[list[Matrix]]:
-    """d2W/dF dF [Pa] as nested [J][L] of matrices (i, k): the blocks of shape vectors e_J and e_L."""
-    s = state(law, F)
-    e = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    v = [slopes(s, D) for D in e]
-    resultant = stress(s)
-    return [[block(s, resultant, e[J], e[L], v[J], v[L], regularised) for L in range(3)] for J in range(3)]
+from liverjax.terms import block, first_piola, slopes, state, stress
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:

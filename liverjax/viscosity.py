@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from liverjax import mjed
+from liverjax import terms
 from liverjax.errors import InputError
 from liverjax.kinematics import Matrix, matmul
 from liverjax.laws.base import Law, isochoric_part, volumetric_part
@@ -143,20 +143,20 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> His
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
     """The second Piola-Kirchhoff stress that relaxes, (6, E) [Pa]: S_h, or its isochoric part."""
-    s = mjed.state(_relaxing(prony, law), F)
-    S = mjed.second_piola(F, mjed.stress(s))
+    s = terms.state(_relaxing(prony, law), F)
+    S = terms.second_piola(F, terms.stress(s))
     return jnp.stack([S[i][j] for i, j in _SIX])
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
     """P_v = (1 - sum a) P_h - F past (part "all"), or with the volumetric stress added in full ("isochoric")."""
-    P = mjed.first_piola(_relaxing(prony, law), F)
+    P = terms.first_piola(_relaxing(prony, law), F)
     remembered = matmul(F, memory.past)
     P = tuple(tuple(memory.now * P[i][j] - remembered[i][j] for j in range(3)) for i in range(3))
     rest = volumetric_part(law) if prony.part == "isochoric" else None
     if rest is None:
         return P
-    U = mjed.first_piola(rest, F)
+    U = terms.first_piola(rest, F)
     return tuple(tuple(P[i][j] + U[i][j] for j in range(3)) for i in range(3))
 
 

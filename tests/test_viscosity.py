@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import mjed, viscosity
+from liverjax import terms, viscosity
 from liverjax.kinematics import unpack
 from liverjax.struct import replace
 
@@ -95,8 +95,8 @@ def test_step_relaxation_follows_alpha(part, table_2):
     g, tau = np.asarray(table_2.ratios), np.asarray(table_2.relaxation_times)
     ramp = tau / dt * np.expm1(dt / tau)
     alpha = 1 - np.sum(g * (1 - ramp * np.exp(-n * dt / tau)))
-    whole = mjed.first_piola(law, F)
-    kept = mjed.first_piola(lj.laws.volumetric_part(law), F) if part == "isochoric" else None
+    whole = terms.first_piola(law, F)
+    kept = terms.first_piola(lj.laws.volumetric_part(law), F) if part == "isochoric" else None
     for i in range(3):
         for j in range(3):
             rest = kept[i][j] if kept else 0.0

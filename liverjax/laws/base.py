@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from liverjax import terms
 from liverjax.errors import InputError
 from liverjax.kinematics import Invariants, invariants, pack, right_cauchy_green, unpack
 from liverjax.laws.volumetric import volumetric
@@ -61,15 +62,11 @@ class Law:
 
     def first_piola(self, F: jax.Array) -> jax.Array:
         """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), by the hand-derived MJED terms."""
-        from liverjax import mjed
-
-        return pack(mjed.first_piola(self, unpack(_floating(F))))
+        return pack(terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
         """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: the block of D = e_J, e_L."""
-        from liverjax import mjed
-
-        A = mjed.tangent(self, unpack(_floating(F)))
+        A = terms.tangent(self, unpack(_floating(F)))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
