@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import tempfile
 from pathlib import Path
 
 from liverjax.errors import InputError
@@ -52,12 +53,14 @@ def _progress(sweep_size: int):
 
 
 def _writable(out: Path) -> None:
-    """Make the folder and write into it before anything is computed."""
+    """Make the folder and try to write into it before anything is computed."""
+    for name in ("fit.json", "fit.png", "fit.h5"):
+        if (out / name).is_dir():
+            raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in ("fit.json", "fit.png", "fit.h5"):
-            with (out / name).open("ab"):
-                pass
+        with tempfile.TemporaryFile(dir=out):
+            pass
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
 

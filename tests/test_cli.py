@@ -114,6 +114,11 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
     (tmp_path / "fit").write_text("mine")
     assert main([str(PORCINE), "--out", str(tmp_path / "fit")]) == 2
     assert "is a file" in capsys.readouterr().err
+    assert main([str(PORCINE), "--out", str(tmp_path / "fit" / "deeper")]) == 2
+    assert "name a folder that can be written" in capsys.readouterr().err
+    (tmp_path / "out" / "fit.h5").mkdir(parents=True)
+    assert main([str(PORCINE), "--out", str(tmp_path / "out")]) == 2
+    assert "fit.h5 in it is a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("module", ["fitting", "liverjax"])
