@@ -18,9 +18,12 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 class Invariants(NamedTuple):
     """What a strain energy may depend on, each of shape (E,); `None` where the law does not ask for it."""
 
-    I1: Any = None
-    I2: Any = None
-    J: Any = None
+    I1: Any = None  # tr C
+    I2: Any = None  # (I1^2 - tr C^2) / 2
+    I4: Any = None  # a . C a of the law's fibre direction a
+    J: Any = None  # det F
+    stretches: Any = None  # `liverjax.spectral.Stretches`
+    E: Any = None  # Green's strain, a tuple matrix in the axes of the law
 
 
 def dot(a: Vector, b: Vector) -> Any:
@@ -78,17 +81,38 @@ def right_cauchy_green(F: Matrix) -> Matrix:
     return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
-def invariants(names: tuple[str, ...], F: Matrix, C: Matrix | None) -> Invariants:
-    """The invariants in `names` and no other. `C` is needed for I2 only."""
+def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
+    """The invariants I1, I2 and J in `names` and no other."""
     values = {}
     if "I1" in names or "I2" in names:
         values["I1"] = sum(dot(row, row) for row in F)
     if "I2" in names:
-        trace_C2 = sum(dot(row, row) for row in C)
+        trace_C2 = sum(dot(row, row) for row in right_cauchy_green(F))
         values["I2"] = 0.5 * (values["I1"] * values["I1"] - trace_C2)
     if "J" in names:
         values["J"] = determinant(F)
-    return Invariants(**{n: values[n] for n in names})
+    return Invariants(**{n: values[n] for n in names if n in values})
+
+
+def green_strain(FA: Matrix) -> Matrix:
+    """E = (C - Id) / 2 in the axes A, from F A."""
+    C = right_cauchy_green(FA)
+    return tuple(tuple(0.5 * (C[i][j] - (1.0 if i == j else 0.0)) for j in range(3)) for i in range(3))
+
+
+def outer(a: Vector, b: Vector) -> Matrix:
+    """a (x) b."""
+    return tuple(scale(x, b) for x in a)
+
+
+def unit(a: Vector) -> Vector:
+    """a / |a|."""
+    return scale(1 / jnp.sqrt(dot(a, a)), a)
+
+
+def add_matrices(A: Matrix, B: Matrix) -> Matrix:
+    """A + B."""
+    return tuple(add(a, b) for a, b in zip(A, B, strict=True))
 
 
 def unpack(F: jax.Array) -> Matrix:

@@ -17,17 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from liverjax.kinematics import Matrix, deformation_gradient, dot, invariants, right_cauchy_green, transpose
+from liverjax import chapter_terms
+from liverjax.errors import InputError
+from liverjax.kinematics import Matrix, deformation_gradient, dot, transpose
 from liverjax.laws.base import Law
 from liverjax.mesh import TetMesh
-from liverjax.terms import block, first_piola, slopes, state, stress
+from liverjax.terms import blocks, first_piola, state
+
+#: Blocks that are computed; the others follow.
+_PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     """Total strain energy [J] at positions x (V, 3) [m]."""
-    F = deformation_gradient(mesh, x)
-    C = right_cauchy_green(F) if "I2" in law.invariants else None
-    return jnp.sum(mesh.volumes * law.strain_energy(invariants(law.invariants, F, C)))
+    return jnp.sum(mesh.volumes * law.strain_energy(law.measures(deformation_gradient(mesh, x))))
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
@@ -47,7 +50,7 @@ def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
 
 @jax.jit
 def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Gradient of the total energy with respect to the positions, (V, 3) [N].
+    """Gradient of the total energy with respect to the positions, (V, 3) [N]: + dW/dx.
 
     Args:
         mesh: `TetMesh`.
@@ -58,23 +61,25 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 
 def element_stiffness(
-    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False
+    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:
     """Blocks {(a, b): K_ab} [N/m] of nodes 1 <= a <= b <= 3 of every element, 45 different numbers each.
 
+    `terms` is "contracted", or "chapter" for its six terms a product (`liverjax.chapter_terms`).
     The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
-    s = state(law, deformation_gradient(mesh, x))
-    resultant = stress(s)
+    F, pairs = deformation_gradient(mesh, x), tuple((a - 1, b - 1) for a, b in _PAIRS)
     D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
-    v = [slopes(s, d) for d in D]
-    V0 = mesh.volumes
-    blocks = {}
-    for a in range(3):
-        for b in range(a, 3):
-            K = block(s, resultant, D[a], D[b], v[a], v[b], regularised)
-            blocks[a + 1, b + 1] = tuple(tuple(V0 * entry for entry in row) for row in K)
-    return blocks
+    if terms not in ("contracted", "chapter"):
+        raise InputError(f"terms = {terms!r} is not known: use contracted or chapter")
+    if terms == "chapter":
+        per_volume = chapter_terms.blocks(law, F, D, pairs, regularised)
+    else:
+        per_volume = blocks(state(law, F), D, pairs, regularised)
+    return {
+        pair: tuple(tuple(mesh.volumes * entry for entry in row) for row in K)
+        for pair, K in zip(_PAIRS, per_volume, strict=True)
+    }
 
 
 def all_blocks(blocks: dict[tuple[int, int], Matrix]) -> list[list[Matrix]]:
@@ -93,7 +98,6 @@ def all_blocks(blocks: dict[tuple[int, int], Matrix]) -> list[list[Matrix]]:
     return K
 
 
-_PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 _ENTRIES = [(a, b, r, c) for a, b in _PAIRS for r in range(3) for c in range(r if a == b else 0, 3)]
 
 
@@ -113,11 +117,13 @@ def _expansion() -> np.ndarray:
 _EXPANSION = _expansion()
 
 
-@partial(jax.jit, static_argnames="regularised")
-def element_matrices(mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False) -> jax.Array:
+@partial(jax.jit, static_argnames=("regularised", "terms"))
+def element_matrices(
+    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
+) -> jax.Array:
     """Element stiffness matrices (E, 144) [N/m], degree of freedom 3 * local node + component."""
-    blocks = element_stiffness(mesh, law, x, regularised)
-    entries = [blocks[a, b][r][c] for a, b, r, c in _ENTRIES]
+    K = element_stiffness(mesh, law, x, regularised, terms)
+    entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
     # A product with a constant writes the other 99 entries: stacked one by one they triple the time to compile.
     return jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
 
@@ -130,11 +136,14 @@ def sparse(mesh: TetMesh, entries: np.ndarray) -> scipy.sparse.csr_array:
     return scipy.sparse.coo_array((np.ravel(entries), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
 
 
-def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False) -> scipy.sparse.csr_array:
+def stiffness_matrix(
+    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
+) -> scipy.sparse.csr_array:
     """Second derivative of the total energy, scipy.sparse (3V, 3V) [N/m], degree of freedom 3 * node + component.
 
     Args:
         mesh, law, x: as in `internal_force`.
         regularised: section 4.1.2 iii, trace kept; changes the path of a Newton iteration, never its root.
+        terms: "contracted", or "chapter": its six terms for every product g(I1, I2) h(J), the same to roundoff.
     """
-    return sparse(mesh, np.asarray(element_matrices(mesh, law, x, regularised)))
+    return sparse(mesh, np.asarray(element_matrices(mesh, law, x, regularised, terms)))

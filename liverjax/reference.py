@@ -28,8 +28,18 @@ def first_piola(law: Law, F: jax.Array) -> jax.Array:
 
 def tangent(law: Law, F: jax.Array) -> jax.Array:
     """d2W/dF dF [Pa] of deformation gradients (..., 3, 3): (..., 3, 3, 3, 3) by forward over reverse mode."""
-    flat = jnp.reshape(F, (-1, 3, 3))
-    return jax.vmap(jax.jacfwd(jax.grad(law.energy)))(flat).reshape(*jnp.shape(F), 3, 3)
+    return _derivative(lambda F: first_piola(law, F), F)
+
+
+def _derivative(function, A: jax.Array) -> jax.Array:
+    """Derivative of an element-wise function of matrices (…, n, m): (…, its shape, n, m), by forward mode.
+
+    One direction for all elements at a time, so that a law may have numbers of its own for each element.
+    """
+    n, m = A.shape[-2:]
+    directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)
+    columns = jax.vmap(lambda d: jax.jvp(function, (A,), (jnp.broadcast_to(d, A.shape),))[1])(directions)
+    return jnp.moveaxis(columns, 0, -1).reshape(*columns.shape[1:], n, m)
 
 
 @jax.jit
@@ -42,14 +52,14 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     D = _all_shape_vectors(mesh)
 
-    def element(nodes, D, V0):
-        return V0 * law.energy(jnp.einsum("ai,aj->ij", nodes.reshape(4, 3), D))
+    def total(nodes):
+        return jnp.sum(mesh.volumes * law.energy(jnp.einsum("eai,eaj->eij", nodes, D)))
 
-    return jax.vmap(jax.hessian(element))(x[mesh.tetrahedra].reshape(-1, 12), D, mesh.volumes)
+    return _derivative(jax.grad(total), x[mesh.tetrahedra])
 
 
 def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
-    """Hessian of the total energy by a vmapped `jax.hessian`, (3V, 3V) [N/m]."""
+    """Hessian of the total energy by forward over reverse mode, element by element, (3V, 3V) [N/m]."""
     return sparse(mesh, np.asarray(_hessians(mesh, law, x)))
 
 
@@ -67,7 +77,7 @@ def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     F, D = _gradient(mesh, x), _all_shape_vectors(mesh)
     C = jnp.einsum("eki,ekj->eij", F, F)
-    elasticity = jax.vmap(jax.jacfwd(lambda C: 4 * jax.grad(lambda C: _energy_of_C(law, C))(C)))(C)
+    elasticity = 2 * _derivative(lambda C: _second_piola_of(law, C), C)
     elasticity = 0.5 * (elasticity + jnp.swapaxes(elasticity, -1, -2))
     rows = jnp.asarray(_VOIGT).T
     Dm = elasticity[:, rows[0], rows[1]][:, :, rows[0], rows[1]]
@@ -98,8 +108,11 @@ def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
 
 
 def _second_piola(law: Law, F: jax.Array) -> jax.Array:
-    C = jnp.einsum("eki,ekj->eij", F, F)
-    return jax.vmap(lambda C: 2 * jax.grad(lambda C: _energy_of_C(law, C))(C))(C)
+    return _second_piola_of(law, jnp.einsum("eki,ekj->eij", F, F))
+
+
+def _second_piola_of(law: Law, C: jax.Array) -> jax.Array:
+    return 2 * jax.grad(lambda C: jnp.sum(_energy_of_C(law, C)))(C)
 
 
 def _voigt(S: jax.Array) -> jax.Array:

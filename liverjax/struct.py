@@ -20,6 +20,8 @@ def param(
     lower: float | None = None,
     upper: float | None = None,
     above: float | None = None,
+    nonzero: bool = False,
+    each: bool = False,
     typical: Any = None,
     default: Any = dataclasses.MISSING,
 ) -> Any:
@@ -29,6 +31,8 @@ def param(
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
         about: one line for ``python -m liverjax laws``.
         lower, upper: inclusive bounds; ``above``: strict lower bound.
+        nonzero: 0 is refused.
+        each: a sequence, one number a term (or the components of a direction).
         typical: value for a soft tissue of about 1 kPa shear modulus, used where a law is asked for by name alone.
         default: as in `dataclasses.field`.
     """
@@ -38,6 +42,8 @@ def param(
         "lower": lower,
         "upper": upper,
         "above": above,
+        "nonzero": nonzero,
+        "each": each,
         "typical": default if typical is None and default is not dataclasses.MISSING else typical,
     }
     return dataclasses.field(default=default, metadata=metadata)

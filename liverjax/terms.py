@@ -4,23 +4,27 @@ Chapter, section 4.1.2, contracted: with J as one more invariant and v_a,i = dI_
 
     d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
 
-No matrix is inverted. `law` is anything with `invariants` and `energy_derivatives` (see `liverjax.laws.base`).
+No matrix is inverted. `law` is anything with `measures` and `energy_derivatives` (see `liverjax.laws.base`).
+Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
 """
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from liverjax import green_terms, stretch_terms
+from liverjax.axes_terms import anisotropic, half_contracted, pushed
 from liverjax.kinematics import (
     Matrix,
     Vector,
     add,
+    add_matrices,
     cofactor,
     cross,
     dot,
-    invariants,
     matmul,
     matvec,
+    outer,
     right_cauchy_green,
     scale,
     transpose,
@@ -37,6 +41,7 @@ class Stress(NamedTuple):
 class State(NamedTuple):
     """What force and stiffness share at one deformation gradient."""
 
+    law: Any
     F: Matrix
     C: Matrix | None
     cof: Matrix
@@ -44,30 +49,61 @@ class State(NamedTuple):
     J: Any
     first: dict
     second: dict
+    fibres: dict  # invariant I4 of a summand -> its fibre direction
+
+
+def summands(law: Any) -> tuple:
+    """The laws of a sum, or the law alone."""
+    return getattr(law, "laws", (law,))
 
 
 def state(law: Any, F: Matrix) -> State:
-    """Invariants that the law asks for and its scalar derivatives; C only where I2 needs it."""
-    C = right_cauchy_green(F) if "I2" in law.invariants else None
-    I = invariants(law.invariants, F, C)
-    first, second = law.energy_derivatives(I)
-    return State(F, C, cofactor(F), I.I1, I.J, first, second)
+    """Scalar derivatives of the law at F; C only where I2 needs it."""
+    first, second = law.energy_derivatives(law.measures(F))
+    cof = cofactor(F)
+    C = right_cauchy_green(F) if "I2" in first else None
+    I1 = None if C is None else C[0][0] + C[1][1] + C[2][2]
+    fibres = {key: green_terms.components(part.fibre) for key, part in fibre_invariants(law).items()}
+    return State(law, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres)
+
+
+def fibre_invariants(law: Any) -> dict[str, Any]:
+    """Names of the invariants a . C a of a law: each summand has its own fibre."""
+    parts = summands(law)
+    if len(parts) == 1:
+        return {"I4": parts[0]} if "I4" in parts[0].invariants else {}
+    return {f"I4.{k}": part for k, part in enumerate(parts) if "I4" in part.invariants}
 
 
 def stress(s: State) -> Stress:
-    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) and p = W_J; absent derivatives leave no term."""
+    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; absent derivatives leave no term."""
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
-    if W2 is None:
+    tensors = [scale_matrix(2 * s.first[key], outer(a, a)) for key, a in s.fibres.items()]
+    tensors += [stretch_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "stretch_energy")]
+    tensors += [green_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "green_energy")]
+    if W2 is not None:
+        diagonal = 2 * (W1 + s.I1 * W2)
+        C = scale_matrix(-2 * W2, s.C)
+        tensors.append(tuple(tuple(C[i][j] + (diagonal if i == j else 0.0) for j in range(3)) for i in range(3)))
+    if not tensors:
         return Stress(2 * W1, p)
-    diagonal = 2 * (W1 + s.I1 * W2)
-    C = scale(-2 * W2, s.C[0]), scale(-2 * W2, s.C[1]), scale(-2 * W2, s.C[2])
-    return Stress(tuple(tuple(C[i][j] + (diagonal if i == j else 0.0) for j in range(3)) for i in range(3)), p)
+    S = tensors[0]
+    for other in tensors[1:]:
+        S = add_matrices(S, other)
+    if W2 is None and "I1" in s.first:
+        S = tuple(tuple(S[i][j] + (2 * W1 if i == j else 0.0) for j in range(3)) for i in range(3))
+    return Stress(S, p)
+
+
+def scale_matrix(w: Any, A: Matrix) -> Matrix:
+    """Scalar times matrix."""
+    return tuple(scale(w, row) for row in A)
 
 
 def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
     """P = F S + p cof F."""
     S, p = resultant
-    FS = matmul(F, S) if isinstance(S, tuple) else tuple(scale(S, row) for row in F)
+    FS = matmul(F, S) if isinstance(S, tuple) else scale_matrix(S, F)
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
 
 
@@ -95,9 +131,9 @@ def first_piola(law: Any, F: Matrix) -> Matrix:
 
 
 def slopes(s: State, D: Vector) -> dict[str, Vector]:
-    """FD, F (I1 Id - C) D and cof(F) D: half of dI1/dx and dI2/dx, and dJ/dx, of a node with shape vector D."""
+    """dJ/dx of a node with shape vector D, and half of the slopes of I1, I2 and I4: F D, F (I1 Id - C) D, (a.D) F a."""
     FD = matvec(s.F, D)
-    v = {"I1": FD}
+    v = {"I1": FD, **{key: scale(dot(a, D), matvec(s.F, a)) for key, a in s.fibres.items()}}
     if "J" in s.first:
         v["J"] = matvec(s.cof, D)
     if s.C is not None:
@@ -105,24 +141,19 @@ def slopes(s: State, D: Vector) -> dict[str, Vector]:
     return v
 
 
-_WEIGHT = {"I1": 2.0, "I2": 2.0, "J": 1.0}
+def _weight(invariant: str) -> float:
+    return 1.0 if invariant == "J" else 2.0
 
 
-def block(s: State, resultant: Stress, Di: Vector, Dj: Vector, vi: dict, vj: dict, regularised: bool) -> Matrix:
-    """d2W/dx_i dx_j per reference volume: the chapter's G, H, I, Lambda, M and R of all terms at once.
-
-    Args:
-        s, resultant: `state` and `stress` of the element.
-        Di, Dj: shape vectors of the two nodes; vi, vj: their `slopes`.
-        regularised: replace G as in section 4.1.2 iii, with eps/3 where the chapter prints eps (the trace is kept).
-    """
+def _block(s: State, resultant: Stress, Di: Vector, Dj: Vector, vi: dict, vj: dict, regularised: bool) -> Matrix:
+    """The block of two nodes with shape vectors Di, Dj and `slopes` vi, vj, without stretches and Green's strain."""
     second = dict(s.second)
     W_JJ = second.pop(("J", "J"), None) if regularised else None
     # v_a,i (x) sum_b W_ab v_b,j: one outer product an invariant.
     partner: dict[str, Vector] = {}
     for (a, b), W in second.items():
         for row, column in dict.fromkeys(((a, b), (b, a))):
-            term = scale(W * (_WEIGHT[row] * _WEIGHT[column]), vj[column])
+            term = scale(W * (_weight(row) * _weight(column)), vj[column])
             partner[row] = add(partner[row], term) if row in partner else term
     W2 = s.first.get("I2")
     if W2 is not None:  # W_2 d2I2 = 2 W_2 (… + 2 FDi (x) FDj - FDj (x) FDi - (Di.Dj) F F^T)
@@ -152,10 +183,34 @@ def block(s: State, resultant: Stress, Di: Vector, Dj: Vector, vi: dict, vj: dic
     return tuple(tuple(row) for row in K)
 
 
+def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regularised: bool = False) -> list[Matrix]:
+    """d2W/dx_i dx_j per reference volume: the chapter's G, H, I, Lambda, M and R of all terms at once.
+
+    Args:
+        s: `state` of the element.
+        D: shape vectors of its nodes [1/m].
+        pairs: which blocks, as indices (i, j) into D.
+        regularised: replace G as in section 4.1.2 iii, with eps/3 where the chapter prints eps (the trace is kept).
+    """
+    resultant, v = stress(s), [slopes(s, d) for d in D]
+    result = [_block(s, resultant, D[i], D[j], v[i], v[j], regularised) for i, j in pairs]
+    for part in summands(s.law):
+        if hasattr(part, "stretch_energy"):
+            C = stretch_terms.moduli(part, s.F)
+            half = [half_contracted(C, d) for d in D]
+            more = [pushed(s.F, anisotropic(half[j], D[i])) for i, j in pairs]
+            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+        if hasattr(part, "green_energy"):
+            more = green_terms.blocks(part, s.F, D, pairs)
+            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+    return result
+
+
+_UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
 def tangent(law: Any, F: Matrix, regularised: bool = False) -> list[list[Matrix]]:
     """d2W/dF dF [Pa] as nested [J][L] of matrices (i, k): the blocks of shape vectors e_J and e_L."""
-    s = state(law, F)
-    e = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    v = [slopes(s, D) for D in e]
-    resultant = stress(s)
-    return [[block(s, resultant, e[J], e[L], v[J], v[L], regularised) for L in range(3)] for J in range(3)]
+    pairs = tuple((J, L) for J in range(3) for L in range(3))
+    A = blocks(state(law, F), list(_UNIT_VECTORS), pairs, regularised)
+    return [A[3 * J : 3 * J + 3] for J in range(3)]

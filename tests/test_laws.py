@@ -19,8 +19,27 @@ LAWS |= {
     "neo_hookean, log": lj.laws.NeoHookean(mu=770.0, bulk=7700.0, volumetric="log"),
     "neo_hookean, simo": lj.laws.NeoHookean(mu=770.0, bulk=7700.0, volumetric="simo"),
     "neo_hookean, isochoric": lj.laws.NeoHookean(mu=770.0, bulk=None),
+    "ogden, five terms": lj.laws.Ogden(
+        mu=(200.0, -100.0, 30.0, 50.0, -5.0), alpha=(1.3, -2.0, 5.0, 2.0, -9.0), bulk=7700.0, volumetric="log"
+    ),
+    "costa, turned": lj.laws.create(
+        "costa",
+        c=200.0,
+        b_ff=8.0,
+        b_ss=4.0,
+        b_nn=3.0,
+        b_fs=5.0,
+        b_fn=4.0,
+        b_sn=2.0,
+        bulk=7700.0,
+        fibre=[1.0, 0.3, -0.2],
+        sheet=[0.2, 1.0, 0.5],
+    ),
     "sum": lj.laws.NeoHookean(mu=500.0, bulk=700.0) + lj.laws.SaintVenantKirchhoff(mu=100.0, lame_lambda=300.0),
 }
+
+
+ANISOTROPIC = {"costa", "costa, turned"}
 
 
 def random_gradients(n: int) -> np.ndarray:
@@ -42,14 +61,19 @@ def random_gradients(n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", LAWS)
 def test_stress_and_tangent_against_autodiff(name):
+    # NumPy for maxima: jnp.max of jax 0.12.0.1 passes over NaN in arrays of several dimensions.
     law, F = LAWS[name], jnp.asarray(random_gradients(20000))
-    P, A = law.first_piola(F), law.tangent(F)
-    P_ref, A_ref = lj.reference.first_piola(law, F), lj.reference.tangent(law, F)
+    exists = np.isfinite(law.energy(F))  # the logarithmic law ends at a finite stretch
+    P, A = (np.asarray(v) for v in (law.first_piola(F), law.tangent(F)))
+    assert np.array_equal(np.isfinite(P).all(axis=(1, 2)), exists)
+    P, A = P[exists], A[exists]
+    P_ref, A_ref = (np.asarray(v)[exists] for v in (lj.reference.first_piola(law, F), lj.reference.tangent(law, F)))
     # Relative to the size of the terms that make up an entry: near rest the stress itself is their small difference.
-    size_A = jnp.abs(A_ref).max(axis=(1, 2, 3, 4))
-    size_P = jnp.abs(P_ref).max(axis=(1, 2)) + law.shear_modulus()
-    assert (jnp.abs(P - P_ref).max(axis=(1, 2)) / size_P).max() < 1e-11
-    assert (jnp.abs(A - A_ref).max(axis=(1, 2, 3, 4)) / size_A).max() < 1e-11
+    size_A = np.abs(A_ref).max(axis=(1, 2, 3, 4))
+    size_P = np.abs(P_ref).max(axis=(1, 2)) + law.shear_modulus()
+    assert exists.mean() > 0.7
+    assert (np.abs(P - P_ref).max(axis=(1, 2)) / size_P).max() < 1e-11
+    assert (np.abs(A - A_ref).max(axis=(1, 2, 3, 4)) / size_A).max() < 1e-11
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -58,11 +82,16 @@ def test_rest_state_and_stated_moduli(name):
     I = jnp.eye(3)
     G, K = law.shear_modulus(), law.bulk_modulus()
     assert abs(law.energy(I)) < 1e-12 * G
-    assert jnp.abs(law.first_piola(I)).max() < 1e-12 * (G + K)
-    A = law.tangent(I)
-    assert np.isclose(A[0, 1, 0, 1], G, rtol=1e-12)
-    assert np.isclose(A[0, 0, 0, 0], K + 4 / 3 * G, rtol=1e-12)
-    assert np.isclose(A[0, 0, 1, 1], K - 2 / 3 * G, rtol=1e-12, atol=1e-9 * G)
+    assert np.abs(law.first_piola(I)).max() < 1e-12 * (G + K)
+    A = np.asarray(law.tangent(I))
+    normal, shear = np.einsum("iijj->ij", A), np.array([A[0, 1, 0, 1], A[0, 2, 0, 2], A[1, 2, 1, 2]])
+    # Voigt's means; of an isotropic law every direction's.
+    coupled = normal[0, 1] + normal[0, 2] + normal[1, 2]
+    assert np.isclose((np.trace(normal) + 2 * coupled) / 9, K, rtol=1e-12, atol=1e-12 * G)
+    assert np.isclose((np.trace(normal) - coupled) / 15 + shear.sum() / 5, G, rtol=1e-12)
+    if name not in ANISOTROPIC:
+        assert np.allclose(shear, G, rtol=1e-12)
+        assert np.allclose(normal, K - 2 / 3 * G + 2 * G * np.eye(3), rtol=1e-12, atol=1e-9 * G)
 
 
 @pytest.mark.parametrize("name", LAWS)
@@ -70,9 +99,9 @@ def test_objective_and_symmetric(name):
     law, F = LAWS[name], jnp.asarray(random_gradients(64))
     Q = jnp.asarray(np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0])
     Q = Q * jnp.sign(jnp.linalg.det(Q))
-    assert np.allclose(law.energy(jnp.einsum("ij,njk->nik", Q, F)), law.energy(F), rtol=1e-9)
-    A = law.tangent(F)
-    assert jnp.abs(A - jnp.transpose(A, (0, 3, 4, 1, 2))).max() < 1e-12 * jnp.abs(A).max()
+    assert np.allclose(law.energy(jnp.einsum("ij,njk->nik", Q, F)), law.energy(F), rtol=1e-9, equal_nan=True)
+    A = np.asarray(law.tangent(F))
+    assert np.nanmax(np.abs(A - np.transpose(A, (0, 3, 4, 1, 2)))) < 1e-12 * np.nanmax(np.abs(A))
 
 
 def test_user_law_needs_only_its_energy():

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import mjed, reference
+from liverjax import chapter_terms, kinematics, mjed, reference, terms
+from liverjax.kinematics import deformation_gradient
 
 LAWS = list(lj.laws.LAWS)
 
@@ -45,6 +46,41 @@ def test_regularised_stiffness_keeps_the_trace(distorted_box):
     diagonal = np.arange(0, 144, 13)
     assert np.allclose(plain[:, diagonal].sum(axis=1), changed[:, diagonal].sum(axis=1), rtol=1e-12)
     assert np.abs(plain - changed).max() > 1e-2 * np.abs(plain).max()
+
+
+NO_PRODUCTS = ("stable_neo_hookean", "ogden", "bogen", "logarithmic", "exponential", "costa")
+#: A function of a sum: regularised term by term it differs from the sum's regularisation.
+FUNCTIONS = ("fung_demiray", "veronda_westmann")
+
+
+@pytest.mark.parametrize("name", [n for n in LAWS if n not in NO_PRODUCTS])
+def test_six_terms_of_the_chapter_are_the_same(name, distorted_box):
+    mesh, x = distorted_box
+    law, F = lj.laws.typical(name), deformation_gradient(mesh, x)
+    D = [tuple(mesh.shape_vectors[a]) for a in range(2)]
+    for regularised in (False,) if name in FUNCTIONS else (False, True):
+        contracted = terms.blocks(terms.state(law, F), D, ((0, 1), (1, 1)), regularised)
+        six = chapter_terms.blocks(law, F, D, ((0, 1), (1, 1)), regularised)
+        for a, b in zip(contracted, six, strict=True):
+            a, b = np.asarray(kinematics.pack(a)), np.asarray(kinematics.pack(b))
+            assert np.abs(a - b).max() < 1e-12 * np.abs(a).max()
+    P, P_six = (np.asarray(kinematics.pack(t.first_piola(law, F))) for t in (terms, chapter_terms))
+    assert np.abs(P - P_six).max() < 1e-12 * np.abs(P).max()
+
+
+def test_stiffness_matrix_in_the_chapters_form(distorted_box):
+    mesh, x = distorted_box
+    law = lj.laws.typical("neo_hookean")
+    K = mjed.stiffness_matrix(mesh, law, x)
+    assert np.abs(mjed.stiffness_matrix(mesh, law, x, terms="chapter") - K).max() < 1e-12 * np.abs(K).max()
+
+
+def test_a_law_that_is_no_product_is_refused_in_the_chapters_form(distorted_box):
+    mesh, x = distorted_box
+    with pytest.raises(lj.InputError, match="Ogden is no sum of products"):
+        mjed.stiffness_matrix(mesh, lj.laws.typical("ogden"), x, terms="chapter")
+    with pytest.raises(lj.InputError, match="use contracted or chapter"):
+        mjed.stiffness_matrix(mesh, lj.laws.typical("yeoh"), x, terms="six")
 
 
 #: FEBio's energies (README of its results): lambda = 3080, mu = 770, k = 7700, U = k/2 ln^2 J.

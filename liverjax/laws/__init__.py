@@ -11,11 +11,13 @@ import numpy as np
 from liverjax.errors import InputError
 from liverjax.laws.arruda_boyce import ArrudaBoyce
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.laws.costa import Costa
 from liverjax.laws.exponential_invariants import FungDemiray, VerondaWestmann
 from liverjax.laws.mooney_rivlin import MooneyRivlin
 from liverjax.laws.neo_hookean import NeoHookean, NeoHookeanCompressible
 from liverjax.laws.saint_venant_kirchhoff import SaintVenantKirchhoff
 from liverjax.laws.stable_neo_hookean import StableNeoHookean
+from liverjax.laws.stretches import Bogen, Exponential, Logarithmic, Ogden
 from liverjax.laws.volumetric import VOLUMETRIC
 from liverjax.laws.yeoh import Yeoh
 from liverjax.struct import replace
@@ -23,11 +25,16 @@ from liverjax.struct import replace
 __all__ = [
     "LAWS",
     "ArrudaBoyce",
+    "Bogen",
+    "Costa",
+    "Exponential",
     "FungDemiray",
     "Law",
+    "Logarithmic",
     "MooneyRivlin",
     "NeoHookean",
     "NeoHookeanCompressible",
+    "Ogden",
     "SaintVenantKirchhoff",
     "StableNeoHookean",
     "Sum",
@@ -52,8 +59,13 @@ LAWS: dict[str, type[Law]] = {
     "mooney_rivlin": MooneyRivlin,
     "yeoh": Yeoh,
     "arruda_boyce": ArrudaBoyce,
+    "ogden": Ogden,
+    "bogen": Bogen,
+    "logarithmic": Logarithmic,
+    "exponential": Exponential,
     "fung_demiray": FungDemiray,
     "veronda_westmann": VerondaWestmann,
+    "costa": Costa,
 }
 
 
@@ -94,7 +106,15 @@ def create(name: str, **values: Any) -> Law:
         if value is None and known[key].default is None:
             continue  # an optional coefficient left out
         _check_value(f"law {name}: {key}", known[key].metadata, value)
-    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    law = cls(**{k: _sequence(v) if known[k].metadata.get("each") else v for k, v in values.items()})
+    if hasattr(law, "check") and not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(law)):
+        law.check()
+    return law
+
+
+def _sequence(value: Any) -> Any:
+    """One number a term as a tuple, so that each is a leaf; directions of elements stay an array."""
+    return jnp.asarray(value) if np.ndim(value) > 1 else tuple(value)
 
 
 def _check_value(where: str, metadata: Any, value: Any) -> None:
@@ -111,6 +131,11 @@ def _check_value(where: str, metadata: Any, value: Any) -> None:
     except (TypeError, ValueError):
         raise InputError(f"{where} = {value!r} is not a number: give a value in {metadata['unit']}") from None
     above, lower, upper = metadata.get("above"), metadata.get("lower"), metadata.get("upper")
+    if metadata["each"] != (np.ndim(value) > 0):
+        shape = "a list of numbers" if metadata["each"] else "one number"
+        raise InputError(f"{where} = {value} is not {shape}: give {shape} in {metadata['unit']}")
+    if metadata["nonzero"] and np.any(numbers == 0):
+        raise InputError(f"{where} = {value} must not be 0: give another exponent")
     if not np.all(np.isfinite(numbers)):
         raise InputError(f"{where} = {value} is not finite: give a number in {metadata['unit']}")
     if above is not None and np.any(numbers <= above):

@@ -1,11 +1,16 @@
-"""What a material law is: a strain energy of invariants, and its scalar derivatives.
+"""What a material law is: a strain energy, and its derivatives with respect to what it depends on.
 
-Two ways to write one, both a frozen pytree made with `liverjax.struct.struct`:
+A law is a frozen pytree made with `liverjax.struct.struct`. It states one or more of
 
-* override `strain_energy(I)`: the whole energy; derivatives come from scalar automatic differentiation, or from an
-  `energy_derivatives(I)` written by hand;
-* override `isochoric_energy(Ibar1, Ibar2)` and have fields `bulk` and `volumetric`: the base class adds U(J) and
-  differentiates J^(-2/3) I1 and J^(-4/3) I2; `isochoric_derivatives` may be written by hand.
+* `isochoric_energy(Ibar1, Ibar2)` of J^(-2/3) I1 and J^(-4/3) I2;
+* `stretch_energy(X_1, …)` of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3, with `exponents()` giving the alpha_k;
+* `green_energy(E)` of Green's strain in the axes `fibre`, `sheet` and their normal (the coordinate axes without them);
+* the volumetric energy U(J): fields `bulk` and `volumetric`;
+
+which add up, or overrides `strain_energy(I)`, the whole energy of the `invariants` it names (I1, I2, I4, J;
+I4 = a . C a needs a field `fibre`). Only what is named is computed. Derivatives come from scalar automatic
+differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_derivatives` or `energy_derivatives` are
+written by hand.
 """
 
 from typing import Any, ClassVar
@@ -15,15 +20,29 @@ import jax.numpy as jnp
 
 from liverjax import terms
 from liverjax.errors import InputError
-from liverjax.kinematics import Invariants, invariants, pack, right_cauchy_green, unpack
+from liverjax.green_terms import components, material_axes
+from liverjax.kinematics import (
+    Invariants,
+    Matrix,
+    determinant,
+    dot,
+    green_strain,
+    invariants,
+    matmul,
+    matvec,
+    pack,
+    unpack,
+)
 from liverjax.laws.volumetric import volumetric
+from liverjax.spectral import power_sum, stretches
 from liverjax.struct import param, replace, static, struct
+from liverjax.terms import fibre_invariants, summands
 
 First = dict[str, Any]
 Second = dict[tuple[str, str], Any]
 
-#: Order of the invariants; keys of second derivatives are pairs in this order.
-ORDER = ("I1", "I2", "J")
+#: Scalar invariants in order; keys of second derivatives are pairs in this order.
+ORDER = ("I1", "I2", "I4", "J")
 
 
 class Law:
@@ -35,15 +54,26 @@ class Law:
     # -- what a law states -------------------------------------------------------------------------------------------
 
     def strain_energy(self, I: Invariants) -> Any:
-        """Energy density [Pa] of the invariants named in `invariants`."""
-        W = self.isochoric_energy(*reduced(I))
+        """Energy density [Pa] of what the law names."""
+        W = 0.0
+        if hasattr(self, "isochoric_energy"):
+            W = W + self.isochoric_energy(*reduced(I))
+        if hasattr(self, "stretch_energy"):
+            W = W + self.stretch_energy(*(power_sum(I.stretches, a) for a in self.exponents()))
+        if hasattr(self, "green_energy"):
+            W = W + self.green_energy(I.E)
         return W if self.bulk is None else W + volumetric(self.volumetric, self.bulk, I.J)[0]
 
     def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
-        """dW/dI_a and d2W/dI_a dI_b; a missing key is a structural zero and costs nothing."""
-        if hasattr(self, "isochoric_energy"):
-            return _split_derivatives(self, I)
-        return autodiff_derivatives(self, I)
+        """dW/dI_a and d2W/dI_a dI_b of scalar invariants; a missing key is a structural zero and costs nothing."""
+        if type(self).strain_energy is not Law.strain_energy:
+            return autodiff_derivatives(self, I)
+        first, second = split_derivatives(self, I) if hasattr(self, "isochoric_energy") else ({}, {})
+        if self.bulk is not None:
+            _, U1, U2 = volumetric(self.volumetric, self.bulk, I.J)
+            first["J"] = first["J"] + U1 if "J" in first else U1
+            second["J", "J"] = second["J", "J"] + U2 if ("J", "J") in second else U2
+        return first, second
 
     def shear_modulus(self) -> Any:
         """Ground-state shear modulus [Pa]."""
@@ -55,10 +85,21 @@ class Law:
 
     # -- what a law can then do --------------------------------------------------------------------------------------
 
+    def measures(self, F: Matrix) -> Invariants:
+        """What `strain_energy` takes, at the tuple matrix F."""
+        I = invariants(self.invariants, F)
+        if "I4" in self.invariants:
+            Fa = matvec(F, components(self.fibre))
+            I = I._replace(I4=dot(Fa, Fa))
+        if hasattr(self, "green_energy"):
+            I = I._replace(E=green_strain(matmul(F, material_axes(self))))
+        if hasattr(self, "stretch_energy"):
+            I = I._replace(stretches=stretches(F))
+        return I if self.bulk is None else I._replace(J=determinant(F))
+
     def energy(self, F: jax.Array) -> jax.Array:
         """Strain energy density [Pa], shape (...), of deformation gradients (..., 3, 3)."""
-        Fm = unpack(_floating(F))
-        return self.strain_energy(invariants(self.invariants, Fm, right_cauchy_green(Fm)))
+        return self.strain_energy(self.measures(unpack(_floating(F))))
 
     def first_piola(self, F: jax.Array) -> jax.Array:
         """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), by the hand-derived MJED terms."""
@@ -87,22 +128,25 @@ class Sum(Law):
 
     laws: tuple = param("1", "laws that add up")
 
-    @property
-    def invariants(self) -> tuple[str, ...]:
-        """Union of what the summands need."""
-        return tuple(n for n in ORDER if any(n in law.invariants for law in self.laws))
+    def measures(self, F):
+        """One set of invariants a summand: what two of them share is computed once."""
+        return tuple(law.measures(F) for law in self.laws)
 
     def strain_energy(self, I):
         """Sum of the energies."""
-        return sum(law.strain_energy(I) for law in self.laws)
+        return sum(law.strain_energy(i) for law, i in zip(self.laws, I, strict=True))
 
     def energy_derivatives(self, I):
         """Sum of the scalar derivatives: summed before anything is assembled, so a second law costs only scalars."""
         first, second = {}, {}
-        for law in self.laws:
-            for total, part in zip((first, second), law.energy_derivatives(I), strict=True):
-                for key, value in part.items():
-                    total[key] = total[key] + value if key in total else value
+        fibres = fibre_invariants(self)
+        for law, i in zip(self.laws, I, strict=True):
+            own = {"I4": next((key for key, part in fibres.items() if part is law), None)}
+            slopes, curvatures = law.energy_derivatives(i)
+            for a, value in slopes.items():
+                _accumulate(first, own.get(a, a), value)
+            for (a, b), value in curvatures.items():
+                _accumulate(second, (own.get(a, a), own.get(b, b)), value)
         return first, second
 
     def shear_modulus(self):
@@ -139,9 +183,8 @@ class Volumetric(Law):
         return 0.0
 
 
-def summands(law: Law) -> tuple[Law, ...]:
-    """The laws of a sum, or the law alone."""
-    return law.laws if isinstance(law, Sum) else (law,)
+def _accumulate(total: dict, key: Any, value: Any) -> None:
+    total[key] = total[key] + value if key in total else value
 
 
 def reduced(I: Invariants) -> tuple[Any, Any]:
@@ -150,7 +193,7 @@ def reduced(I: Invariants) -> tuple[Any, Any]:
     return (None if I.I1 is None else m * I.I1), (None if I.I2 is None else m * m * I.I2)
 
 
-def _split_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
+def split_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
     """Chain rule from w(Ibar1, Ibar2) + U(J) to I1, I2, J (mathematics of the chapter's section 4.1.2, contracted)."""
     m = I.J ** (-2 / 3)
     inverse_J = 1 / I.J
@@ -159,7 +202,7 @@ def _split_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
         Ibar["I2"] = m * m * I.I2
     power = {"I1": m, "I2": m * m}
     p = {"I1": -2 / 3, "I2": -4 / 3}
-    w1, w2 = law.isochoric_derivatives(Ibar.get("I1"), Ibar.get("I2"))
+    w1, w2 = _isochoric_derivatives(law, Ibar)
     slope_J = {a: p[a] * Ibar[a] * inverse_J for a in w1}  # dIbar_a/dJ
 
     first = {a: w * power[a] for a, w in w1.items()}
@@ -173,39 +216,43 @@ def _split_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
         if a != b:
             second[b, "J"] = second[b, "J"] + w * power[b] * slope_J[a]
         second["J", "J"] = second["J", "J"] + (1 if a == b else 2) * w * slope_J[a] * slope_J[b]
-    if law.bulk is not None:
-        _, U1, U2 = volumetric(law.volumetric, law.bulk, I.J)
-        first["J"], second["J", "J"] = first["J"] + U1, second["J", "J"] + U2
     return first, second
+
+
+def _isochoric_derivatives(law: Law, Ibar: dict) -> tuple[First, Second]:
+    if hasattr(law, "isochoric_derivatives"):
+        return law.isochoric_derivatives(Ibar.get("I1"), Ibar.get("I2"))
+    return _scalar_derivatives(lambda **I: law.isochoric_energy(I.get("I1"), I.get("I2")), Ibar)
 
 
 def autodiff_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
     """The scalar derivatives of `law.strain_energy` by forward mode: what a law gets that states only its energy."""
-    names = [n for n in ORDER if n in law.invariants]
-    values = tuple(getattr(I, n) for n in names)
-    ones = [
-        tuple(jnp.ones_like(v) if k == j else jnp.zeros_like(v) for k, v in enumerate(values))
-        for j in range(len(names))
-    ]
+    values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
+    return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
 
-    def W(*v):
-        return law.strain_energy(Invariants(**dict(zip(names, v, strict=True))))
 
-    def slope(j):
-        return lambda *v: jax.jvp(W, v, ones[j])[1]
+def _scalar_derivatives(W: Any, values: dict) -> tuple[First, Second]:
+    names = list(values)
 
-    first = {n: slope(j)(*values) for j, n in enumerate(names)}
-    second = {
-        (names[a], names[b]): jax.jvp(slope(a), values, ones[b])[1]
-        for a in range(len(names))
-        for b in range(a, len(names))
-    }
-    return first, second
+    def slope(a):
+        tangents = {n: jnp.ones_like(v) if n == a else jnp.zeros_like(v) for n, v in values.items()}
+        return lambda v: jax.jvp(lambda v: W(**v), (v,), (tangents,))[1]
+
+    def curvature(a, b):
+        tangents = {n: jnp.ones_like(v) if n == b else jnp.zeros_like(v) for n, v in values.items()}
+        return jax.jvp(slope(a), (values,), (tangents,))[1]
+
+    first = {a: slope(a)(values) for a in names}
+    return first, {(a, b): curvature(a, b) for k, a in enumerate(names) for b in names[k:]}
+
+
+def _is_split(law: Law) -> bool:
+    return hasattr(law, "isochoric_energy") or hasattr(law, "stretch_energy")
 
 
 def isochoric_part(law: Law) -> Law | None:
     """The law without its volumetric energy, or `None` where an energy has no such split (or is only volumetric)."""
-    parts = [replace(s, bulk=None) if hasattr(s, "isochoric_energy") else None for s in summands(law)]
+    parts = [replace(s, bulk=None) if _is_split(s) else None for s in summands(law)]
     if any(p is None and not isinstance(s, Volumetric) for p, s in zip(parts, summands(law), strict=True)):
         return None
     kept = tuple(p for p in parts if p is not None)

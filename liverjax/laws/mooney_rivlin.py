@@ -42,13 +42,14 @@ class MooneyRivlin(Law):
     volumetric: str = static("quadratic", "quadratic, log or simo")
     invariants: ClassVar = ("I1", "I2", "J")
 
-    def _terms(self):
+    def terms(self):
+        """Coefficient and powers of every monomial that is there."""
         return [(getattr(self, name), i, j) for name, (i, j) in _POWERS.items() if getattr(self, name) is not None]
 
     def isochoric_energy(self, I1, I2):
         """Polynomial in the deviations from rest."""
         a, b = I1 - 3, I2 - 3
-        return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self._terms())
+        return sum(c * _monomial(1.0, (a, i), (b, j)) for c, i, j in self.terms())
 
     def isochoric_derivatives(self, I1, I2):
         """Derivatives of the monomials; terms that vanish identically are left out."""
@@ -58,7 +59,7 @@ class MooneyRivlin(Law):
         def put(table, key, value):
             table[key] = table[key] + value if key in table else value
 
-        for c, i, j in self._terms():
+        for c, i, j in self.terms():
             if i:
                 put(first, "I1", c * _monomial(i, (a, i - 1), (b, j)))
             if j:

@@ -1,0 +1,81 @@
+"""Costa's law of fibrous tissue; Guccione's is its transversely isotropic case."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.axes_terms import SIX, symmetric
+from liverjax.errors import InputError
+from liverjax.green_terms import Moduli
+from liverjax.laws.base import Law
+from liverjax.struct import param, static, struct
+
+
+@struct
+class Costa(Law):
+    """W = c/2 (exp Q - 1) + U(J), Q = sum b_AB E_AB^2 over fibre, sheet, normal, shear pairs counted twice.
+
+    Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2).
+    Chapter, Table 1; Costa, Holmes and McCulloch 2001. E is Green's strain in the axes fibre, sheet (made orthogonal to
+    the fibre) and normal. Not an isochoric energy: it adds to the bulk modulus.
+    """
+
+    c: Any = param("Pa", "scale", above=0.0, typical=200.0)
+    b_ff: Any = param("1", "along the fibre", above=0.0, typical=8.0)
+    b_ss: Any = param("1", "along the sheet", above=0.0, typical=4.0)
+    b_nn: Any = param("1", "along the normal", above=0.0, typical=3.0)
+    b_fs: Any = param("1", "shear fibre-sheet", above=0.0, typical=5.0)
+    b_fn: Any = param("1", "shear fibre-normal", above=0.0, typical=4.0)
+    b_sn: Any = param("1", "shear sheet-normal", above=0.0, typical=2.0)
+    bulk: Any = param("Pa", "bulk modulus of U(J)", above=0.0, typical=7700.0)
+    fibre: Any = param("1", "fibre direction, (3,) or (E, 3)", each=True, default=(1.0, 0.0, 0.0))
+    sheet: Any = param("1", "sheet direction, (3,) or (E, 3)", each=True, default=(0.0, 1.0, 0.0))
+    volumetric: str = static("quadratic", "quadratic, log or simo")
+    invariants: ClassVar = ("E", "J")
+
+    def _weights(self):
+        return (self.b_ff, self.b_ss, self.b_nn, self.b_fs, self.b_fn, self.b_sn)
+
+    def _exponent(self, E):
+        terms = [b * E[i][j] ** 2 for b, (i, j) in zip(self._weights(), SIX, strict=True)]
+        return sum(terms[:3]) + 2 * sum(terms[3:])
+
+    def green_energy(self, E):
+        """By expm1: no cancellation at rest."""
+        return 0.5 * self.c * jnp.expm1(self._exponent(E))
+
+    def green_derivatives(self, E):
+        """S_AB = s b_AB E_AB with s = c exp Q, and moduli s b_AB (half for shears) + 2/s S (x) S."""
+        s = self.c * jnp.exp(self._exponent(E))
+        b = self._weights()
+        S = symmetric(tuple(s * w * E[i][j] for w, (i, j) in zip(b, SIX, strict=True)))
+        normal = symmetric((s * b[0], s * b[1], s * b[2], 0.0, 0.0, 0.0))
+        return S, Moduli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
+
+    def shear_modulus(self):
+        """Mean over all shears (Voigt's), c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
+        b = self._weights()
+        return self.c * (sum(b[:3]) / 15 + sum(b[3:]) / 10)
+
+    def bulk_modulus(self):
+        """Voigt's: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
+        return self.bulk + self.c * sum(self._weights()[:3]) / 9
+
+    def check(self):
+        """InputError where a direction has no length or the sheet lies along the fibre."""
+        f, s = np.asarray(self.fibre, float), np.asarray(self.sheet, float)
+        if f.shape[-1:] != (3,) or s.shape[-1:] != (3,):
+            raise InputError(
+                f"law costa: fibre and sheet have shapes {f.shape} and {s.shape}: give (3,) or one row of 3 an element"
+            )
+        size = np.linalg.norm(f, axis=-1) * np.linalg.norm(s, axis=-1)
+        if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):
+            raise InputError(
+                "law costa: sheet lies along fibre, or one of them is zero: give two directions that differ"
+            )
+
+    @classmethod
+    def guccione(cls, *, c: Any, b_f: Any, b_t: Any, b_fs: Any, bulk: Any, **directions: Any) -> "Costa":
+        """Guccione, McCulloch and Waldman 1991: b_ff = b_f, b_ss = b_nn = b_sn = b_t, b_fs = b_fn = b_fs."""
+        return cls(c=c, b_ff=b_f, b_ss=b_t, b_nn=b_t, b_sn=b_t, b_fs=b_fs, b_fn=b_fs, bulk=bulk, **directions)

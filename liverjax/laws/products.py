@@ -1,0 +1,91 @@
+"""Laws as the chapter decomposes them (section 4.1.2 i): sums of products g(I1, I2) h(J), functions of such sums."""
+
+from collections.abc import Callable
+from math import comb
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from liverjax.errors import InputError
+from liverjax.kinematics import Invariants
+from liverjax.laws.arruda_boyce import COEFFICIENTS, ArrudaBoyce
+from liverjax.laws.base import Law, Volumetric
+from liverjax.laws.exponential_invariants import FungDemiray, VerondaWestmann
+from liverjax.laws.mooney_rivlin import MooneyRivlin
+from liverjax.laws.neo_hookean import NeoHookean, NeoHookeanCompressible
+from liverjax.laws.saint_venant_kirchhoff import SaintVenantKirchhoff
+from liverjax.laws.volumetric import volumetric
+from liverjax.laws.yeoh import Yeoh
+
+
+class Product(NamedTuple):
+    """W^k = c I1^i I2^j J^p."""
+
+    c: Any
+    i: int
+    j: int
+    p: float
+
+
+class Group(NamedTuple):
+    """phi(sum_k W^k); `slopes` gives phi' and phi'' of the sum, `None` stands for the sum itself."""
+
+    products: list[Product]
+    slopes: Callable[[Any], tuple[Any, Any]] | None = None
+
+
+def _isochoric(c: Any, i: int, j: int) -> list[Product]:
+    """c (Ibar1 - 3)^i (Ibar2 - 3)^j by the binomial theorem, without its constant."""
+    return [
+        Product(c * comb(i, a) * comb(j, b) * (-3.0) ** (i - a + j - b), a, b, -2 * a / 3 - 4 * b / 3)
+        for a in range(i + 1)
+        for b in range(j + 1)
+        if a + b
+    ]
+
+
+def groups(law: Law) -> list[Group]:
+    """The products of a single law; `InputError` for a law that is none of invariants I1, I2 and J in that form."""
+    match law:
+        case NeoHookean():
+            return [Group(_isochoric(law.mu / 2, 1, 0))]
+        case NeoHookeanCompressible():
+            return [Group([Product(law.mu / 2, 1, 0, 0.0)])]
+        case SaintVenantKirchhoff():
+            a, m = law.lame_lambda / 8 + law.mu / 4, law.mu
+            linear = -3 / 4 * law.lame_lambda - m / 2
+            return [Group([Product(a, 2, 0, 0.0), Product(linear, 1, 0, 0.0), Product(-m / 2, 0, 1, 0.0)])]
+        case MooneyRivlin():
+            return [Group([p for c, i, j in law.terms() for p in _isochoric(c, i, j)])]
+        case Yeoh():
+            return [Group([p for k, c in enumerate((law.c1, law.c2, law.c3), 1) for p in _isochoric(c, k, 0)])]
+        case ArrudaBoyce():
+            N = law.chain_length
+            return [
+                Group([Product(law.mu * c / N ** (k - 1), k, 0, -2 * k / 3) for k, c in enumerate(COEFFICIENTS, 1)])
+            ]
+        case FungDemiray():
+            return [_exponential(law.c1 / (2 * law.c2), law.c2)]
+        case VerondaWestmann():
+            return [_exponential(law.c1, law.c2), Group([Product(-law.c1 * law.c2 / 2, 0, 1, -4 / 3)])]
+        case Volumetric():
+            return []
+    raise InputError(f"law {type(law).__name__} is no sum of products g(I1, I2) h(J): use terms = 'contracted'")
+
+
+def _exponential(scale: Any, factor: Any) -> Group:
+    """scale exp(factor (Ibar1 - 3))."""
+
+    def slopes(s: Any) -> tuple[Any, Any]:
+        e = scale * factor * jnp.exp(factor * (s - 3))
+        return e, factor * e
+
+    return Group([Product(1.0, 1, 0, -2 / 3)], slopes)
+
+
+def functions_of_volume(law: Law, J: Any) -> list[tuple[Any, Any]]:
+    """h' and h'' of the products whose g is 1."""
+    if isinstance(law, NeoHookeanCompressible):
+        first, second = law.energy_derivatives(Invariants(J=J))
+        return [(first["J"], second["J", "J"])]
+    return [] if law.bulk is None else [volumetric(law.volumetric, law.bulk, J)[1:]]

@@ -1,0 +1,125 @@
+"""Fibre laws: Costa, Guccione, directions of each element, and I4 of users' own laws."""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import mjed, reference
+
+COSTA = dict(c=200.0, b_ff=8.0, b_ss=4.0, b_nn=3.0, b_fs=5.0, b_fn=4.0, b_sn=2.0, bulk=7700.0)
+
+
+@lj.struct
+class Holzapfel(lj.Law):
+    """Neo-Hookean matrix and one family of fibres (Holzapfel, Gasser and Ogden 2000): only its energy is written."""
+
+    mu: Any = lj.param("Pa", typical=500.0)
+    k1: Any = lj.param("Pa", typical=100.0)
+    k2: Any = lj.param("1", typical=2.0)
+    bulk: Any = lj.param("Pa", typical=5000.0)
+    fibre: Any = lj.param("1", each=True, default=(1.0, 0.0, 0.0))
+    volumetric: str = lj.static("quadratic")
+    invariants: ClassVar = ("I1", "I4", "J")
+
+    def strain_energy(self, I):
+        """mu/2 (Ibar1 - 3) + k1/(2 k2) (exp(k2 (I4 - 1)^2) - 1) + K/2 (J - 1)^2."""
+        fibres = self.k1 / (2 * self.k2) * jnp.expm1(self.k2 * (I.I4 - 1) ** 2)
+        return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + fibres + self.bulk / 2 * (I.J - 1) ** 2
+
+
+@lj.struct
+class FungOfGreen(lj.Law):
+    """A user's exponential of Green's strain: no derivative by hand, no fibre, no bulk."""
+
+    c: Any = lj.param("Pa", typical=500.0)
+
+    def green_energy(self, E):
+        """c (exp(2 E_xx^2 + E_yy^2 + E_xy E_xy + E_yz^2 + E_xx E_zz) - 1)."""
+        Q = 2 * E[0][0] ** 2 + E[1][1] ** 2 + E[0][1] ** 2 + E[1][2] ** 2 + E[0][0] * E[2][2]
+        return self.c * jnp.expm1(Q)
+
+
+def directions(n: int) -> np.ndarray:
+    """One direction an element, not of unit length."""
+    return np.random.default_rng(7).standard_normal((n, 3))
+
+
+def laws(n: int) -> dict:
+    """Laws with one direction, with one an element, and sums of them."""
+    a, b = directions(n), directions(n)[::-1].copy()
+    return {
+        "costa, one direction": lj.laws.create("costa", **COSTA, fibre=[1.0, 0.2, 0.0], sheet=[0.0, 1.0, 0.3]),
+        "costa, one an element": lj.laws.create("costa", **COSTA, fibre=a, sheet=b),
+        "I4": Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=(0.5, 0.5, 0.1)),
+        "I4, one an element": Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=a),
+        "two families": Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=a)
+        + Holzapfel(mu=0.0, k1=300.0, k2=1.0, bulk=0.0, fibre=b),
+        "fibres and stretches": lj.laws.create("costa", **COSTA, fibre=a, sheet=b) + lj.laws.typical("ogden"),
+        "user's energy of Green's strain": FungOfGreen(c=500.0) + lj.laws.typical("neo_hookean"),
+    }
+
+
+@pytest.mark.parametrize("name", laws(8))
+def test_force_and_stiffness_against_both_references(name, distorted_box):
+    mesh, x = distorted_box
+    x = 0.5 * (x + mesh.points)  # exponentials of Green's strain
+    law = laws(mesh.number_of_elements)[name]
+    f, K = np.asarray(mjed.internal_force(mesh, law, x)), mjed.stiffness_matrix(mesh, law, x)
+    assert np.isclose(mjed.energy(mesh, law, x), reference.energy(mesh, law, x), rtol=1e-13)
+    for force in (reference.internal_force, reference.standard_internal_force):
+        assert np.abs(np.asarray(force(mesh, law, x)) - f).max() < 1e-11 * np.abs(f).max()
+    for stiffness in (reference.stiffness_matrix, reference.standard_stiffness_matrix):
+        assert np.abs(stiffness(mesh, law, x) - K).max() < 1e-11 * np.abs(K).max()
+
+
+def test_one_direction_and_the_same_for_each_element_agree(distorted_box):
+    mesh, x = distorted_box
+    one = lj.laws.create("costa", **COSTA, fibre=[1.0, 0.2, 0.0], sheet=[0.0, 1.0, 0.3])
+    rows = np.ones((mesh.number_of_elements, 1))
+    each = lj.laws.create("costa", **COSTA, fibre=rows * [[1.0, 0.2, 0.0]], sheet=rows * [[0.0, 1.0, 0.3]])
+    assert np.allclose(mjed.internal_force(mesh, one, x), mjed.internal_force(mesh, each, x), rtol=1e-13, atol=1e-12)
+
+
+def test_guccione_is_transversely_isotropic_and_stiffer_along_the_fibre():
+    # Land et al. 2015: C = 2 kPa, b_f = 8, b_t = 2, b_fs = 4.
+    law = lj.laws.Costa.guccione(c=2000.0, b_f=8.0, b_t=2.0, b_fs=4.0, bulk=1e5)
+    c, s = np.cos(0.7), np.sin(0.7)
+    about_fibre = jnp.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    F = jnp.eye(3) + 0.2 * jnp.asarray(np.random.default_rng(1).standard_normal((3, 3)))
+    assert np.isclose(law.energy(F @ about_fibre), law.energy(F), rtol=1e-12)
+    E = 0.5 * (F.T @ F - jnp.eye(3))
+    Q = 8 * E[0, 0] ** 2 + 2 * (E[1, 1] ** 2 + E[2, 2] ** 2 + 2 * E[1, 2] ** 2) + 4 * 2 * (E[0, 1] ** 2 + E[0, 2] ** 2)
+    assert np.isclose(law.energy(F), 1000 * jnp.expm1(Q) + 5e4 * (jnp.linalg.det(F) - 1) ** 2, rtol=1e-12)
+    along, across = (law.energy(jnp.diag(jnp.array(v))) for v in ((1.2, 1.0, 1.0), (1.0, 1.2, 1.0)))
+    volumetric = 5e4 * 0.2**2
+    assert along - volumetric > 4 * (across - volumetric)
+
+
+def test_derivative_by_the_fibre_angle():
+    F = jnp.diag(jnp.array([1.2, 0.9, 1.0]))
+
+    def energy(angle):
+        turned = jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
+        across = jnp.array([-jnp.sin(angle), jnp.cos(angle), 0.0])
+        return lj.laws.Costa(**COSTA, fibre=turned, sheet=across).energy(F)
+
+    h = 1e-5
+    assert np.isclose(jax.grad(energy)(0.3), (energy(0.3 + h) - energy(0.3 - h)) / (2 * h), rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("directions", "sentence"),
+    [
+        ({"sheet": [2.0, 0.0, 0.0]}, "sheet lies along fibre"),
+        ({"fibre": [0.0, 0.0, 0.0]}, "one of them is zero"),
+        ({"fibre": [1.0, 0.0]}, r"give \(3,\)"),
+        ({"fibre": 1.0}, "a list of numbers"),
+    ],
+)
+def test_unusable_directions_are_refused(directions, sentence):
+    with pytest.raises(lj.InputError, match=sentence):
+        lj.laws.create("costa", **COSTA, **directions)
