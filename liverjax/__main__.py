@@ -1,7 +1,11 @@
-"""``python -m liverjax laws``: what the simulator offers."""
+"""``python -m liverjax laws | check | plot``: what the simulator offers, and whether a law is right."""
 
 import argparse
+import dataclasses
+import os
 import sys
+import tempfile
+from pathlib import Path
 
 from liverjax import laws
 from liverjax.errors import InputError
@@ -11,6 +15,7 @@ def _bounds(metadata) -> str:
     parts = [f"> {metadata['above']:g}"] if metadata.get("above") is not None else []
     parts += [f">= {metadata['lower']:g}"] if metadata.get("lower") is not None else []
     parts += [f"<= {metadata['upper']:g}"] if metadata.get("upper") is not None else []
+    parts += ["not 0"] if metadata.get("nonzero") else []
     return ", ".join(parts) or "any"
 
 
@@ -21,22 +26,91 @@ def list_laws() -> None:
         for field in laws.parameters(cls):
             m = field.metadata
             optional = ", optional" if field.default is None else ""
+            if field.default not in (None, dataclasses.MISSING):
+                optional = f", default {field.default}"
             print(f"    {field.name:14s} [{m['unit']}]  {_bounds(m):8s} {m['about']}{optional}")
+
+
+def check_law(name: str, out: Path) -> int:
+    """Print the table of a law's gradient check and draw it; 1 if a row failed."""
+    from liverjax import check, figures
+
+    law = check.load(name)
+    file = _picture(out, f"check_{_label(name)}.png")
+    result = check.check(law)
+    print(check.table(result))
+    figures.gradient_check(result, _label(name), file)
+    print(f"written: {file}")
+    for row in result.failed:
+        print(f"failed: {row.name}: {row.found} ({row.limit})", file=sys.stderr)
+    return 1 if result.failed else 0
+
+
+def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
+    """Draw the stress-stretch curves of laws."""
+    from liverjax import check, figures
+
+    if not 0 < stretches[0] < 1 < stretches[1] <= 20:
+        raise InputError(
+            f"--stretch {stretches[0]:g} {stretches[1]:g} is no range about 1: give e.g. --stretch 0.6 1.6"
+        )
+    named = {_label(name): check.load(name) for name in (laws.LAWS if names == ["all"] else names)}
+    file = _picture(out, "laws.png")
+    figures.curves(named, file, tuple(stretches))
+    print(f"written: {file}")
+    return 0
+
+
+def _label(name: str) -> str:
+    return name.rpartition(":")[2]
+
+
+def _picture(out: Path, name: str) -> Path:
+    """A file in folder `out`, which is made and tried before anything is computed."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
+    return out / name
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m liverjax",
+        description="Soft-tissue mechanics in JAX.",
+        epilog="Exit code 0: done; 1: a check failed; 2: unusable input.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("laws", help="the laws, their parameters, units and bounds")
+    law = "name of a shipped law (typical parameters), or FILE.py:LAW, a law object or class of your own"
+    check = commands.add_parser("check", help="gradient-check a material law", description="Gradient-check a law.")
+    check.add_argument("law", metavar="NAME|FILE.py:LAW", help=law)
+    plot = commands.add_parser("plot", help="stress-stretch curves", description="Draw stress-stretch curves of laws.")
+    plot.add_argument("law", nargs="+", metavar="NAME|FILE.py:LAW", help=f"{law}; all for every shipped one")
+    plot.add_argument("--stretch", nargs=2, type=float, default=(0.6, 1.6), metavar=("LOW", "HIGH"), help="0.6 1.6")
+    for command in (check, plot):
+        command.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the picture (here)")
+    return parser
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; returns the exit code: 0 done, 1 failed, 2 unusable input."""
-    parser = argparse.ArgumentParser(prog="python -m liverjax", description="Soft-tissue mechanics in JAX.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("laws", help="the laws, their parameters, units and bounds")
-    options = parser.parse_args(arguments)
+    options = _parser().parse_args(arguments)
     try:
-        if options.command == "laws":
-            list_laws()
+        if options.command == "check":
+            return check_law(options.law, options.out)
+        if options.command == "plot":
+            return plot_laws(options.law, options.out, list(options.stretch))
+        list_laws()
         return 0
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 if __name__ == "__main__":

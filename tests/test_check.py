@@ -1,0 +1,190 @@
+"""The gradient check: every shipped law passes, planted mistakes are caught in their row, files are read."""
+
+import textwrap
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import check, homogeneous
+from liverjax.__main__ import main
+
+HEAD = """
+import jax.numpy as jnp
+import liverjax as lj
+from liverjax.laws import NeoHookean
+
+
+class Derived:
+    '''Takes the derivatives by hand away again.'''
+
+    def __get__(self, law, cls):
+        raise AttributeError
+
+
+@lj.struct
+class Law(NeoHookean):
+    '''W = mu/2 (Ibar1 - 3) + U(J), with a mistake.'''
+"""
+
+#: What is written into a neo-Hookean law -> a row that must fail.
+MISTAKES = {
+    "wrong sign": (
+        """
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": -self.mu / 2}, {}
+        """,
+        "stress by hand",
+    ),
+    "factor 2": (
+        """
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": self.mu}, {}
+        """,
+        "energy to stress",
+    ),
+    "wrong curvature": (
+        """
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": self.mu / 2}, {("I1", "I1"): 0.1 * self.mu}
+        """,
+        "stress to tangent",
+    ),
+    "not objective": (
+        """
+        def energy(self, F):
+            return super(Law, self).energy(F) + self.mu * F[..., 0, 1] ** 2
+        """,
+        "objective: W",
+    ),
+    "NaN at rest": (
+        """
+        isochoric_derivatives = Derived()
+
+        def isochoric_energy(self, I1, I2):
+            return self.mu * jnp.sqrt(I1 - 3) ** 2
+        """,
+        "stress at rest",
+    ),
+    "energy at rest": (
+        """
+        def isochoric_energy(self, I1, I2):
+            return self.mu / 2 * (I1 - 2)
+        """,
+        "energy at rest",
+    ),
+    "wrong modulus stated": (
+        """
+        def shear_modulus(self):
+            return 2 * self.mu
+        """,
+        "ground-state shear modulus",
+    ),
+    "unstable at rest": (
+        """
+        def isochoric_energy(self, I1, I2):
+            return -self.mu / 2 * (I1 - 3)
+
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": -self.mu / 2}, {}
+        """,
+        "stable in uniaxial",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_planted_mistakes_are_caught(mistake, tmp_path, capsys):
+    body, row = MISTAKES[mistake]
+    file = tmp_path / "mine.py"
+    file.write_text(HEAD + textwrap.indent(textwrap.dedent(body), "    "))
+    assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 1
+    output = capsys.readouterr()
+    assert f"failed: {row}" in output.err
+    assert "FAILED" in output.out
+
+
+@pytest.mark.parametrize("name", ["neo_hookean", "costa", "logarithmic", "saint_venant_kirchhoff"])
+def test_shipped_laws_pass(name, tmp_path, capsys):
+    assert main(["check", name, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / f"check_{name}.png").stat().st_size > 10_000
+    assert "FAILED" not in capsys.readouterr().out
+
+
+def test_differences_have_the_v_shape():
+    result = check.check(lj.laws.typical("yeoh"))
+    for errors in result.difference_errors.values():
+        k = int(np.argmin(errors))
+        assert 1.9 < np.log10(errors[1] / errors[3]) < 2.1  # second order while it falls
+        assert errors[0] > 1e3 * errors[k] < errors[-1]
+
+
+def test_stable_ranges_of_known_laws():
+    # Mooney-Rivlin with c01 < 0: P = 2 (l - l^-2)(c10 + c01/l) falls below the root of its derivative.
+    c10, c01 = 400.0, -100.0
+    l = np.linspace(0.1, 1.0, 100_001)
+    slope = 2 * ((1 + 2 * l**-3) * (c10 + c01 / l) - (l - l**-2) * c01 / l**2)
+    root = l[slope < 0].max()
+    low, _ = check.check(lj.laws.MooneyRivlin(c10=c10, c01=c01, bulk=7700.0)).stable["uniaxial"]
+    assert 0 <= low - root < 0.1  # the ellipticity may be lost a little before
+    assert check.check(lj.laws.typical("neo_hookean")).stable["uniaxial"] == (0.2, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("argument", "sentence"),
+    [
+        ("neo_hokean", "did you mean neo_hookean"),
+        ("nothing.py:Law", "is not a file"),
+        ("mine.py", "names no law"),
+        ("mine.py:Lew", "use Law"),
+        ("mine.py:number", "is no law"),
+        ("mine.py:Bare", "write @liverjax.struct"),
+        ("mine.py:NoTypical", "parameter mu has no typical value"),
+        ("broken.py:Law", "does not run"),
+    ],
+)
+def test_files_are_refused_in_one_sentence(argument, sentence, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(
+        HEAD
+        + "    pass\n\nnumber = 3\n\nclass Bare(lj.Law):\n    pass\n\n"
+        + "@lj.struct\nclass NoTypical(lj.Law):\n    mu: float = lj.param('Pa')\n"
+    )
+    (tmp_path / "broken.py").write_text("import no_such_module")
+    assert main(["check", argument]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1
+
+
+def test_plot_draws_laws(tmp_path, capsys):
+    assert main(["plot", "neo_hookean", "yeoh", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "laws.png").stat().st_size > 10_000
+    assert main(["plot", "yeoh", "--stretch", "1.2", "1.6", "--out", str(tmp_path)]) == 2
+    assert "no range about 1" in capsys.readouterr().err
+
+
+def test_laws_lists_every_law(capsys):
+    assert main(["laws"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in lj.laws.LAWS)
+    assert "not 0" in text and "default (1.0, 0.0, 0.0)" in text
+
+
+def test_homogeneous_stress_against_textbook_formulas():
+    stretch = jnp.linspace(0.5, 2.0, 31)
+    mooney = lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=7700.0)
+    c1, c2 = 300.0, 85.0
+    exact = {
+        "uniaxial": 2 * (stretch - stretch**-2) * (c1 + c2 / stretch),
+        "equibiaxial": 2 * (stretch - stretch**-5) * (c1 + stretch**2 * c2),
+        "pure_shear": 2 * (stretch - stretch**-3) * (c1 + c2),
+        "simple_shear": 2 * stretch * (c1 + c2),
+    }
+    for test, expected in exact.items():
+        assert np.allclose(homogeneous.response(mooney, test, stretch), expected, rtol=1e-12, atol=1e-10)
+    ogden = lj.laws.Ogden(mu=(300.0, -150.0), alpha=(1.7, -2.6), bulk=7700.0)
+    expected = sum(m * (stretch ** (a - 1) - stretch ** (-a / 2 - 1)) for m, a in ((300.0, 1.7), (-150.0, -2.6)))
+    assert np.allclose(homogeneous.response(ogden, "uniaxial", stretch), expected, rtol=1e-12, atol=1e-10)
+    with pytest.raises(lj.InputError, match="use one of uniaxial"):
+        homogeneous.deformation_gradient("torsion", stretch)
