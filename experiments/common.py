@@ -15,10 +15,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from fitting.report import BLUE, GREEN, GREY, ORANGE, versions
+from fitting.report import versions
 
 RESULTS = Path(__file__).parent / "results"
-COLOURS = (BLUE, ORANGE, GREEN, GREY)
 plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.grid": True, "grid.alpha": 0.3, "savefig.dpi": 150})
 
 

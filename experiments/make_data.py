@@ -1,4 +1,4 @@
-"""Make the tables of data/: ``python experiments/make_data.py FOLDER`` with the raw lion's mane sweeps in FOLDER.
+"""Make the tables of data/: ``python experiments/make_data.py FOLDER`` with folders lions_mane and curves in FOLDER.
 
 Without FOLDER only the tables that follow from the chapter are rewritten.
 """
@@ -33,6 +33,20 @@ PORCINE = """\
 frequency_Hz,storage_modulus_Pa,loss_modulus_Pa
 """
 
+RUBBER = """\
+# Nominal stress of vulcanised rubber (8 % sulphur) in uniaxial tension, equibiaxial tension and pure shear.
+# Source: Treloar 1944, Trans. Faraday Soc. 40, 59-70, as digitised in the repository
+# Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); tabulated by experiments/make_data.py.
+test,stretch,nominal_stress_MPa
+"""
+
+BRAIN = """\
+# Nominal stress of human brain cortex in tension, compression and simple shear (quasi-static, first loading).
+# Source: Budday et al. 2017, Acta Biomaterialia 48, 319-340, as digitised in the repository
+# Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); every second point, tabulated by experiments/make_data.py.
+test,stretch,shear,nominal_stress_kPa
+"""
+
 #: Table 2 (the g's are ratios, not Pa as printed).
 TABLE_2 = Maxwell(jnp.array(770.0), jnp.array([0.235, 0.333]), jnp.array([0.27, 0.03]))
 
@@ -59,7 +73,29 @@ def porcine_liver() -> None:
             out.write(",".join(f"{float(v):.17g}" for v in row) + "\n")
 
 
+def rubber(folder: Path) -> None:
+    """All points of Treloar's three tests."""
+    with (DATA / "rubber_curves.csv").open("w") as out:
+        out.write(RUBBER)
+        for letters, test in (("UT", "uniaxial"), ("ET", "equibiaxial"), ("PS", "pure_shear")):
+            for row in np.genfromtxt(folder / f"Treloar_1944__{letters}.csv", delimiter=",", names=True):
+                out.write(f"{test},{row['F11']:.5g},{row['P11']:.5g}\n")
+
+
+def brain(folder: Path) -> None:
+    """Every second point of one region's tests."""
+    with (DATA / "brain_cortex_curves.csv").open("w") as out:
+        out.write(BRAIN)
+        for letters in ("UT_T", "UT_C"):
+            for row in np.genfromtxt(folder / f"Budday_2017__{letters}_cortex.csv", delimiter=",", names=True)[::2]:
+                out.write(f"uniaxial,{row['F11']:.5g},,{row['P11']:.5g}\n")
+        for row in np.genfromtxt(folder / "Budday_2017__SS_cortex.csv", delimiter=",", names=True)[::2]:
+            out.write(f"simple_shear,1,{row['F12']:.5g},{row['P12']:.5g}\n")
+
+
 if __name__ == "__main__":
     porcine_liver()
     if len(sys.argv) > 1:
-        lions_mane(Path(sys.argv[1]))
+        lions_mane(Path(sys.argv[1]) / "lions_mane")
+        rubber(Path(sys.argv[1]) / "curves")
+        brain(Path(sys.argv[1]) / "curves")

@@ -1,4 +1,4 @@
-"""``python -m fitting SWEEP.csv``: Prony parameters, with their uncertainty, from a measured frequency sweep."""
+"""``python -m fitting SWEEP.csv`` and ``python -m fitting curves LAW FILES``: parameters with their uncertainty."""
 
 import argparse
 import sys
@@ -17,11 +17,14 @@ def _modes(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
 
 
+_EXIT_CODES = "Exit code 0: done; 1: the fit did not converge (its best point is kept, marked); 2: unusable input."
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m fitting",
         description="Identify a generalised Maxwell (Prony) model from a rheometer's frequency sweep.",
-        epilog="Exit code 0: done; 1: the fit did not converge (its best point is kept, marked); 2: unusable input.",
+        epilog="Stress-stretch curves: python -m fitting curves --help. " + _EXIT_CODES,
     )
     parser.add_argument("sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text")
     parser.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
@@ -39,6 +42,22 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _curves_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m fitting curves",
+        description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves at once.",
+        epilog=_EXIT_CODES,
+    )
+    parser.add_argument("law", metavar="LAW", help="name of a law, or all")
+    parser.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
+    parser.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="of Ogden's law (default 1, 2 and 3)")
+    parser.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="Pa", help="of stress columns that name none")
+    parser.add_argument(
+        "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
+    )
+    return parser
+
+
 def _progress(sweep_size: int):
     """A bar on standard error, silent when that is not a terminal."""
     from tqdm import tqdm
@@ -52,9 +71,11 @@ def _progress(sweep_size: int):
     return update, bar
 
 
-def _writable(out: Path) -> None:
+def _writable(out: Path, files: tuple[str, ...]) -> None:
     """Make the folder and try to write into it before anything is computed."""
-    for name in ("fit.json", "fit.png", "fit.h5"):
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out {out} is a file: name a folder for the results")
+    for name in files:
         if (out / name).is_dir():
             raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
     try:
@@ -70,8 +91,6 @@ def identify(options: argparse.Namespace) -> int:
     from fitting import fit, prony, report, rheometer, uncertainty
     from liverjax import laws
 
-    if options.out.exists() and not options.out.is_dir():
-        raise InputError(f"--out {options.out} is a file: name a folder for the results")
     for name in ("radius", "height"):
         value = getattr(options, name)
         if value is not None and not 0 < value <= 0.2:
@@ -86,7 +105,7 @@ def identify(options: argparse.Namespace) -> int:
     if options.modes != "auto":
         fit.check_modes(sweep, options.modes)
     dense = prony.refuse_impossible(sweep)
-    _writable(options.out)
+    _writable(options.out, ("fit.json", "fit.png", "fit.h5"))
     if options.modes == "auto":
         closed = fit.choose_modes(sweep, dense, options.optimizer)[0]
     else:
@@ -118,11 +137,36 @@ def identify(options: argparse.Namespace) -> int:
     return 0 if fits[-1].converged else 1
 
 
+def identify_laws(options: argparse.Namespace) -> int:
+    """Fit one law, or all, to the curves; the exit code."""
+    from tqdm import tqdm
+
+    from fitting import curves, curves_report, stress_stretch
+
+    candidates = stress_stretch.candidates(options.law, options.terms)
+    found, notes = curves.read_curves(options.files, options.unit)
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+    stress_stretch.initial_modulus(found)
+    _writable(options.out, ("curves.json", "curves.png"))
+    bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
+    fits = [stress_stretch.fit(candidate, found) for candidate in bar]
+    curves_report.write(options.out, found, fits)
+    print(curves_report.table(fits))
+    for fit in curves_report.best_first(fits):
+        for sentence in fit.warnings:
+            print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/curves.json, curves.png")
+    return 0 if curves_report.best_first(fits)[0].converged else 1
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    options = _parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        return identify(options)
+        if arguments[:1] == ["curves"]:
+            return identify_laws(_curves_parser().parse_args(arguments[1:]))
+        return identify(_parser().parse_args(arguments))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

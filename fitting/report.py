@@ -12,9 +12,7 @@ import liverjax
 from fitting.fit import Fit
 from fitting.prony import moduli
 from fitting.rheometer import Sweep
-
-#: Okabe and Ito's colours, distinct for every kind of colour vision.
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+from liverjax.colours import BLUE, GREEN, GREY, ORANGE
 
 
 def versions() -> dict[str, str]:
@@ -25,12 +23,12 @@ def versions() -> dict[str, str]:
     return own | {p: version(p) for p in ("jax", "jaxlib", "numpy", "scipy")}
 
 
-def _numbers(values: Any) -> Any:
+def numbers(values: Any) -> Any:
     """JSON numbers; what is not finite becomes null."""
     if isinstance(values, dict):
-        return {k: _numbers(v) for k, v in values.items()}
+        return {k: numbers(v) for k, v in values.items()}
     if isinstance(values, (list, tuple)):
-        return [_numbers(v) for v in values]
+        return [numbers(v) for v in values]
     if isinstance(values, (float, np.floating)):
         return float(values) if math.isfinite(values) else None
     return values.item() if isinstance(values, np.generic) else values
@@ -77,7 +75,7 @@ def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | No
         content["closed_form"] = summary(fits[0], sweep)
     if profile is not None:  # of the closed form, whichever method leads
         content.get("closed_form", content)["profile_intervals_95"] = profile
-    content = _numbers(content)
+    content = numbers(content)
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     _figure(out / "fit.png", sweep, fits)
     _store(out / "fit.h5", sweep, fits, content)

@@ -48,21 +48,32 @@ def noise_factor(residuals: np.ndarray, n_parameters: int, deviations_given: boo
     return max(1.0, estimate) if deviations_given else estimate
 
 
+def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Square root A of the covariance A A^T of natural parameters (delta method), and scaled singular values.
+
+    Args:
+        jacobian: of the residuals by unconstrained parameters u.
+        noise: standard deviation of a residual.
+        to_natural: derivative of the natural parameters by u.
+    """
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
+    return noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0]), s
+
+
 def estimate(found: Solution, deviations_given: bool) -> Uncertainty:
     """Linearised covariance at the minimum, carried to the natural parameters by the delta method."""
     u, J, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
     noise = noise_factor(r, len(u), deviations_given)
-    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
-    to_natural = np.asarray(jax.jacfwd(parameter_vector)(found.u)) / scale
-    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
-    half = noise * (to_natural @ Vt.T) / np.maximum(s, 1e-14 * s[0])
+    to_natural = np.asarray(jax.jacfwd(parameter_vector)(found.u))
+    half, _ = spread(J, noise, to_natural)
     values = np.asarray(parameter_vector(found.u))
     covariance = half @ half.T
     errors = np.sqrt(np.diag(covariance))
     correlation = covariance / np.maximum(np.outer(errors, errors), 1e-300)
     # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
-    stuck = np.abs(to_natural * scale).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
+    stuck = np.abs(to_natural).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
     errors = np.where(stuck, np.inf, errors)
     modes = (len(u) - 1) // 2
     # d(G0 (1 - sum g)): through the square root of the covariance, which keeps it non-negative.

@@ -214,7 +214,7 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
         driven = SHEARS if what == "shear" else STRETCHES
         F = homogeneous.deformation_gradient(test, driven)
         P = _numbers(jax.jit(partial(homogeneous.nominal_stress, law)), F)
-        stable = _work_is_positive(test, driven, P) & (_ellipticity(_numbers(tangent, F)) > 0)
+        stable = _work_is_positive(test, driven, P) & (ellipticity(_numbers(tangent, F)) > 0)
         start = int(np.argmin(np.abs(driven - (0.0 if what == "shear" else 1.0))))
         low, high = _range(driven, stable, start)
         ranges[test] = (low, high)
@@ -231,7 +231,7 @@ def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarra
         return np.gradient(stress, driven) > 0
 
 
-def _ellipticity(A: np.ndarray) -> np.ndarray:
+def ellipticity(A: np.ndarray) -> np.ndarray:
     """Smallest eigenvalue of the acoustic tensor A_iJkL n_J n_L over 200 directions, relative to the tangent."""
     k = np.arange(200) + 0.5
     z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # Fibonacci's points of the upper half sphere

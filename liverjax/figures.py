@@ -8,14 +8,11 @@ import numpy as np
 
 from liverjax import homogeneous
 from liverjax.check import Check
+from liverjax.colours import BLUE, COLOURS, GREY, ORANGE
 from liverjax.laws import Law
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-
-#: Okabe and Ito's colours, distinct for every kind of colour vision.
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
 def _stress(law: Law, test: str, driven: np.ndarray) -> np.ndarray:
@@ -33,9 +30,14 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")
     for axis, (test, what) in zip(axes, homogeneous.TESTS.items(), strict=True):
         driven = np.linspace(0.0, stretches[1] - 1, 101) if what == "shear" else np.linspace(*stretches, 201)
+        ends = []
         for k, (name, law) in enumerate(named.items()):
+            stress = _stress(law, test, driven)
             style = ("-", "--", ":")[k // len(COLOURS) % 3]
-            axis.plot(driven, _stress(law, test, driven), style, color=COLOURS[k % len(COLOURS)], label=name)
+            axis.plot(driven, stress, style, color=COLOURS[k % len(COLOURS)], label=name)
+            ends.append((np.nanmin(stress), np.nanmax(stress)))
+        low, high = 3 * np.median(ends, axis=0)  # an exponential law must not hide the others
+        axis.set_ylim(max(low, axis.get_ylim()[0]), min(high, axis.get_ylim()[1]))
         axis.set(title=test.replace("_", " "), xlabel="amount of shear" if what == "shear" else "stretch")
         axis.grid(alpha=0.3)
         axis.axhline(0, color=GREY, lw=0.5)

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.errors import InputError
+from liverjax.kinematics import pack, unpack
 from liverjax.laws.base import Law, isochoric_part
+from liverjax.stretch_terms import stress_at_constant
 
 #: Test -> what is driven: a stretch, or the amount of shear.
 TESTS = {"uniaxial": "stretch", "equibiaxial": "stretch", "pure_shear": "stretch", "simple_shear": "shear"}
@@ -37,14 +39,18 @@ def deformation_gradient(test: str, driven: Any, stretch: Any = 1.0) -> jax.Arra
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def nominal_stress(law: Law, F: jax.Array) -> jax.Array:
+def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
     """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample whose face 3 is free: P_33 = 0.
 
     P = dW/dF - p cof F. The volumetric energy of a law has no part in it; a law without such a split is taken at
-    det F = 1 as it is.
+    det F = 1 as it is. `constant` says that F is data, with respect to which nothing will be differentiated: a
+    stretch-based law is then much cheaper to differentiate with respect to its parameters.
     """
     split = isochoric_part(law)
-    P = (law if split is None else split).first_piola(F)
+    if constant and hasattr(split, "stretch_energy"):
+        P = F @ pack(stress_at_constant(split, unpack(F)))
+    else:
+        P = (law if split is None else split).first_piola(F)
     cofactor = jnp.stack([jnp.cross(F[..., k - 2, :], F[..., k - 1, :]) for k in range(3)], axis=-2)
     return P - (P[..., 2, 2] / cofactor[..., 2, 2])[..., None, None] * cofactor
 

@@ -115,6 +115,11 @@ def _square(upper: tuple) -> list[list]:
 # function of which only a linear argument is unknown (forward over reverse mode).
 
 
+def stress_at_constant(law: Any, F: Matrix) -> Matrix:
+    """`stress` where F is data: the axes do not move, so plain differentiation by the parameters is right and cheap."""
+    return symmetric(_stress.fun(_arrays(law, F), F))
+
+
 @jax.custom_jvp
 def _stress(law: Any, F: Matrix) -> tuple:
     s = _at(law, F)

@@ -1,0 +1,223 @@
+"""Laws from stress-stretch curves: known parameters come back, SciPy finds nothing better, bad files are refused."""
+
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import liverjax as lj
+from fitting import curves, stress_stretch
+from fitting.__main__ import main
+from liverjax import homogeneous
+
+DATA = Path(__file__).parent.parent / "data"
+
+
+def synthetic(law: lj.Law, noise: float = 0.0, seed: int = 0) -> list[curves.Curve]:
+    """Curves of a known law in three tests, with Gaussian noise relative to the curve."""
+    rng, made = np.random.default_rng(seed), []
+    for test, driven in (
+        ("uniaxial", np.linspace(0.75, 1.4, 27)),
+        ("simple_shear", np.linspace(-0.3, 0.4, 15)),
+        ("equibiaxial", np.linspace(0.9, 1.25, 12)),
+    ):
+        F = homogeneous.deformation_gradient(test, driven)
+        at = (0, 1) if test == "simple_shear" else (0, 0)
+        P = np.asarray(homogeneous.response(law, test, driven))
+        P = P + noise * np.sqrt(np.mean(P**2)) * rng.standard_normal(len(P))
+        made.append(curves.Curve(test, test, np.asarray(F), at, P))
+    return made
+
+
+KNOWN = {
+    "neo_hookean": lj.laws.NeoHookean(mu=770.0, bulk=None),
+    "mooney_rivlin": lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=None),
+    "yeoh": lj.laws.Yeoh(c1=385.0, c2=-50.0, c3=200.0, bulk=None),
+    "arruda_boyce": lj.laws.ArrudaBoyce(mu=700.0, chain_length=3.0, bulk=None),
+    "bogen": lj.laws.Bogen(mu=-150.0, alpha=-9.0, bulk=None),
+    "logarithmic": lj.laws.Logarithmic(c1=500.0, c2=0.2, alpha=4.0, bulk=None),
+    "exponential": lj.laws.Exponential(c1=100.0, c2=1.0, alpha=-4.0, bulk=None),
+    "fung_demiray": lj.laws.FungDemiray(c1=500.0, c2=2.0, bulk=None),
+    "veronda_westmann": lj.laws.VerondaWestmann(c1=300.0, c2=2.0, bulk=None),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_noise_free_curves_give_the_parameters_back(name):
+    (candidate,) = stress_stretch.candidates(name)
+    found = stress_stretch.fit(candidate, synthetic(KNOWN[name]))
+    exact = np.array([float(getattr(KNOWN[name], n)) for n in found.names])
+    assert found.converged and found.mean_relative_error < 1e-9
+    assert np.allclose(found.values, exact, rtol=1e-5)
+    assert np.isclose(found.shear_modulus, float(KNOWN[name].shear_modulus()), rtol=1e-6)
+
+
+def test_standard_errors_are_the_scatter_of_repeated_fits():
+    law = lj.laws.FungDemiray(c1=500.0, c2=2.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    fits = [stress_stretch.fit(candidate, synthetic(law, 0.03, seed), starts=4) for seed in range(20)]
+    values = np.stack([f.values for f in fits])
+    stated = np.mean([f.standard_errors for f in fits], axis=0)
+    # A standard deviation from 20 draws is known to 1/sqrt(38) = 16 %: three of these.
+    assert np.allclose(values.std(axis=0, ddof=1), stated, rtol=0.49)
+    assert np.all(np.abs(values.mean(axis=0) - [500.0, 2.0]) < 3.5 * stated / np.sqrt(20))
+
+
+def _stress_of_rubber(test: str, l: np.ndarray, mu: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Ogden's law in the three tests, from the textbook."""
+    l = l[:, None]
+    free = {"uniaxial": -alpha / 2 - 1, "equibiaxial": -2 * alpha - 1, "pure_shear": -alpha - 1}[test]
+    return (l ** (alpha - 1) - l**free) @ mu
+
+
+def test_rubber_no_worse_than_scipy_from_100_starts():
+    found, _ = curves.read_curves([DATA / "rubber_curves.csv"])
+    assert [len(c.stress) for c in found] == [24, 16, 13]
+
+    def residuals(x):
+        with np.errstate(all="ignore"):
+            model = [_stress_of_rubber(c.test, c.driven, 1e5 * x[:3], x[3:]) / c.scale for c in found]
+            misfit = np.concatenate([m - c.stress / c.scale for m, c in zip(model, found, strict=True)])
+        return np.nan_to_num(misfit, nan=1e6, posinf=1e6, neginf=-1e6)
+
+    rng, best = np.random.default_rng(5), np.inf
+    for _ in range(100):
+        start = np.concatenate([3 * rng.standard_normal(3), rng.uniform(-6, 6, 3)])
+        best = min(best, scipy.optimize.least_squares(residuals, start, max_nfev=500).cost)
+    (candidate,) = stress_stretch.candidates("ogden", terms=3)
+    ours = stress_stretch.fit(candidate, found)
+    assert ours.cost <= best * (1 + 1e-6)
+    assert ours.mean_relative_error < 0.03  # Ogden 1972 with three terms follows these data
+
+
+def test_eight_chains_no_worse_than_scipy_from_100_starts():
+    found, _ = curves.read_curves([DATA / "rubber_curves.csv"])
+    F = [jnp.asarray(c.F) for c in found]
+    I1 = [np.asarray(jnp.einsum("nij,nij->n", f, f)) for f in F]
+    from liverjax.laws.arruda_boyce import COEFFICIENTS
+
+    def residuals(x):
+        mu, N = 1e5 * np.exp(x[0]), np.exp(x[1])
+        out = []
+        for c, i1 in zip(found, I1, strict=True):
+            W1 = mu * sum(k * ck * (i1 / N) ** (k - 1) for k, ck in enumerate(COEFFICIENTS, 1))
+            l = c.driven
+            power = {"uniaxial": -2, "equibiaxial": -5, "pure_shear": -3}[c.test]
+            out.append((2 * W1 * (l - l**power) - c.stress) / c.scale)
+        return np.concatenate(out)
+
+    rng = np.random.default_rng(6)
+    best = min(scipy.optimize.least_squares(residuals, rng.normal(1, 2, 2)).cost for _ in range(100))
+    (candidate,) = stress_stretch.candidates("arruda_boyce")
+    assert stress_stretch.fit(candidate, found).cost <= best * (1 + 1e-6)
+
+
+def test_a_law_that_cannot_follow_is_held_stable():
+    # Softening data: free coefficients of Yeoh's law alone would let the stress fall.
+    l = np.linspace(1.0, 1.6, 13)
+    P = 2000 * (l - 1) - 2400 * (l - 1) ** 2
+    curve = curves.Curve("soft", "uniaxial", np.asarray(homogeneous.deformation_gradient("uniaxial", l)), (0, 0), P)
+    (candidate,) = stress_stretch.candidates("yeoh")
+    found = stress_stretch.fit(candidate, [curve])
+    model = np.asarray(homogeneous.response(found.law, "uniaxial", l))
+    assert np.diff(model).min() > -1e-3 * np.abs(P).max()
+    assert any("edge of stability" in w for w in found.warnings)
+
+
+def test_a_parameter_without_data_is_told():
+    law = lj.laws.NeoHookean(mu=770.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    small = [c for c in synthetic(law, 0.02) if c.test == "simple_shear"]
+    assert any("leave c2 free" in w for w in stress_stretch.fit(candidate, small).warnings)
+
+
+def test_command_writes_table_json_and_picture(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["curves", "fung_demiray", str(DATA / "brain_cortex_curves.csv"), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "fung_demiray" in text and "error" in text
+    content = json.loads((out / "curves.json").read_text())
+    (law,) = content["laws"]
+    assert set(law["parameters"]) == set(law["standard_errors"]) == {"c1", "c2"}
+    assert law["run_time_s"] > 0 and 0 < law["mean_relative_error"] < 1
+    assert content["best"] == "fung_demiray" and len(content["curves"]) == 2
+    assert (out / "curves.png").stat().st_size > 10_000
+
+
+def test_components_and_named_tests_are_the_same_data(tmp_path):
+    l, g = np.linspace(0.8, 1.2, 5), np.linspace(0, 0.3, 4)
+    names = [f"{a}{i}{j}" for a in "FP" for i in (1, 2, 3) for j in (1, 2, 3)]
+    rows = [",".join(names).replace("P11", "P11_kPa")]
+    for v in l:
+        F = np.asarray(homogeneous.deformation_gradient("uniaxial", v)).ravel()
+        rows.append(",".join(f"{x:.12g}" for x in [*F, v - 1, *np.zeros(8)]))
+    (tmp_path / "components.csv").write_text("\n".join(rows))
+    simple = ["# tension, and shear at a stretch of 1.1", "test,stretch,shear,nominal_stress_kPa"]
+    simple += [f"uniaxial,{v},,{v - 1}" for v in l] + [f"simple_shear,1.1,{v},{v}" for v in g]
+    (tmp_path / "named.csv").write_text("\n".join(simple))
+    found, notes = curves.read_curves([tmp_path / "components.csv", tmp_path / "named.csv"])
+    assert not notes
+    assert [c.test for c in found] == ["uniaxial", "uniaxial", "simple_shear"]
+    assert np.allclose(found[0].F, found[1].F) and np.allclose(found[0].stress, found[1].stress)
+    assert np.isclose(found[1].stress[0], -200.0)
+    assert np.allclose(found[2].F[:, 0, 0], 1.1) and found[2].component == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "holds no rows"),
+        ("a,b\n1,2\n", "has columns a, b"),
+        ("test,stretch,nominal_stress_kPa\nbending,1,2\n", "'bending' is not known"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,1,x\nuniaxial,2,3\nuniaxial,3,3\n", "'x' is not a number"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,1,nan\nuniaxial,2,3\nuniaxial,3,3\n", "not finite"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,-1,1\nuniaxial,2,3\nuniaxial,3,3\n", "not possible"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,1,1\nuniaxial,2,3\n", "at least 3"),
+        ("test,stretch,force_N\nuniaxial,1,1\n", "no column nominal_stress_Pa"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,0.9,1\nuniaxial,1.1,-1\nuniaxial,1.2,-2\n", "point against"),
+    ],
+)
+def test_bad_files_get_one_sentence(text, sentence, tmp_path, capsys):
+    file = tmp_path / "bad.csv"
+    file.write_text(text)
+    assert main(["curves", "neo_hookean", str(file), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and error.count("\n") == 1
+
+
+def test_components_that_cannot_be_used_are_refused(tmp_path, capsys):
+    names = ",".join(f"{a}{i}{j}" for a in "FP" for i in (1, 2, 3) for j in (1, 2, 3))
+
+    def run(*rows):
+        file = tmp_path / "bad.csv"
+        file.write_text("\n".join([names, *rows]))
+        assert main(["curves", "yeoh", str(file), "--out", str(tmp_path / "out")]) == 2
+        return capsys.readouterr().err
+
+    swollen = "1.2,0,0,0,1,0,0,0,1," + "5,0,0,0,0,0,0,0,0"
+    assert "det F = 1.2" in run(swollen, swollen, swollen)
+    loaded = "1,0,0,0,1,0,0,0,1," + "0,0,0,0,0,0,0,0,5"
+    assert "face 3 carries stress" in run(loaded, loaded, loaded)
+    silent = "1,0,0,0,1,0,0,0,1," + "0,0,0,0,0,0,0,0,0"
+    assert "zero or missing" in run(silent, silent, silent)
+
+
+def test_laws_without_isochoric_form_are_refused(capsys):
+    assert main(["curves", "costa", str(DATA / "rubber_curves.csv")]) == 2
+    assert "use neo_hookean, mooney_rivlin" in capsys.readouterr().err
+
+
+def test_measured_data_of_other_folders(tmp_path):
+    from conftest import SHARED
+
+    folder = SHARED / "data" / "curves"
+    if not folder.is_dir():
+        pytest.skip("the digitised curves are not here")
+    files = [folder / f"Budday_2017__{n}.csv" for n in ("UT_T_cortex", "CSS_corona_radiata_lambda_0d75")]
+    found, notes = curves.read_curves([*files, folder / "Treloar_1944__ET.csv"], unit="kPa")
+    assert [c.test for c in found] == ["uniaxial", "simple_shear", "equibiaxial"]
+    assert len(notes) == 3 and "names no unit, read as kPa" in notes[0]
+    assert np.isclose(found[1].F[0, 0, 0], 0.75)
