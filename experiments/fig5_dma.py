@@ -9,13 +9,14 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from common import BLUE, GREEN, GREY, ORANGE, plt, save, timed
+from common import plt, save, timed
 from matplotlib.ticker import NullFormatter
 
 import liverjax as lj
 from fitting import fit, prony, torsion
 from fitting.rheometer import read_sweep
 from fitting.torsion import Drive
+from liverjax.colours import BLUE, GREEN, GREY, ORANGE
 from liverjax.struct import replace
 
 DATA = Path(__file__).parent.parent / "data"

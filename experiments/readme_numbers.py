@@ -1,6 +1,6 @@
 """The numbers that README.md quotes, from the JSON of other experiments.
 
-``python experiments/readme_numbers.py`` rewrites the part of README.md between its two markers; a test compares them.
+``python experiments/readme_numbers.py`` rewrites the parts of README.md between markers; a test compares them.
 """
 
 import json
@@ -8,12 +8,47 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 README = HERE.parent / "README.md"
-BEGIN, END = "<!-- numbers: experiments/readme_numbers.py -->", "<!-- end of numbers -->"
+END = "<!-- end of numbers -->"
 
 
-def text() -> str:
+def begin(part: str) -> str:
+    """The marker before a part."""
+    return f"<!-- {part}: experiments/readme_numbers.py -->"
+
+
+def _results(*names: str) -> list[dict]:
+    return [json.loads((HERE / "results" / f"{n}.json").read_text()) for n in names]
+
+
+def laws() -> str:
+    """Every law: error and time of its hand-derived terms, and how well it follows brain and rubber."""
+    table, brain, rubber = _results("laws_table", "curves_brain", "curves_rubber")
+    fits = [{f["law"]: f for f in data["laws"]} for data in (brain, rubber)]
+
+    def followed(found: dict, name: str) -> str:
+        f = found.get({"ogden": "ogden, 3 terms"}.get(name, name))
+        return "" if f is None else f"{100 * f['mean_relative_error']:.2g} %, {1000 * f['run_time_s']:.0f} ms"
+
+    rows = [
+        "| law | error against autodiff | force | force and stiffness | compile | brain | rubber |",
+        "|---" * 7 + "|",
+    ]
+    for name, r in table["laws"].items():
+        error = max(r["stress_error"], r["tangent_error"])
+        times = (f"{1000 * r[key]:.2g} ms" for key in ("force_s", "force and stiffness_s"))
+        cells = (error_text(error), *times, f"{r['force and stiffness_compile_s']:.2g} s")
+        rows.append(" | ".join([f"| `{name}`", *cells, *(followed(f, name) for f in fits)]) + " |")
+    return "\n".join(rows)
+
+
+def error_text(error: float) -> str:
+    """Roundoff, as a power of ten."""
+    return f"{error:.0e}"
+
+
+def numbers() -> str:
     """The table of error against run time and the paragraph on the chapter's 5 %."""
-    fig5, job = (json.loads((HERE / "results" / f"{n}.json").read_text()) for n in ("fig5_dma", "main_job"))
+    fig5, job = _results("fig5_dma", "main_job")
     steps = {(r["scheme"], r["steps"]): r for r in fig5["steps"]}
 
     def percent(x: float) -> str:
@@ -51,11 +86,16 @@ def text() -> str:
     return "\n".join(rows)
 
 
+PARTS = {"numbers": numbers, "laws": laws}
+
+
 def main() -> None:
     """Rewrite README.md."""
     page = README.read_text()
-    head, rest = page.split(BEGIN)
-    README.write_text(head + BEGIN + "\n" + text() + "\n" + END + rest.split(END)[1])
+    for part, text in PARTS.items():
+        head, rest = page.split(begin(part))
+        page = head + begin(part) + "\n" + text() + "\n" + END + rest.split(END, 1)[1]
+    README.write_text(page)
 
 
 if __name__ == "__main__":

@@ -5,11 +5,12 @@
 
 import jax.numpy as jnp
 import numpy as np
-from common import BLUE, GREEN, GREY, ORANGE, plt, save, timed
+from common import plt, save, timed
 
 import liverjax as lj
 from fitting import torsion
 from fitting.torsion import Drive
+from liverjax.colours import BLUE, GREEN, GREY, ORANGE
 
 STYLES = {
     "neo_hookean": (BLUE, "o-"),

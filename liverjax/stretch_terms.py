@@ -22,6 +22,9 @@ from liverjax.axes_terms import PAIRS, SIX, rotated, six_of, symmetric
 from liverjax.kinematics import Matrix, Vector, add, determinant, dot, matmul, transpose
 from liverjax.spectral import change, expanded_power_sum, principal, sinh_ratio
 
+#: Logarithms of the principal stretches and their axes, of `liverjax.spectral.principal`: constants of differentiation.
+Frame = tuple[Vector, Matrix]
+
 
 class Principal(NamedTuple):
     """What stress and moduli share at one F."""
@@ -51,8 +54,8 @@ def stretch_slopes(law: Any, X: tuple) -> tuple[tuple, dict]:
     return tuple(slope(k)(*X) for k in range(n)), second
 
 
-def _at(law: Any, F: Matrix) -> Principal:
-    logs, axes = principal(F)
+def _at(law: Any, F: Matrix, frame: Frame) -> Principal:
+    logs, axes = frame
     mean_log = jnp.log(determinant(F)) / 3  # NaN for J < 0
     d = [e - mean_log for e in logs]
     alphas = law.exponents()
@@ -88,14 +91,14 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
 # -- stress and moduli -------------------------------------------------------------------------------------------------
 
 
-def stress(law: Any, F: Matrix) -> Matrix:
-    """Second Piola-Kirchhoff stress [Pa] of w alone (no volumetric part)."""
-    return symmetric(_stress(_arrays(law, F), F))
+def stress(law: Any, F: Matrix, frame: Frame) -> Matrix:
+    """Second Piola-Kirchhoff stress [Pa] of w alone (no volumetric part), with `frame` = `principal(F)`."""
+    return symmetric(_stress(_arrays(law, F), F, frame))
 
 
-def moduli(law: Any, F: Matrix) -> list[list]:
-    """dS/dE [Pa] of w alone over six components each, in the coordinate axes."""
-    return _square(_moduli(_arrays(law, F), F))
+def moduli(law: Any, F: Matrix, frame: Frame) -> list[list]:
+    """dS/dE [Pa] of w alone over six components each, in the coordinate axes, with `frame` = `principal(F)`."""
+    return _square(_moduli(_arrays(law, F), F, frame))
 
 
 def _arrays(law: Any, F: Matrix) -> Any:
@@ -117,12 +120,12 @@ def _square(upper: tuple) -> list[list]:
 
 def stress_at_constant(law: Any, F: Matrix) -> Matrix:
     """`stress` where F is data: the axes do not move, so plain differentiation by the parameters is right and cheap."""
-    return symmetric(_stress.fun(_arrays(law, F), F))
+    return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 
 @jax.custom_jvp
-def _stress(law: Any, F: Matrix) -> tuple:
-    s = _at(law, F)
+def _stress(law: Any, F: Matrix, frame: Frame) -> tuple:
+    s = _at(law, F, frame)
     diagonal = tuple(t * c for t, c in zip(s.tau, s.inverse, strict=True))
     scaled_axes = tuple(tuple(n * d for n, d in zip(row, diagonal, strict=True)) for row in s.axes)
     return tuple(dot(scaled_axes[i], s.axes[j]) for i, j in SIX)
@@ -130,20 +133,20 @@ def _stress(law: Any, F: Matrix) -> tuple:
 
 @partial(_stress.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
-    (law, F), (law_dot, F_dot) = primals, tangents
+    (law, F, frame), (law_dot, F_dot, _) = primals, tangents
     parts = []
     if _perturbed(F_dot):
         half = matmul(transpose(F), _filled(F_dot, F))
         dE = tuple((1.0 if i == j else 2.0) * 0.5 * (half[i][j] + half[j][i]) for i, j in SIX)
-        parts.append(tuple(sum(c * e for c, e in zip(row, dE, strict=True)) for row in _square(_moduli(law, F))))
+        parts.append(tuple(sum(c * e for c, e in zip(row, dE, strict=True)) for row in _square(_moduli(law, F, frame))))
     if _perturbed(law_dot):
-        parts.append(jax.jvp(lambda law: _expanded_stress(law, F), (law,), (_filled(law_dot, law),))[1])
-    return _stress(law, F), add(*parts)
+        parts.append(jax.jvp(lambda law: _expanded_stress(law, F, frame), (law,), (_filled(law_dot, law),))[1])
+    return _stress(law, F, frame), add(*parts)
 
 
 @jax.custom_jvp
-def _moduli(law: Any, F: Matrix) -> tuple:
-    s = _at(law, F)
+def _moduli(law: Any, F: Matrix, frame: Frame) -> tuple:
+    s = _at(law, F, frame)
     normal, shear = _principal_moduli(s)
     n = transpose(s.axes)
     squares = [tuple(n[m][i] * n[m][j] for i, j in SIX) for m in range(3)]
@@ -155,13 +158,13 @@ def _moduli(law: Any, F: Matrix) -> tuple:
 
 @partial(_moduli.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
-    (law, F), (law_dot, F_dot) = primals, tangents
+    (law, F, frame), (law_dot, F_dot, _) = primals, tangents
     parts = []
     if _perturbed(F_dot):
-        parts.append(jax.jvp(lambda F: _expanded_moduli(law, F), (F,), (_filled(F_dot, F),))[1])
+        parts.append(jax.jvp(lambda F: _expanded_moduli(law, F, frame), (F,), (_filled(F_dot, F),))[1])
     if _perturbed(law_dot):
-        parts.append(jax.jvp(lambda law: _expanded_moduli(law, F), (law,), (_filled(law_dot, law),))[1])
-    return _moduli(law, F), add(*parts)
+        parts.append(jax.jvp(lambda law: _expanded_moduli(law, F, frame), (law,), (_filled(law_dot, law),))[1])
+    return _moduli(law, F, frame), add(*parts)
 
 
 def _perturbed(tangents: Any) -> bool:
@@ -191,9 +194,9 @@ def _expanded_energy(law: Any, logs: Vector, axes: Matrix, log_J0: Any, Y: tuple
     return law.stretch_energy(*(expanded_power_sum(a, logs, X, log_J) for a in law.exponents()))
 
 
-def _expansion(law: Any, F: Matrix, orders: int) -> tuple[Any, tuple]:
+def _expansion(law: Any, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
     """The energy as a function of a change Y of C, and Y: zero, `orders` times differentiable with respect to F."""
-    logs, axes = principal(F)
+    logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))
     return partial(_expanded_energy, law, logs, axes, log_J0), change(F, orders)
 
@@ -208,12 +211,12 @@ def _along(function: Any, Y: tuple) -> jax.Array:
     return jax.vmap(along)(jnp.diag(jnp.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0], jnp.result_type(Y[0]))))
 
 
-def _expanded_stress(law: Any, F: Matrix) -> tuple:
-    energy, Y = _expansion(law, F, 2)
+def _expanded_stress(law: Any, F: Matrix, frame: Frame) -> tuple:
+    energy, Y = _expansion(law, F, frame, 2)
     return tuple(_along(energy, Y))
 
 
-def _expanded_moduli(law: Any, F: Matrix) -> tuple:
-    energy, Y = _expansion(law, F, 1)
+def _expanded_moduli(law: Any, F: Matrix, frame: Frame) -> tuple:
+    energy, Y = _expansion(law, F, frame, 1)
     C = _along(lambda Y: _along(energy, Y), Y)
     return tuple(C[a, b] for a, b in _UPPER)

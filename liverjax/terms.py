@@ -29,6 +29,7 @@ from liverjax.kinematics import (
     scale,
     transpose,
 )
+from liverjax.spectral import principal
 
 
 class Stress(NamedTuple):
@@ -50,6 +51,7 @@ class State(NamedTuple):
     first: dict
     second: dict
     fibres: dict  # invariant I4 of a summand -> its fibre direction
+    frame: Any  # principal stretches and axes, where a summand has an energy of stretches
 
 
 def summands(law: Any) -> tuple:
@@ -64,7 +66,8 @@ def state(law: Any, F: Matrix) -> State:
     C = right_cauchy_green(F) if "I2" in first else None
     I1 = None if C is None else C[0][0] + C[1][1] + C[2][2]
     fibres = {key: green_terms.components(part.fibre) for key, part in fibre_invariants(law).items()}
-    return State(law, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres)
+    frame = principal(F) if any(hasattr(part, "stretch_energy") for part in summands(law)) else None
+    return State(law, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres, frame)
 
 
 def fibre_invariants(law: Any) -> dict[str, Any]:
@@ -79,7 +82,7 @@ def stress(s: State) -> Stress:
     """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; absent derivatives leave no term."""
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
     tensors = [scale_matrix(2 * s.first[key], outer(a, a)) for key, a in s.fibres.items()]
-    tensors += [stretch_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "stretch_energy")]
+    tensors += [stretch_terms.stress(part, s.F, s.frame) for part in summands(s.law) if hasattr(part, "stretch_energy")]
     tensors += [green_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "green_energy")]
     if W2 is not None:
         diagonal = 2 * (W1 + s.I1 * W2)
@@ -196,7 +199,7 @@ def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regula
     result = [_block(s, resultant, D[i], D[j], v[i], v[j], regularised) for i, j in pairs]
     for part in summands(s.law):
         if hasattr(part, "stretch_energy"):
-            C = stretch_terms.moduli(part, s.F)
+            C = stretch_terms.moduli(part, s.F, s.frame)
             half = [half_contracted(C, d) for d in D]
             more = [pushed(s.F, anisotropic(half[j], D[i])) for i, j in pairs]
             result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]

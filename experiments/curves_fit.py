@@ -1,0 +1,28 @@
+"""Which laws follow tension, compression and shear at once: fits of every law to brain and to rubber.
+
+``python experiments/curves_fit.py`` writes results/curves_brain.json, .png and curves_rubber.json, .png. Liver is not
+in these data: the chapter's liver curves exist in print only as pictures.
+"""
+
+from pathlib import Path
+
+from common import save
+
+from fitting import curves, curves_report, stress_stretch
+from fitting.report import numbers
+
+DATA = Path(__file__).parent.parent / "data"
+
+
+def main() -> None:
+    """Both materials, every law."""
+    for name, file in (("brain", "brain_cortex_curves.csv"), ("rubber", "rubber_curves.csv")):
+        found, _ = curves.read_curves([DATA / file])
+        fits = curves_report.best_first([stress_stretch.fit(c, found) for c in stress_stretch.candidates("all")])
+        print(f"{name}\n{curves_report.table(fits)}")
+        content = {"laws": [curves_report.summary(f) for f in fits]}
+        save(f"curves_{name}", numbers(content), curves_report.figure(found, fits))
+
+
+if __name__ == "__main__":
+    main()

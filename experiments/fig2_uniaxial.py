@@ -1,0 +1,127 @@
+"""Fig. 2 of the chapter: the laws of Table 1 in tension and compression, and stiffness against strain rate.
+
+``python experiments/fig2_uniaxial.py`` writes results/fig2_uniaxial.json and .png. All laws have the ground-state shear
+modulus of Table 2, 770 Pa; nothing here is fitted to the measurements that the chapter's figure collects. Fig. 2B and C
+show that the liver's stiffness below 10 % strain grows with the strain rate: what Table 2's viscosity gives of that.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import plt, save, timed
+
+import liverjax as lj
+from liverjax import homogeneous, laws, viscosity
+from liverjax.colours import BLUE, COLOURS, GREY, ORANGE
+from liverjax.kinematics import pack, unpack
+
+#: The chapter's Table 1. St Venant-Kirchhoff and Costa (fibres along 1) are no isochoric forms: taken at det F = 1.
+TABLE_1 = (
+    "saint_venant_kirchhoff",
+    "neo_hookean",
+    "mooney_rivlin",
+    "arruda_boyce",
+    "ogden",
+    "bogen",
+    "logarithmic",
+    "exponential",
+    "fung_demiray",
+    "veronda_westmann",
+    "costa",
+)
+TABLE_2 = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
+RATES = np.geomspace(0.003, 22.5, 25)  # of the studies in Fig. 2 [1/s]
+STRAIN = 0.1
+
+
+def chord_moduli(law: laws.Law, sign: float, steps: int) -> jax.Array:
+    """Nominal stress over strain at 10 % [Pa], one for each of RATES, of an incompressible sample at constant rate."""
+    law = laws.isochoric_part(law)
+
+    def at_rate(rate):
+        dt = STRAIN / rate / steps
+
+        def step(history, k):
+            F = homogeneous.deformation_gradient("uniaxial", 1 + sign * STRAIN * (k + 1) / steps)
+            Ft = unpack(F[None])
+            P = pack(viscosity.first_piola(TABLE_2, viscosity.recall(TABLE_2, history, dt), law, Ft))[0]
+            pressure = P[2, 2] * F[2, 2]  # the side is free
+            return viscosity.advance(TABLE_2, history, law, Ft, dt), P[0, 0] - pressure / F[0, 0]
+
+        _, stress = jax.lax.scan(step, viscosity.initial_history(TABLE_2, 1), jnp.arange(steps))
+        return stress[-1] / (sign * STRAIN)
+
+    return jax.lax.map(at_rate, jnp.asarray(RATES))
+
+
+def linear_moduli() -> np.ndarray:
+    """The same of linear viscoelasticity: 3 G0 (1 - sum g (1 - x (1 - exp(-1/x)))), x = tau rate / strain."""
+    g, tau = np.asarray(TABLE_2.ratios)[:, None], np.asarray(TABLE_2.relaxation_times)[:, None]
+    x = tau * RATES[None] / STRAIN
+    return 3 * 770.0 * (1 - np.sum(g * (1 - x * (1 - np.exp(-1 / x))), axis=0))
+
+
+def stress_stretch(named: dict[str, laws.Law]) -> tuple[np.ndarray, dict]:
+    """Nominal stress of every law at stretches 0.7 to 1.4, its error against autodiff, and the time it takes."""
+    stretch = np.linspace(0.7, 1.4, 141)
+    table = {}
+    for name, law in named.items():
+        F = homogeneous.deformation_gradient("uniaxial", stretch)
+        P, t = timed(lambda law, F=F: homogeneous.nominal_stress(law, F), law)
+        split = laws.isochoric_part(law)
+        exact = lj.reference.first_piola(law if split is None else split, F)
+        p = exact[:, 2, 2] * F[:, 2, 2]
+        reference = np.asarray(exact[:, 0, 0] - p / F[:, 0, 0])
+        stress = np.asarray(P[:, 0, 0])
+        error = np.abs(stress - reference).max() / np.abs(stress).max()
+        table[name] = {"stress_Pa": stress.tolist(), "error": float(error), "run_s": t.run, "compile_s": t.compile}
+    return stretch, table
+
+
+def main() -> None:
+    """Both halves of the figure."""
+    named = {name: laws.typical(name) for name in TABLE_1}
+    stretch, table = stress_stretch(named)
+    rates = {}
+    for label, sign in (("tension", 1.0), ("compression", -1.0)):
+        for name in ("neo_hookean", "arruda_boyce", "fung_demiray"):
+            coarse, t = timed(lambda law, sign=sign: chord_moduli(law, sign, 100), named[name], rounds=3)
+            fine, _ = timed(lambda law, sign=sign: chord_moduli(law, sign, 800), named[name], rounds=1)
+            error = float(np.abs(np.asarray(coarse) / np.asarray(fine) - 1).max())
+            rates[f"{name}, {label}"] = {"chord_modulus_Pa": np.asarray(coarse).tolist(), "error": error} | {
+                "run_s": t.run,
+                "compile_s": t.compile,
+            }
+            low, high = float(coarse[0]), float(coarse[-1])
+            print(f"{name:14s} {label:12s} {low:6.0f} to {high:6.0f} Pa, error {100 * error:.1g} %, {t.run:.2g} s")
+    linear = linear_moduli()
+    draw(stretch, table, rates, linear)
+    for name, row in table.items():
+        print(f"{name:24s} error {row['error']:.1e}, {1e3 * row['run_s']:.2f} ms for {len(stretch)} stretches")
+
+
+def draw(stretch: np.ndarray, table: dict, rates: dict, linear: np.ndarray) -> None:
+    """Left: the laws; right: stiffness against strain rate."""
+    fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained")
+    for k, (name, row) in enumerate(table.items()):
+        style, colour = ("-", "--")[k // len(COLOURS)], COLOURS[k % len(COLOURS)]
+        label = f"{name.replace('_', ' ')} ({row['error']:.0e}, {1e3 * row['run_s']:.1f} ms)"
+        left.plot(stretch, np.asarray(row["stress_Pa"]) / 1000, style, color=colour, label=label)
+    left.set(xlabel="stretch [1]", ylabel="nominal stress [kPa]", ylim=(-4, 3))
+    left.set_title("incompressible samples, G0 = 770 Pa (error against autodiff, time of 141 stretches)")
+    left.legend(fontsize=7)
+    for (name, row), colour, style in zip(
+        rates.items(), (BLUE, ORANGE, COLOURS[2]) * 2, ("-", "-", "-", "--", "--", "--"), strict=True
+    ):
+        label = f"{name.replace('_', ' ')} ({100 * row['error']:.1g} %, {1e3 * row['run_s']:.1f} ms)"
+        right.semilogx(RATES, np.asarray(row["chord_modulus_Pa"]) / 1000, style, color=colour, label=label)
+    right.semilogx(RATES, linear / 1000, ":", color=GREY, lw=2, label="linear viscoelasticity")
+    right.set(xlabel="strain rate [1/s]", ylabel="chord modulus, 0 to 10 % [kPa]", ylim=(0, None))
+    right.set_title("viscosity of Table 2 (time-step error, run time)")
+    right.legend(fontsize=7)
+    content = {"stretches": stretch.tolist(), "laws": table, "rates_1_per_s": RATES.tolist(), "chord_moduli": rates}
+    save("fig2_uniaxial", content | {"linear_Pa": linear.tolist()}, fig)
+
+
+if __name__ == "__main__":
+    main()
