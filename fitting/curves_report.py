@@ -8,10 +8,11 @@ import jax
 import numpy as np
 
 from fitting.curves import Curve
-from fitting.report import numbers, versions
+from fitting.report import numbers
 from fitting.stress_stretch import LawFit
 from liverjax import homogeneous
 from liverjax.colours import COLOURS, GREY
+from liverjax.versions import versions
 
 
 def best_first(fits: list[LawFit]) -> list[LawFit]:

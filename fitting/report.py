@@ -2,25 +2,16 @@
 
 import json
 import math
-import platform
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import liverjax
 from fitting.fit import Fit
 from fitting.prony import moduli
 from fitting.rheometer import Sweep
 from liverjax.colours import BLUE, GREEN, GREY, ORANGE
-
-
-def versions() -> dict[str, str]:
-    """Releases of what computed the result."""
-    from importlib.metadata import version
-
-    own = {"python": platform.python_version(), "liverjax": liverjax.__version__}
-    return own | {p: version(p) for p in ("jax", "jaxlib", "numpy", "scipy")}
+from liverjax.versions import versions
 
 
 def numbers(values: Any) -> Any:

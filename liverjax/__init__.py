@@ -15,30 +15,45 @@ if jax.__version__ in ("0.10.2", "0.11.0"):
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-from liverjax import laws, mjed, reference, shapes, viscosity
+from liverjax import boundary, laws, mjed, reference, shapes, viscosity
+from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
 from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
+from liverjax.scene import Body, Scene, Solve, check_scene, load_scene, with_parameters
+from liverjax.simulation import Result, simulate
 from liverjax.struct import param, static, struct
 from liverjax.viscosity import Prony
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Body",
+    "Displaced",
+    "Fixed",
     "InputError",
     "Law",
     "Prony",
+    "Result",
+    "Scene",
+    "Solve",
     "TetMesh",
+    "Traction",
+    "boundary",
     "check_mesh",
+    "check_scene",
     "laws",
+    "load_scene",
     "mjed",
     "param",
     "read_mesh",
     "reference",
     "shapes",
+    "simulate",
     "static",
     "struct",
     "tet_mesh",
     "viscosity",
+    "with_parameters",
     "write_mesh",
 ]

@@ -1,4 +1,4 @@
-"""``python -m liverjax laws | check | plot``: what the simulator offers, and whether a law is right."""
+"""``python -m liverjax simulate | check | plot | laws``."""
 
 import argparse
 import dataclasses
@@ -36,7 +36,7 @@ def check_law(name: str, out: Path) -> int:
     from liverjax import check, figures
 
     law = check.load(name)
-    file = _picture(out, f"check_{_label(name)}.png")
+    file = _target(out, f"check_{_label(name)}.png")
     result = check.check(law)
     print(check.table(result))
     figures.gradient_check(result, _label(name), file)
@@ -55,17 +55,59 @@ def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
             f"--stretch {stretches[0]:g} {stretches[1]:g} is no range about 1: give e.g. --stretch 0.6 1.6"
         )
     named = {_label(name): check.load(name) for name in (laws.LAWS if names == ["all"] else names)}
-    file = _picture(out, "laws.png")
+    file = _target(out, "laws.png")
     figures.curves(named, file, tuple(stretches))
     print(f"written: {file}")
     return 0
+
+
+def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
+    """Simulate a scene file and write its results; 1 if a step failed, with what was computed kept."""
+    import time
+
+    import jax
+    import numpy as np
+
+    from liverjax import output, scene, status
+    from liverjax.simulation import simulate
+    from liverjax.versions import versions
+
+    read = scene.load_scene(file)
+    target = _target(out, "result.h5")
+    if target.is_dir():
+        raise InputError(f"--out {out}: result.h5 in it is a folder; name another folder for the results")
+    begin = time.perf_counter()
+    program = jax.jit(simulate).lower(read).compile()
+    compiled = time.perf_counter()
+    result = jax.block_until_ready(program(read))
+    run_time, compile_time = time.perf_counter() - compiled, compiled - begin
+    codes = np.asarray(result.status)
+    attributes = {"scene": file.read_text(encoding="utf-8"), "run_time_s": run_time, "compile_time_s": compile_time}
+    output.write_hdf5(target, read, result, attributes | {"versions": versions()})
+    s = result.statistics
+    print(
+        f"{read.mesh.number_of_nodes} nodes, {read.mesh.number_of_elements} tetrahedra, {len(codes)} steps: "
+        f"{int(np.sum(s.iterations))} Newton and {int(np.sum(s.linear_iterations))} CG iterations, "
+        f"largest residual {float(np.max(np.asarray(s.residual))):.1e} of the forces\n"
+        f"run {run_time:.3g} s ({len(codes) / run_time:.3g} steps a second), compile {compile_time:.3g} s"
+    )
+    written = [str(target)]
+    if vtu:
+        written.append(str(output.write_vtu(out / "vtu", read, result)))
+    if png:
+        output.picture(out / "result.png", read, result)
+        written.append(str(out / "result.png"))
+    print(f"written: {', '.join(written)}")
+    for step in np.flatnonzero(codes != status.CONVERGED)[:5]:
+        print(f"failed: step {step + 1}: {status.advice(codes[step])}", file=sys.stderr)
+    return 1 if np.any(codes != status.CONVERGED) else 0
 
 
 def _label(name: str) -> str:
     return name.rpartition(":")[2]
 
 
-def _picture(out: Path, name: str) -> Path:
+def _target(out: Path, name: str) -> Path:
     """A file in folder `out`, which is made and tried before anything is computed."""
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -80,9 +122,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m liverjax",
         description="Soft-tissue mechanics in JAX.",
-        epilog="Exit code 0: done; 1: a check failed; 2: unusable input.",
+        epilog="Exit code 0: done; 1: a check or a step failed; 2: unusable input.",
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    simulate = commands.add_parser("simulate", help="run a scene file", description="Run a scene file.")
+    simulate.add_argument("scene", type=Path, metavar="SCENE.toml")
+    simulate.add_argument("--vtu", action="store_true", help="write a ParaView series as well")
+    simulate.add_argument("--png", action="store_true", help="draw the last state as well")
     commands.add_parser("laws", help="the laws, their parameters, units and bounds")
     law = "name of a shipped law (typical parameters), or FILE.py:LAW, a law object or class of your own"
     check = commands.add_parser("check", help="gradient-check a material law", description="Gradient-check a law.")
@@ -90,8 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     plot = commands.add_parser("plot", help="stress-stretch curves", description="Draw stress-stretch curves of laws.")
     plot.add_argument("law", nargs="+", metavar="NAME|FILE.py:LAW", help=f"{law}; all for every shipped one")
     plot.add_argument("--stretch", nargs=2, type=float, default=(0.6, 1.6), metavar=("LOW", "HIGH"), help="0.6 1.6")
-    for command in (check, plot):
-        command.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the picture (here)")
+    for command in (check, plot, simulate):
+        command.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the results (here)")
     return parser
 
 
@@ -101,6 +147,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if options.command == "check":
             return check_law(options.law, options.out)
+        if options.command == "simulate":
+            return run_scene(options.scene, options.out, options.vtu, options.png)
         if options.command == "plot":
             return plot_laws(options.law, options.out, list(options.stretch))
         list_laws()

@@ -1,0 +1,201 @@
+"""Run a scene: load steps or time steps, each a Newton solve with implicit differentiation."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax import boundary, continuation, mjed, status, terms, viscosity
+from liverjax.continuation import StepOptions, StepStatistics
+from liverjax.errors import InputError
+from liverjax.kinematics import deformation_gradient
+from liverjax.scene import Scene
+from liverjax.struct import param, struct
+
+
+@struct
+class Result:
+    """What a run leaves; arrays over the T steps, all of them differentiable but the statistics."""
+
+    times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
+    positions: jax.Array = param("m", "(T, V, 3)")
+    reactions: jax.Array = param("N", "(T, V, 3), force of the support on the body, 0 where nothing is prescribed")
+    status: jax.Array = param("1", "(T,) result codes of `liverjax.status`")
+    statistics: StepStatistics = param("1", "per step: Newton and CG iterations, cuts, residual")
+
+    def check(self) -> "Result":
+        """The result itself, or `RuntimeError` with advice where a step failed; host side."""
+        codes = np.asarray(self.status)
+        if np.any(codes != status.CONVERGED):
+            step = int(np.argmax(codes != status.CONVERGED))
+            raise RuntimeError(f"step {step + 1}: {status.advice(codes.ravel()[step])}")
+        return self
+
+
+class State(NamedTuple):
+    """What a step hands to the next; parts that the scene lacks are None."""
+
+    x: jax.Array  # (V, 3) [m]
+    velocity: jax.Array | None  # dynamic
+    acceleration: jax.Array | None  # Newmark
+    history: viscosity.History | None  # viscosity
+
+
+def initial_state(scene: Scene) -> State:
+    """At rest in the reference positions."""
+    x = scene.mesh.points
+    dynamic = scene.solve.kind == "dynamic"
+    acceleration = None
+    if dynamic and scene.solve.integrator == "newmark":
+        # m a = f at rest: Newmark's method keeps its order from the first step.
+        mass = scene.body.density * boundary.nodal_volumes(scene.mesh)
+        mask = boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced)
+        acceleration = mask * _loads(scene) / mass[:, None]
+    history = None
+    if scene.viscosity is not None:
+        history = viscosity.initial_history(scene.viscosity, scene.mesh.number_of_elements, x.dtype)
+    return State(x, jnp.zeros_like(x) if dynamic else None, acceleration, history)
+
+
+def _loads(scene: Scene) -> jax.Array:
+    """Dead nodal forces (V, 3) [N]: weight and tractions."""
+    force = jnp.zeros(scene.mesh.points.shape, scene.mesh.points.dtype)
+    if scene.body is not None:
+        mass = scene.body.density * boundary.nodal_volumes(scene.mesh)
+        force = force + mass[:, None] * jnp.asarray(scene.body.gravity, force.dtype)[None]
+    return force + boundary.nodal_tractions(scene.mesh, scene.traction) if scene.traction else force
+
+
+def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStatistics]:
+    """Step k = 1 … steps: the next state, the reactions (V, 3) [N] and what the solve took."""
+    mesh, law, solve = scene.mesh, scene.law, scene.solve
+    dtype = mesh.points.dtype
+    dt = solve.dt
+    mask = boundary.free_degrees(mesh, scene.fixed, scene.displaced)
+    loads = _loads(scene)
+    memory = None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt)
+    mass = scene.body.density * boundary.nodal_volumes(mesh) if state.velocity is not None else None
+    moving = len(scene.displaced) > 0
+    ramped = dt is None
+
+    def conditions(s):
+        """Positions of held degrees of freedom (V, 3), 0 elsewhere, and dead loads at part s of the step."""
+        at = (k - 1 + s) / solve.steps
+        held = mesh.points
+        if moving:
+            held = held + boundary.prescribed(mesh, scene.displaced, 0.0 if dt is None else dt * (k - 1 + s), at)
+        return (1 - mask) * held, at * loads if ramped else loads
+
+    def positions(q, s):
+        return mask * q.reshape(-1, 3) + conditions(s)[0]
+
+    def forces(q, s):
+        """Internal, inertial and dead forces (V, 3)."""
+        x = positions(q, s)
+        F = deformation_gradient(mesh, x)
+        P = terms.first_piola(law, F) if memory is None else viscosity.first_piola(scene.viscosity, memory, law, F)
+        internal = mjed.nodal_force(mesh, P)
+        inertial = None if mass is None else mass[:, None] * _acceleration(solve.integrator, state, x, dt)
+        return internal, inertial, conditions(s)[1]
+
+    def residual(q, s):
+        internal, inertial, load = forces(q, s)
+        total = internal - load if inertial is None else internal + inertial - load
+        at_work = jnp.linalg.norm(internal) + jnp.linalg.norm(load)
+        if inertial is not None:
+            at_work = at_work + jnp.linalg.norm(inertial)
+        return (mask * total).ravel(), jax.lax.stop_gradient(at_work)
+
+    precondition = _block_jacobi(scene, state, mask, mass, memory)
+    options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
+    q, statistics = continuation.solve(residual, (mask * state.x).ravel(), precondition, options)
+    one = jnp.ones((), dtype)
+    x = positions(q, one)
+    internal, inertial, load = forces(q, one)
+    reactions = (1 - mask) * (internal - load if inertial is None else internal + inertial - load)
+    velocity, acceleration = _motion(solve.integrator, state, x, dt)
+    history = None
+    if memory is not None:
+        history = viscosity.advance(scene.viscosity, state.history, law, deformation_gradient(mesh, x), dt)
+    return State(x, velocity, acceleration, history), reactions, statistics
+
+
+def _acceleration(integrator: str, state: State, x: jax.Array, dt: Any) -> jax.Array:
+    """At the end of the step: implicit Euler, or Newmark's average acceleration."""
+    if integrator == "euler":
+        return (x - state.x - dt * state.velocity) / dt**2
+    return 4 * (x - state.x - dt * state.velocity) / dt**2 - state.acceleration
+
+
+def _motion(integrator: str, state: State, x: jax.Array, dt: Any) -> tuple[jax.Array | None, jax.Array | None]:
+    if state.velocity is None:
+        return None, None
+    if integrator == "euler":
+        return (x - state.x) / dt, None
+    a = _acceleration(integrator, state, x, dt)
+    return state.velocity + 0.5 * dt * (state.acceleration + a), a
+
+
+def _block_jacobi(scene: Scene, state: State, mask: jax.Array, mass: Any, memory: Any) -> Any:
+    """Inverse 3 x 3 diagonal blocks of the tangent at the beginning of the step; carries no derivative."""
+    scene, state, mass, memory = jax.lax.stop_gradient((scene, state, mass, memory))
+    mesh = scene.mesh
+    K = mjed.all_blocks(mjed.element_stiffness(mesh, scene.law, state.x))
+    now = 1.0 if memory is None else memory.now
+    blocks = [[jnp.zeros(mesh.number_of_nodes, state.x.dtype) for _ in range(3)] for _ in range(3)]
+    for r in range(3):
+        for c in range(r, 3):
+            for a in range(4):
+                blocks[r][c] = blocks[r][c].at[mesh.tetrahedra[:, a]].add(now * K[a][a][r][c])
+            blocks[c][r] = blocks[r][c]
+    if mass is not None:
+        weight = {"euler": 1.0, "newmark": 4.0}[scene.solve.integrator] / scene.solve.dt**2
+        for r in range(3):
+            blocks[r][r] = blocks[r][r] + weight * mass
+    # Held degrees of freedom get a unit row; a block that is not positive definite its mean diagonal.
+    A = jnp.stack([jnp.stack(row, axis=-1) for row in blocks], axis=-2)
+    A = A * mask[:, :, None] * mask[:, None, :] + (1 - mask)[:, :, None] * jnp.eye(3, dtype=A.dtype)[None]
+    det2 = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] ** 2
+    det3 = jnp.linalg.det(A)
+    positive = (A[:, 0, 0] > 0) & (det2 > 0) & (det3 > 0) & jnp.isfinite(det3)
+    size = jnp.abs(A[:, 0, 0]) + jnp.abs(A[:, 1, 1]) + jnp.abs(A[:, 2, 2])
+    fallback = jnp.where((size > 0) & jnp.isfinite(size), size / 3, 1.0)
+    A = jnp.where(positive[:, None, None], A, fallback[:, None, None] * jnp.eye(3, dtype=A.dtype)[None])
+    inverse = jnp.linalg.inv(A)
+
+    def apply(r):
+        return (mask * jnp.einsum("vij,vj->vi", inverse, mask * r.reshape(-1, 3))).ravel()
+
+    return apply
+
+
+@jax.jit
+def _run(scene: Scene) -> Result:
+    steps = scene.solve.steps
+    dtype = scene.mesh.points.dtype
+
+    def advance(state, k):
+        new, reactions, statistics = step(scene, state, k)
+        # A state that is not finite spoils nothing further: the run stays where it last was.
+        good = statistics.status != status.NOT_FINITE
+        new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
+        return new, (new.x, jnp.where(good, reactions, 0.0), statistics)
+
+    _, (x, reactions, statistics) = jax.lax.scan(advance, initial_state(scene), jnp.arange(1, steps + 1, dtype=dtype))
+    times = jnp.arange(1, steps + 1, dtype=dtype) * (1.0 if scene.solve.dt is None else scene.solve.dt)
+    return Result(times=times, positions=x, reactions=reactions, status=statistics.status, statistics=statistics)
+
+
+def simulate(scene: Scene) -> Result:
+    """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`."""
+    if scene.solve.precision == "float32":
+        scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
+    elif not jax.config.jax_enable_x64:
+        raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
+    return _run(scene)
+
+
+def _cast(value: Any, dtype: Any) -> Any:
+    return jnp.asarray(value, dtype) if jnp.issubdtype(jnp.result_type(value), jnp.floating) else value

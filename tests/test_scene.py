@@ -1,0 +1,219 @@
+"""Scene files: what they say, what is refused in one sentence, what the command leaves behind."""
+
+import json
+import tomllib
+
+import h5py
+import jax
+import jax.numpy as jnp
+import meshio
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.__main__ import main
+from liverjax.scene import scene_from
+
+SCENE = """
+[mesh]
+shape = "box"
+size = [100, 100, 100]
+cells = [2, 2, 2]
+unit = "mm"
+
+[[law]]
+name = "neo_hookean"
+mu = 500.0
+bulk = 2200.0
+[[law]]
+name = "ogden"
+mu = [200.0, -30.0]
+alpha = [2.0, -4.0]
+bulk = 100.0
+
+[viscosity]
+ratios = [0.235, 0.333]
+relaxation_times = [0.27, 0.03]
+
+[body]
+density = 1060.0
+gravity = [0, 0, -9.81]
+
+[[fixed]]
+where = {z_max = 0.0}
+[[fixed]]
+set = "x_min"
+axes = "x"
+[[displaced]]
+where = {z_min = 0.1, x_min = 0.05}
+history = "ramp.csv"
+[[traction]]
+where = {y_max = 0.0}
+value = [0, 10.0, 0]
+
+[solve]
+kind = "static"
+steps = 3
+dt = 0.05
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with the scene and its history."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "ramp.csv").write_text("time,x,y,z\n0,0,0,0\n0.15,0.01,0,0.02\n")
+    return tmp_path
+
+
+def test_a_scene_file_says_what_it_says(folder):
+    scene = lj.load_scene(folder / "scene.toml")
+    assert scene.mesh.number_of_nodes == 27 and np.isclose(np.asarray(scene.mesh.points).max(), 0.1)
+    assert isinstance(scene.law, lj.laws.Sum) and scene.law.laws[1].alpha == (2.0, -4.0)
+    assert len(scene.fixed[0].nodes) == 9 and scene.fixed[1].axes == "x"
+    assert len(scene.displaced[0].nodes) == 6 and scene.displaced[0].history.shape == (2, 3)
+    assert len(scene.traction[0].triangles) == 8
+    assert scene.solve.steps == 3 and scene.solve.dt == 0.05
+
+
+def test_parameters_by_the_files_own_names(folder):
+    scene = lj.load_scene(folder / "scene.toml")
+    changed = lj.with_parameters(
+        scene,
+        {
+            "law.0.mu": 800.0,
+            "law.1.alpha.0": 3.0,
+            "viscosity.relaxation_times": (0.3, 0.02),
+            "viscosity.ratios.0": 0.1,
+            "body.density": 1000.0,
+            "traction.0.value": (0.0, 5.0, 0.0),
+            "solve.dt": 0.1,
+        },
+    )
+    assert changed.law.laws[0].mu == 800.0 and changed.law.laws[1].alpha == (3.0, -4.0)
+    assert np.allclose(changed.viscosity.relaxation_times, [0.3, 0.02])
+    assert np.allclose(changed.viscosity.ratios, [0.1, 0.333])
+    assert changed.body.density == 1000.0 and changed.solve.dt == 0.1
+    assert jax.tree.structure(changed) == jax.tree.structure(scene)  # nothing is compiled anew
+    for name, near in (("law.0.mew", "mu"), ("viscosty.ratios", "viscosity"), ("law.5.mu", "leads nowhere")):
+        with pytest.raises(lj.InputError, match=near):
+            lj.with_parameters(scene, {name: 1.0})
+
+
+def test_command_leaves_hdf5_vtu_and_a_picture(folder, capsys):
+    out = folder / "out"
+    assert main(["simulate", str(folder / "scene.toml"), "--out", str(out), "--vtu", "--png"]) == 0
+    text = capsys.readouterr().out
+    assert "27 nodes, 48 tetrahedra, 3 steps" in text and "residual" in text and "compile" in text
+    with h5py.File(out / "result.h5") as file:
+        assert file["positions"].shape == file["reactions"].shape == (3, 27, 3)
+        assert np.allclose(file["times"], [0.05, 0.1, 0.15])
+        assert file["reference"].shape == (27, 3) and file["tetrahedra"].shape == (48, 4)
+        assert np.all(file.attrs["status"] == 0) and file.attrs["run_time_s"] > 0
+        assert tomllib.loads(file.attrs["scene"])["body"]["density"] == 1060.0
+        assert "jax" in json.loads(file.attrs["versions"])
+        last = file["positions"][-1] - file["reference"][:]
+    moved = lj.load_scene(folder / "scene.toml").displaced[0].nodes
+    assert np.allclose(last[np.asarray(moved)], [0.01, 0.0, 0.02])
+    series = json.loads((out / "vtu" / "result.vtu.series").read_text())["files"]
+    assert [e["time"] for e in series] == pytest.approx([0.05, 0.1, 0.15])
+    assert np.allclose(meshio.read(out / "vtu" / series[-1]["name"]).point_data["displacement"], last)
+    assert (out / "result.png").stat().st_size > 10_000
+
+
+def test_a_failed_step_is_exit_code_1_and_keeps_what_was_computed(tmp_path, capsys):
+    text = (
+        SCENE.split("[viscosity]")[0].split("[[law]]")[0]
+        + """
+[law]
+name = "neo_hookean_compressible"
+mu = 770.0
+lame_lambda = 2000.0
+[[fixed]]
+where = {z_max = 0.0}
+[[displaced]]
+where = {z_min = 0.1}
+by = [0.0, 0.0, -0.15]
+[solve]
+steps = 2
+"""
+    )
+    (tmp_path / "scene.toml").write_text(text)
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "failed: step 2" in error and "Traceback" not in error
+    with h5py.File(tmp_path / "result.h5") as file:
+        assert np.isfinite(file["positions"][:]).all()
+        assert file.attrs["status"][0] == 0 and file.attrs["status"][1] != 0
+
+
+#: A change of the scene's dictionary -> part of the sentence.
+REFUSED = {
+    "no mesh": (lambda c: c.pop("mesh"), r"no \[mesh\]"),
+    "unknown section": (lambda c: c.update(bodey={}), "did you mean body"),
+    "unknown key": (lambda c: c["solve"].update(stps=3), "did you mean steps"),
+    "unknown law": (lambda c: c["law"][0].update(name="neo_hokean"), "did you mean neo_hookean"),
+    "parameter out of bounds": (lambda c: c["law"][0].update(mu=-1.0), "must be above 0"),
+    "unknown unit": (lambda c: c["mesh"].update(unit="inch"), "use one of m, cm"),
+    "two meshes": (lambda c: c["mesh"].update(file="a.vtu"), "either file"),
+    "where meets nothing": (lambda c: c["fixed"][0].update(where={"z_max": -1.0}), "meets no node"),
+    "unknown where": (lambda c: c["fixed"][0].update(where={"zmax": 0.0}), "did you mean z_max"),
+    "unknown set": (lambda c: c["fixed"][1].update(set="vena_cava"), "no node set 'vena_cava'"),
+    "ratios add up": (lambda c: c["viscosity"].update(ratios=[0.5, 0.6]), "less than 1"),
+    "viscosity without dt": (lambda c: c["solve"].pop("dt"), "no dt, which viscosity needs"),
+    "clamp and motion": (lambda c: c["fixed"].append({"where": {"z_min": 0.1}}), "both prescribe node"),
+    "by and history": (lambda c: c["displaced"][0].update(by=[0, 0, 0]), "either by"),
+    "short vector": (lambda c: c["body"].update(gravity=[0, 0]), "list of 3 numbers"),
+    "no density": (lambda c: c["body"].pop("density"), "needs density"),
+    "text for a number": (lambda c: c["body"].update(density="1060"), "not a number"),
+    "steps": (lambda c: c["solve"].update(steps=0), "whole number above 0"),
+    "kind": (lambda c: c["solve"].update(kind="quasistatic"), "use static or dynamic"),
+    "loose body": (lambda c: (c.pop("fixed"), c.pop("displaced")), "nothing holds the body"),
+    "no triangle": (lambda c: c["traction"][0].update(where={"y_max": 0.0, "x_max": 0.0}), "no boundary triangle"),
+    "history is missing": (lambda c: c["displaced"][0].update(history="none.csv"), "cannot be read"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_scenes_are_refused_in_one_sentence(case, folder):
+    change, sentence = REFUSED[case]
+    content = tomllib.loads(SCENE)
+    change(content)
+    with pytest.raises(lj.InputError, match=sentence) as caught:
+        scene_from(content, folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_hinge_is_not_enough():
+    content = {
+        "mesh": {"shape": "box", "size": [1, 1, 1], "cells": [1, 1, 1]},
+        "law": {"name": "neo_hookean", "mu": 1.0, "bulk": 10.0},
+        "fixed": [{"where": {"z_max": 0.0, "x_max": 0.0}}],
+    }
+    with pytest.raises(lj.InputError, match="against every rigid motion"):
+        scene_from(content)
+    content["fixed"].append({"where": {"z_min": 1.0, "x_min": 1.0}, "axes": "z"})
+    scene_from(content)
+
+
+@pytest.mark.parametrize("text", [b"[mesh", b"\xff\xfe\x00", None])
+def test_files_that_are_no_scenes(text, tmp_path, capsys):
+    file = tmp_path / "scene.toml"
+    file.mkdir() if text is None else file.write_bytes(text)
+    assert main(["simulate", str(file)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_a_mesh_file_with_sets_and_units(tmp_path):
+    mesh = lj.shapes.box((100.0, 100.0, 100.0), (2, 2, 2))
+    lj.write_mesh(tmp_path / "cube.vtu", mesh)
+    content = {
+        "mesh": {"file": "cube.vtu", "unit": "mm"},
+        "law": {"name": "neo_hookean", "mu": 770.0, "bulk": 2200.0},
+        "fixed": [{"set": "z_min"}],
+        "displaced": [{"set": "z_max", "by": [0.0, 0.0, 0.01]}],
+    }
+    scene = scene_from(content, tmp_path)
+    result = lj.simulate(scene).check()
+    assert np.isclose(float(jnp.max(result.positions[-1])), 0.11)

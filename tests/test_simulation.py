@@ -1,0 +1,352 @@
+"""Runs of scenes: patch test, balances, orders, other programs' solutions, gradients, and what is left out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import boundary, continuation, mjed, status
+from liverjax.continuation import StepOptions
+from liverjax.simulation import initial_state, step
+from liverjax.struct import replace
+
+TABLE_2 = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
+LAW = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
+
+
+def box(n: int = 2) -> lj.TetMesh:
+    """A 10 cm cube."""
+    return lj.shapes.box((0.1, 0.1, 0.1), (n, n, n))
+
+
+def bottom(mesh: lj.TetMesh) -> lj.Fixed:
+    """Its lower face, held."""
+    return lj.Fixed(nodes=jnp.asarray(boundary.select(mesh, {"z_max": 0.0})))
+
+
+def top(mesh: lj.TetMesh, **motion) -> lj.Displaced:
+    """Its upper face, moved."""
+    return lj.Displaced(nodes=jnp.asarray(boundary.select(mesh, {"z_min": 0.1})), **motion)
+
+
+def test_patch_test_is_exact():
+    # Boundary positions of a homogeneous deformation: the inner nodes follow it exactly, whatever the mesh.
+    mesh = box(3)
+    inner = np.setdiff1d(np.arange(mesh.number_of_nodes), boundary.boundary_triangles(mesh))
+    points = np.asarray(mesh.points).copy()
+    points[inner] += 0.006 * np.random.default_rng(0).uniform(-1, 1, (len(inner), 3))
+    mesh = lj.tet_mesh(points, mesh.tetrahedra)
+    outer = np.setdiff1d(np.arange(len(points)), inner)
+    A = np.array([[0.2, 0.1, 0.0], [0.0, -0.1, 0.15], [0.05, 0.0, 0.1]])
+    x = points @ (np.eye(3) + A).T
+    force = np.asarray(mjed.internal_force(mesh, LAW, jnp.asarray(x)))
+    assert np.abs(force[inner]).max() < 1e-13 * np.abs(force).max()
+    # And found from elsewhere: the outer nodes held there, the inner ones displaced by hand.
+    start = x.copy()
+    start[inner] += 0.002 * np.random.default_rng(1).uniform(-1, 1, (len(inner), 3))
+    held = lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=jnp.asarray(outer)),), solve=lj.Solve(tolerance=1e-12))
+    mask = boundary.free_degrees(mesh, held.fixed, ())
+
+    def residual(q, s):
+        f = mjed.internal_force(mesh, LAW, mask * q.reshape(-1, 3) + (1 - mask) * x)
+        return (mask * f).ravel(), jnp.linalg.norm(f)
+
+    q, statistics = jax.jit(lambda q: continuation.solve(residual, q, lambda r: r, StepOptions(tolerance=1e-13)))(
+        (mask * start).ravel()
+    )
+    assert int(statistics.status) == status.CONVERGED
+    assert np.abs(np.asarray(q).reshape(-1, 3)[inner] - x[inner]).max() < 1e-11 * 0.1
+
+
+def test_static_solution_and_reactions_balance():
+    mesh = box()
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        fixed=(bottom(mesh),),
+        displaced=(top(mesh, by=jnp.array([0.02, 0.0, 0.03])),),
+        solve=lj.Solve(steps=2),
+    )
+    result = lj.simulate(scene).check()
+    assert result.positions.shape == (2, mesh.number_of_nodes, 3)
+    moved = np.asarray(result.positions[-1] - mesh.points)[np.asarray(scene.displaced[0].nodes)]
+    assert np.allclose(moved, [0.02, 0.0, 0.03], atol=1e-16)
+    reactions, x = np.asarray(result.reactions[-1]), np.asarray(result.positions[-1])
+    size = np.abs(reactions).sum()
+    assert np.abs(reactions.sum(axis=0)).max() < 1e-8 * size
+    assert np.abs(np.cross(x, reactions).sum(axis=0)).max() < 1e-8 * 0.1 * size
+    free = np.setdiff1d(
+        np.arange(mesh.number_of_nodes), np.concatenate([scene.fixed[0].nodes, scene.displaced[0].nodes])
+    )
+    assert np.all(reactions[free] == 0)
+    assert np.all(np.asarray(result.statistics.residual) <= 1e-8)
+    # More load steps end at the same place: an elastic state has no memory.
+    once = lj.simulate(replace(scene, solve=lj.Solve(steps=1)))
+    assert np.abs(np.asarray(once.positions[-1]) - x).max() < 1e-8 * 0.03
+
+
+def test_gravity_and_traction_are_carried_by_the_support():
+    mesh = box()
+    face = boundary.boundary_triangles(mesh, boundary.select(mesh, {"z_min": 0.1}))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=5000.0, bulk=20000.0),
+        body=lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -9.81])),
+        fixed=(bottom(mesh),),
+        traction=(lj.Traction(triangles=jnp.asarray(face), value=jnp.array([30.0, 0.0, -100.0])),),
+        solve=lj.Solve(steps=2),
+    )
+    support = np.asarray(lj.simulate(scene).check().reactions[-1]).sum(axis=0)
+    assert np.allclose(support, [-0.3, 0.0, 1.0 + 1060 * 1e-3 * 9.81], rtol=1e-7, atol=1e-7)
+
+
+def test_a_far_motion_is_cut_into_parts_and_a_hopeless_one_is_told():
+    mesh = box()
+
+    def crushed(by):
+        law = lj.laws.typical("neo_hookean_compressible")
+        moved = top(mesh, by=jnp.array([0.0, 0.0, by]))
+        return lj.simulate(lj.Scene(mesh=mesh, law=law, fixed=(bottom(mesh),), displaced=(moved,)))
+
+    far = crushed(-0.085)
+    assert int(far.status[0]) == status.CONVERGED
+    assert int(far.statistics.cuts[0]) > 0
+    hopeless = crushed(-0.11)  # through the floor: infinite energy in between
+    assert int(hopeless.status[0]) != status.CONVERGED
+    assert np.isfinite(np.asarray(hopeless.positions)).all()
+    with pytest.raises(RuntimeError, match=r"step 1: .*smaller"):
+        hopeless.check()
+
+
+def march(scene: lj.Scene, runs: tuple[int, ...], duration: float) -> list:
+    """Runs with these numbers of steps by one program, the time step being a number: last states, all reactions."""
+
+    @jax.jit
+    def advance(state, k, dt):
+        state, reactions, statistics = step(replace(scene, solve=replace(scene.solve, dt=dt)), state, k)
+        return state, reactions, statistics.status
+
+    results = []
+    for n in runs:
+        state, reactions = initial_state(scene), []
+        for k in range(1, n + 1):
+            state, reaction, code = advance(state, float(k), duration / n)
+            assert int(code) == status.CONVERGED
+            reactions.append(np.asarray(reaction))
+        results.append((state, np.array(reactions)))
+    return results
+
+
+@pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("newmark", 2)])
+def test_order_of_the_integrators(integrator, order):
+    mesh = box()
+
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        body=lj.Body(density=1060.0, gravity=jnp.array([2.0, 0.0, -3.0])),
+        fixed=(bottom(mesh),),
+        solve=lj.Solve(kind="dynamic", dt=0.01, integrator=integrator, tolerance=1e-11),
+    )
+    x = [np.asarray(state.x[-1]) for state, _ in march(scene, (20, 40, 80), 0.1)]
+    observed = np.log2(np.linalg.norm(x[1] - x[0]) / np.linalg.norm(x[2] - x[1]))
+    assert abs(observed - order) < 0.25
+
+
+def test_implicit_euler_only_dissipates():
+    mesh = box()
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        body=lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -9.81])),
+        fixed=(bottom(mesh),),
+        solve=lj.Solve(kind="dynamic", steps=1, dt=0.01),
+    )
+    mass = 1060.0 * np.asarray(boundary.nodal_volumes(mesh))
+    advance = jax.jit(lambda state, k: step(scene, state, k)[0])
+
+    def energy(state):
+        kinetic = 0.5 * np.sum(mass[:, None] * np.asarray(state.velocity) ** 2)
+        weight = np.sum(mass * 9.81 * np.asarray(state.x)[:, 2])
+        return float(mjed.energy(mesh, LAW, state.x)) + kinetic + weight
+
+    state = initial_state(scene)
+    energies = [energy(state)]
+    for k in range(1, 30):
+        state = advance(state, float(k))
+        energies.append(energy(state))
+    scale = mass.sum() * 9.81 * 0.1
+    assert np.all(np.diff(energies) < 1e-9 * scale)
+    assert energies[0] - energies[-1] > 1e-3 * scale
+
+
+def test_free_fall_is_exact():
+    # A body that nothing holds moves rigidly: no stress, and implicit Euler's own sum of velocities.
+    mesh = box()
+    n, dt, g = 10, 0.02, np.array([1.0, 2.0, -9.81])
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        body=lj.Body(density=1060.0, gravity=jnp.asarray(g)),
+        solve=lj.Solve(kind="dynamic", steps=n, dt=dt, tolerance=1e-12),
+    )
+    x = np.asarray(lj.simulate(scene).check().positions[-1])
+    assert np.allclose(x, np.asarray(mesh.points) + g * dt**2 * n * (n + 1) / 2, rtol=0, atol=1e-10)
+
+
+def test_long_relaxation_leaves_the_elastic_state_with_less_stress():
+    mesh = box()
+    parts = dict(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, by=jnp.array([0.01, 0.0, 0.02])),))
+    elastic = lj.simulate(lj.Scene(**parts)).check()
+    held = top(
+        mesh, times=jnp.array([0.0, 0.1, 50.0]), history=jnp.array([[0, 0, 0], [0.01, 0, 0.02], [0.01, 0, 0.02]])
+    )
+    parts["displaced"] = (held,)
+    slow = lj.simulate(lj.Scene(**parts, viscosity=TABLE_2, solve=lj.Solve(dt=0.1, steps=60))).check()
+    remaining = 1 - float(jnp.sum(TABLE_2.ratios))
+    size = np.abs(np.asarray(elastic.reactions)).max()
+    # After 5.9 s the longest memory, 0.27 s, is down to exp(-22).
+    assert np.abs(np.asarray(slow.reactions[-1]) - remaining * np.asarray(elastic.reactions[-1])).max() < 1e-7 * size
+    assert np.abs(np.asarray(slow.positions[-1] - elastic.positions[-1])).max() < 1e-7 * 0.02
+
+
+FEBIO_LAWS = {
+    "neo-Hookean": lj.laws.NeoHookeanCompressible(mu=770.0, lame_lambda=3080.0),
+    "Mooney-Rivlin": lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=7700.0, volumetric="log"),
+    "Veronda-Westmann": lj.laws.VerondaWestmann(c1=350.0, c2=2.2, bulk=7700.0, volumetric="log"),
+}
+
+
+def febio_cube(febio) -> lj.TetMesh:
+    """FEBio's unit cube."""
+    return lj.tet_mesh(
+        np.loadtxt(febio / "cube3_nodes.csv", delimiter=","),
+        np.loadtxt(febio / "cube3_tets.csv", delimiter=",", dtype=int),
+    )
+
+
+def held_and_moved(mesh: lj.TetMesh, **motion) -> dict:
+    """Its bottom held, its top moved."""
+    low, high = boundary.select(mesh, {"z_max": 0.0}), boundary.select(mesh, {"z_min": 1.0})
+    return {
+        "fixed": (lj.Fixed(nodes=jnp.asarray(low)),),
+        "displaced": (lj.Displaced(nodes=jnp.asarray(high), **motion),),
+    }
+
+
+@pytest.mark.parametrize("name", FEBIO_LAWS)
+def test_positions_and_reactions_of_febio(febio, name):
+    mesh = febio_cube(febio)
+    rows = np.loadtxt(febio / f"a_{name}_nodes.csv", delimiter=",")
+    conditions = held_and_moved(mesh, by=jnp.array([0.3, 0.0, 0.2]))
+    result = lj.simulate(lj.Scene(mesh=mesh, law=FEBIO_LAWS[name], **conditions, solve=lj.Solve(steps=2))).check()
+    assert np.abs(np.asarray(result.positions[-1] - mesh.points) - rows[:, 1:4]).max() < 1e-6 * 0.3
+    assert np.abs(np.asarray(result.reactions[-1]) - rows[:, 4:7]).max() < 1e-6 * np.abs(rows[:, 4:7]).max()
+
+
+def test_viscous_ramp_and_hold_of_febio(febio):
+    mesh = febio_cube(febio)
+    theirs = np.loadtxt(febio / "b_visco_neo-Hookean_dt0.0025.csv", delimiter=",")
+    ramp = dict(times=jnp.array([0.0, 0.1, 1.5]), history=jnp.array([[0.0, 0, 0], [0.2, 0, 0], [0.2, 0, 0]]))
+    conditions = held_and_moved(mesh, **ramp)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=FEBIO_LAWS["neo-Hookean"],
+        viscosity=TABLE_2,
+        **conditions,
+        solve=lj.Solve(dt=0.01),
+    )
+    top_nodes, errors = np.asarray(scene.displaced[0].nodes), []
+    for n, (_, reactions) in zip((30, 60), march(scene, (30, 60), 0.3), strict=True):
+        at = np.rint(0.3 / n * np.arange(1, n + 1) / 0.0025).astype(int)
+        ours = reactions[:, top_nodes].sum(axis=1)
+        errors.append(np.abs(ours - theirs[at, 2:5]).max() / np.abs(theirs[:, 2:5]).max())
+    # Both recursions are exact for a stress that is linear over a step: second order, and FEBio's own steps remain.
+    assert errors[1] < 2e-3
+    assert errors[0] / errors[1] > 2.5
+
+
+def test_gradients_against_differences():
+    mesh = box()
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        viscosity=TABLE_2,
+        body=lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -9.81])),
+        fixed=(bottom(mesh),),
+        solve=lj.Solve(kind="dynamic", dt=0.03, steps=4, tolerance=1e-12),
+    )
+    names = ("law.mu", "viscosity.relaxation_times", "body.density")
+
+    @jax.jit
+    def loss(values):
+        x = lj.simulate(lj.with_parameters(scene, dict(zip(names, values, strict=True)))).positions
+        return jnp.sum((x[-1] - mesh.points) ** 2)
+
+    at = (770.0, jnp.array([0.27, 0.03]), 1060.0)
+    gradient = jax.jit(jax.grad(loss))(at)
+    for k, direction in ((0, 1.0), (1, jnp.array([1.0, 0.0])), (2, 1.0)):
+        size = float(jnp.sum(jnp.asarray(at[k]) * direction))
+        best = np.inf
+        for relative in (1e-3, 1e-4, 1e-5):
+            h = relative * size
+            plus, minus = (loss((*at[:k], at[k] + sign * h * direction, *at[k + 1 :])) for sign in (1, -1))
+            exact = float(jnp.sum(gradient[k] * direction))
+            best = min(best, abs((plus - minus) / (2 * h) - exact) / abs(exact))
+        assert best < 1e-7
+
+
+def test_vmap_is_the_loop():
+    mesh = box(1)
+    scene = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, by=jnp.array([0.0, 0.0, 0.03])),))
+    moduli = jnp.array([500.0, 770.0, 2000.0])
+    run = jax.jit(lambda mu: lj.simulate(lj.with_parameters(scene, {"law.mu": mu})))
+    lanes = jax.vmap(run)(moduli)
+    assert np.all(np.asarray(lanes.status) == status.CONVERGED)
+    for k, mu in enumerate(moduli):
+        assert np.allclose(lanes.reactions[k], run(mu).reactions, rtol=1e-9, atol=1e-9)
+
+
+def test_a_scene_carries_only_what_it_has():
+    mesh = box(1)
+    plain = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),))
+    assert len(jax.tree.leaves(initial_state(plain))) == 1
+    slow = replace(plain, viscosity=TABLE_2, solve=lj.Solve(dt=0.1))
+    assert len(jax.tree.leaves(initial_state(slow))) == 3  # positions, memory, last stress
+    body = lj.Body(density=1000.0)
+    assert len(jax.tree.leaves(initial_state(replace(plain, body=body, solve=lj.Solve(dt=0.1, kind="dynamic"))))) == 2
+    # Without viscosity no exponential of the time step, without motion no interpolation.
+    text = str(jax.make_jaxpr(lj.simulate)(plain))
+    assert "exp2" not in text and " exp " not in text
+
+
+def test_one_newton_iteration_is_the_chapters_scheme():
+    mesh = box()
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        body=lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -2.0])),
+        fixed=(bottom(mesh),),
+        solve=lj.Solve(kind="dynamic", dt=0.01, steps=5, newton_iterations=1),
+    )
+    one = lj.simulate(scene).check()
+    full = lj.simulate(replace(scene, solve=replace(scene.solve, newton_iterations=25))).check()
+    assert np.all(np.asarray(one.statistics.iterations) == 1)
+    moved = np.abs(np.asarray(full.positions[-1] - mesh.points)).max()
+    assert 0 < np.abs(np.asarray(one.positions - full.positions)).max() < 0.05 * moved
+
+
+def test_single_precision_says_so():
+    mesh = box(1)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        fixed=(bottom(mesh),),
+        displaced=(top(mesh, by=jnp.array([0.0, 0.0, 0.01])),),
+        solve=lj.Solve(precision="float32", tolerance=1e-5),
+    )
+    single = lj.simulate(scene).check()
+    double = lj.simulate(replace(scene, solve=lj.Solve()))
+    assert single.positions.dtype == jnp.float32
+    assert np.abs(np.asarray(single.positions) - np.asarray(double.positions)).max() < 1e-4 * 0.01
