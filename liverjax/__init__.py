@@ -20,6 +20,7 @@ from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
 from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
+from liverjax.porosity import Porosity
 from liverjax.scene import Body, Scene, Solve, check_scene, load_scene, with_parameters
 from liverjax.simulation import Result, simulate
 from liverjax.struct import param, static, struct
@@ -33,6 +34,7 @@ __all__ = [
     "Fixed",
     "InputError",
     "Law",
+    "Porosity",
     "Prony",
     "Result",
     "Scene",

@@ -22,6 +22,9 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
         for name, unit in (("times", "s"), ("positions", "m"), ("reactions", "N")):
             out[name] = np.asarray(getattr(result, name))
             out[name].attrs["unit"] = unit
+        if result.pressure is not None:
+            out["pressure"] = np.asarray(result.pressure)
+            out["pressure"].attrs["unit"] = "Pa"
         out["times"].attrs["unit"] = "s" if scene.solve.dt is not None else "load step"
         out["reference"] = np.asarray(scene.mesh.points)
         out["reference"].attrs["unit"] = "m"
@@ -48,6 +51,8 @@ def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
     ):
         name = f"step_{k + 1:05d}.vtu"
         data = {"displacement": x - reference, "reaction": f}
+        if result.pressure is not None:
+            data["pressure"] = np.asarray(result.pressure[k])
         meshio.Mesh(reference, cells, point_data=data).write(folder / name)
         entries.append({"name": name, "time": float(time)})
     series = folder / "result.vtu.series"

@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import boundary, laws, shapes, viscosity
+from liverjax import boundary, laws, porosity, shapes, viscosity
 from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
 from liverjax.mesh import UNITS, TetMesh, check_mesh, read_mesh
+from liverjax.porosity import Porosity
 from liverjax.struct import param, replace, static, struct
 from liverjax.viscosity import Prony
 
@@ -47,6 +48,7 @@ class Scene:
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")
     viscosity: Prony | None = param("1", "Prony series", default=None)
+    porosity: Porosity | None = param("1", "sponge and fluid", default=None)
     body: Body | None = param("1", "density and gravity", default=None)
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
@@ -59,6 +61,7 @@ class Scene:
 _KEYS = {
     "mesh": ("file", "unit", "shape", "size", "cells", "radius", "height", "cell_size"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
+    "porosity": ("bulk", "limit_bulk", "fluid_fraction", "permeability", "drained", "scheme", "keep_bulk"),
     "body": ("density", "gravity"),
     "fixed": ("where", "set", "axes"),
     "displaced": ("where", "set", "axes", "by", "history"),
@@ -103,6 +106,7 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
         mesh=mesh,
         law=_law(content["law"]),
         viscosity=prony,
+        porosity=_section(content, "porosity", lambda table: _porosity(mesh, table)),
         body=_section(content, "body", _body),
         fixed=tuple(_fixed(mesh, k, t) for k, t in enumerate(_tables(content, "fixed"))),
         displaced=tuple(_displaced(mesh, k, t, folder) for k, t in enumerate(_tables(content, "displaced"))),
@@ -189,6 +193,21 @@ def _prony(table: dict) -> Prony:
             raise InputError(f"[viscosity] needs {key}: give a list of numbers, one a mode")
     g, tau = (jnp.asarray(_numbers(f"[viscosity] {k}", table[k])) for k in ("ratios", "relaxation_times"))
     return Prony(ratios=g, relaxation_times=tau, **{k: table[k] for k in ("part", "scheme") if k in table})
+
+
+def _porosity(mesh: TetMesh, table: dict) -> Porosity:
+    values = {}
+    for key in ("bulk", "limit_bulk", "fluid_fraction", "permeability"):
+        if key not in table:
+            raise InputError(f"[porosity] needs {key}: give a number")
+        values[key] = _number(f"[porosity] {key}", table[key])
+    if not isinstance(table.get("keep_bulk", False), bool):
+        raise InputError(f"[porosity] keep_bulk = {table['keep_bulk']!r} must be true or false: give one of them")
+    if "drained" in table:
+        given = table["drained"]
+        by_set = isinstance(given, dict) and set(given) == {"set"}
+        values["drained"] = _nodes(mesh, "porosity.drained", given if by_set else {"where": given})
+    return Porosity(**values, **{k: table[k] for k in ("scheme", "keep_bulk") if k in table})
 
 
 def _body(table: dict) -> Body:
@@ -283,10 +302,16 @@ def check_scene(scene: Scene) -> None:
     check_mesh(scene.mesh)
     if scene.viscosity is not None:
         viscosity.check(scene.viscosity, scene.law)
+    if scene.porosity is not None:
+        porosity.check(scene.porosity)
     solve = scene.solve
     histories = any(d.history is not None for d in scene.displaced)
     if solve.dt is None:
-        for present, what in ((scene.viscosity is not None, "viscosity"), (histories, "a history")):
+        for present, what in (
+            (scene.viscosity is not None, "viscosity"),
+            (scene.porosity is not None, "porosity"),
+            (histories, "a history"),
+        ):
             if present:
                 raise InputError(f"[solve] has no dt, which {what} needs: give the time step in seconds")
         if solve.kind == "dynamic":

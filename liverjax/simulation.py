@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import boundary, continuation, mjed, status, terms, viscosity
+from liverjax import boundary, continuation, mjed, porosity, status, terms, viscosity
 from liverjax.continuation import StepOptions, StepStatistics
 from liverjax.errors import InputError
-from liverjax.kinematics import deformation_gradient
+from liverjax.kinematics import add_matrices, deformation_gradient, determinant
+from liverjax.laws import Volumetric
 from liverjax.scene import Scene
 from liverjax.struct import param, struct
 
@@ -23,6 +24,7 @@ class Result:
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3), force of the support on the body, 0 where nothing is prescribed")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.status`")
+    pressure: jax.Array | None = param("Pa", "(T, V), of a porous scene", default=None)
     statistics: StepStatistics = param("1", "per step: Newton and CG iterations, cuts, residual")
 
     def check(self) -> "Result":
@@ -41,6 +43,7 @@ class State(NamedTuple):
     velocity: jax.Array | None  # dynamic
     acceleration: jax.Array | None  # Newmark
     history: viscosity.History | None  # viscosity
+    fluid: porosity.Fluid | None  # porosity
 
 
 def initial_state(scene: Scene) -> State:
@@ -56,7 +59,8 @@ def initial_state(scene: Scene) -> State:
     history = None
     if scene.viscosity is not None:
         history = viscosity.initial_history(scene.viscosity, scene.mesh.number_of_elements, x.dtype)
-    return State(x, jnp.zeros_like(x) if dynamic else None, acceleration, history)
+    fluid = None if scene.porosity is None else porosity.initial_fluid(scene.porosity, scene.mesh)
+    return State(x, jnp.zeros_like(x) if dynamic else None, acceleration, history, fluid)
 
 
 def _loads(scene: Scene) -> jax.Array:
@@ -70,7 +74,8 @@ def _loads(scene: Scene) -> jax.Array:
 
 def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStatistics]:
     """Step k = 1 … steps: the next state, the reactions (V, 3) [N] and what the solve took."""
-    mesh, law, solve = scene.mesh, scene.law, scene.solve
+    mesh, sponge, solve = scene.mesh, scene.porosity, scene.solve
+    law = porosity.law_in_force(sponge, scene.law)
     dtype = mesh.points.dtype
     dt = solve.dt
     mask = boundary.free_degrees(mesh, scene.fixed, scene.displaced)
@@ -79,6 +84,13 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     mass = scene.body.density * boundary.nodal_volumes(mesh) if state.velocity is not None else None
     moving = len(scene.displaced) > 0
     ramped = dt is None
+    F_begin = None if sponge is None else deformation_gradient(mesh, state.x)
+
+    def fluid_pressure(F):
+        return porosity.pressure(sponge, mesh, state.fluid, F_begin, determinant(F), dt)
+
+    # The chapter's pressure does not depend on where the step ends: solved for once.
+    known = None if sponge is None or sponge.scheme == "implicit" else fluid_pressure(F_begin)
 
     def conditions(s):
         """Positions of held degrees of freedom (V, 3), 0 elsewhere, and dead loads at part s of the step."""
@@ -96,6 +108,9 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
         x = positions(q, s)
         F = deformation_gradient(mesh, x)
         P = terms.first_piola(law, F) if memory is None else viscosity.first_piola(scene.viscosity, memory, law, F)
+        if sponge is not None:
+            fluid = fluid_pressure(F) if known is None else known
+            P = add_matrices(P, porosity.first_piola(sponge, mesh, fluid, F))
         internal = mjed.nodal_force(mesh, P)
         inertial = None if mass is None else mass[:, None] * _acceleration(solve.integrator, state, x, dt)
         return internal, inertial, conditions(s)[1]
@@ -116,10 +131,14 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     internal, inertial, load = forces(q, one)
     reactions = (1 - mask) * (internal - load if inertial is None else internal + inertial - load)
     velocity, acceleration = _motion(solve.integrator, state, x, dt)
-    history = None
+    history, fluid = None, None
+    if memory is not None or sponge is not None:
+        F = deformation_gradient(mesh, x)
     if memory is not None:
-        history = viscosity.advance(scene.viscosity, state.history, law, deformation_gradient(mesh, x), dt)
-    return State(x, velocity, acceleration, history), reactions, statistics
+        history = viscosity.advance(scene.viscosity, state.history, law, F, dt)
+    if sponge is not None:
+        fluid = porosity.advance(sponge, state.fluid, fluid_pressure(F) if known is None else known, F)
+    return State(x, velocity, acceleration, history, fluid), reactions, statistics
 
 
 def _acceleration(integrator: str, state: State, x: jax.Array, dt: Any) -> jax.Array:
@@ -142,7 +161,10 @@ def _block_jacobi(scene: Scene, state: State, mask: jax.Array, mass: Any, memory
     """Inverse 3 x 3 diagonal blocks of the tangent at the beginning of the step; carries no derivative."""
     scene, state, mass, memory = jax.lax.stop_gradient((scene, state, mass, memory))
     mesh = scene.mesh
-    K = mjed.all_blocks(mjed.element_stiffness(mesh, scene.law, state.x))
+    law = porosity.law_in_force(scene.porosity, scene.law)
+    if scene.porosity is not None:  # at its stiffest, before anything flows
+        law = law + Volumetric(bulk=porosity.undrained(scene.porosity))
+    K = mjed.all_blocks(mjed.element_stiffness(mesh, law, state.x))
     now = 1.0 if memory is None else memory.now
     blocks = [[jnp.zeros(mesh.number_of_nodes, state.x.dtype) for _ in range(3)] for _ in range(3)]
     for r in range(3):
@@ -181,11 +203,15 @@ def _run(scene: Scene) -> Result:
         # A state that is not finite spoils nothing further: the run stays where it last was.
         good = statistics.status != status.NOT_FINITE
         new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
-        return new, (new.x, jnp.where(good, reactions, 0.0), statistics)
+        P = None if new.fluid is None else new.fluid.pressure
+        return new, (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
-    _, (x, reactions, statistics) = jax.lax.scan(advance, initial_state(scene), jnp.arange(1, steps + 1, dtype=dtype))
-    times = jnp.arange(1, steps + 1, dtype=dtype) * (1.0 if scene.solve.dt is None else scene.solve.dt)
-    return Result(times=times, positions=x, reactions=reactions, status=statistics.status, statistics=statistics)
+    _, (x, reactions, P, statistics) = jax.lax.scan(
+        advance, initial_state(scene), jnp.arange(1, steps + 1, dtype=dtype)
+    )
+    times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
+    code = statistics.status
+    return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
 
 
 def simulate(scene: Scene) -> Result:
