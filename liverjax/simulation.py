@@ -206,9 +206,8 @@ def _run(scene: Scene) -> Result:
         P = None if new.fluid is None else new.fluid.pressure
         return new, (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
-    _, (x, reactions, P, statistics) = jax.lax.scan(
-        advance, initial_state(scene), jnp.arange(1, steps + 1, dtype=dtype)
-    )
+    numbers = jnp.arange(1, steps + 1, dtype=dtype)
+    _, (x, reactions, P, statistics) = jax.lax.scan(advance, initial_state(scene), numbers)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status
     return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
