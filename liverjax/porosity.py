@@ -91,15 +91,20 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     return Fluid(jnp.zeros(mesh.points.shape[0], J.dtype), J, J if porosity.scheme == "chapter" else None)
 
 
-def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, F_begin: Matrix, J_end: Any, dt: Any) -> jax.Array:
-    """P (V,) [Pa] at the end of a step that begins at F_begin and ends with volumes J_end (E,)."""
+def pressure(
+    porosity: Porosity, mesh: TetMesh, fluid: Fluid, F_begin: Matrix, J_end: Any, dt: Any, tolerance: float
+) -> jax.Array:
+    """P (V,) [Pa] at the end of a step that begins at F_begin and ends with volumes J_end (E,).
+
+    `tolerance` is that of the linear solve, relative to its right-hand side.
+    """
     increment = fluid.J - fluid.J_before if porosity.scheme == "chapter" else J_end - fluid.J
     matvec_A, diagonal, mask = _operator(porosity, mesh, F_begin, fluid.J, dt)
     store = _scatter(mesh, mesh.volumes * fluid.J / 4) / porosity.limit_bulk
     rate = -_scatter(mesh, mesh.volumes * increment / 4)
     # Everything times dt: the storage term stays of the size of a volume whatever the step.
     rhs = mask * (store * fluid.pressure + rate)
-    return differentiable_solve(matvec_A, rhs, lambda r: r / diagonal, 1e-13, 2000)
+    return differentiable_solve(matvec_A, rhs, lambda r: r / diagonal, tolerance, 2000)
 
 
 def _operator(porosity: Porosity, mesh: TetMesh, F: Matrix, J: Any, dt: Any) -> tuple[Any, jax.Array, jax.Array]:
@@ -120,12 +125,12 @@ def _operator(porosity: Porosity, mesh: TetMesh, F: Matrix, J: Any, dt: Any) -> 
     diagonal = mask * diagonal + (1 - mask)
 
     def apply(p):
-        p = mask * p
+        held, p = (1 - mask) * p, mask * p  # a unit row where drained: adjoint loads need not vanish there
         corner = [p[mesh.tetrahedra[:, a]] for a in range(4)]
         flow = jnp.zeros_like(p)
         for a in range(4):
             flow = flow.at[mesh.tetrahedra[:, a]].add(sum(pairs[min(a, b), max(a, b)] * corner[b] for b in range(4)))
-        return mask * (store * p + flow)
+        return mask * (store * p + flow) + held
 
     return apply, diagonal, mask
 

@@ -87,7 +87,7 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     F_begin = None if sponge is None else deformation_gradient(mesh, state.x)
 
     def fluid_pressure(F):
-        return porosity.pressure(sponge, mesh, state.fluid, F_begin, determinant(F), dt)
+        return porosity.pressure(sponge, mesh, state.fluid, F_begin, determinant(F), dt, 1e-3 * solve.tolerance)
 
     # The chapter's pressure does not depend on where the step ends: solved for once.
     known = None if sponge is None or sponge.scheme == "implicit" else fluid_pressure(F_begin)

@@ -13,7 +13,8 @@ from liverjax.kinematics import deformation_gradient
 LAWS = list(lj.laws.LAWS)
 
 
-@pytest.mark.parametrize("name", LAWS)
+#: One of the stretch-based laws stands for all: they differ in scalars that tests/test_laws.py checks.
+@pytest.mark.parametrize("name", [n for n in LAWS if n not in ("bogen", "logarithmic", "exponential")])
 def test_force_and_stiffness_against_both_references(name, distorted_box):
     mesh, x = distorted_box
     law = lj.laws.typical(name)

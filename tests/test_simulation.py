@@ -213,7 +213,6 @@ def test_long_relaxation_leaves_the_elastic_state_with_less_stress():
 
 FEBIO_LAWS = {
     "neo-Hookean": lj.laws.NeoHookeanCompressible(mu=770.0, lame_lambda=3080.0),
-    "Mooney-Rivlin": lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=7700.0, volumetric="log"),
     "Veronda-Westmann": lj.laws.VerondaWestmann(c1=350.0, c2=2.2, bulk=7700.0, volumetric="log"),
 }
 

@@ -1,0 +1,146 @@
+"""The sponge and its fluid: the stress of section 4.3, consolidation, limits, stability of the two schemes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import porosity
+from liverjax.scene import scene_from
+from liverjax.simulation import initial_state
+from liverjax.struct import replace
+
+#: Table 2 with the permeability read in mm^2/(Pa s).
+SPONGE = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
+SHEAR, HEIGHT, LOAD = 300.0, 0.1, -0.4
+MODULUS = 400.0 + 4 / 3 * SHEAR
+DIFFUSION_TIME = HEIGHT**2 * (MODULUS + 2200.0) / (2e-5 * MODULUS * 2200.0)
+
+
+def test_volumetric_stress_and_its_tangent_line():
+    J0 = 1 - 0.5 + 0.5 * 400 / 2200  # 0.5909: the factor r_w that the chapter's print lacks
+    J = jnp.linspace(-0.5, 2.0, 2001)
+    stress = np.asarray(porosity.volumetric_stress(SPONGE, J))
+    above = np.asarray(J) > J0
+    assert np.allclose(
+        stress[above], 400 * 0.5 * np.log((0.5 + np.asarray(J)[above] - 1) / 0.5), rtol=1e-12, atol=1e-12
+    )
+    slope = jax.vmap(jax.grad(lambda J: porosity.volumetric_stress(SPONGE, J)))(J)
+    assert np.isclose(porosity.volumetric_stress(SPONGE, 1.0), 0.0)
+    assert np.allclose(np.asarray(slope)[~above], 2200.0)
+    assert np.isclose(jax.grad(lambda J: porosity.volumetric_stress(SPONGE, J))(J0 + 1e-9), 2200.0, rtol=1e-6)
+    assert np.isclose(jax.grad(lambda J: porosity.volumetric_stress(SPONGE, J))(1.0), 400.0)
+
+
+def column(layers: int, steps: int, duration: float, scheme: str = "implicit", **changes) -> lj.Scene:
+    """Confined compression, drained at the top; `duration` in diffusion times."""
+    sides = [{"set": name, "axes": name[0]} for name in ("x_min", "x_max", "y_min", "y_max")]
+    return scene_from(
+        {
+            "mesh": {"shape": "box", "size": [0.02, 0.02, HEIGHT], "cells": [1, 1, layers]},
+            "law": {"name": "neo_hookean", "mu": SHEAR, "bulk": 1.0},
+            "porosity": {
+                "bulk": 400.0,
+                "limit_bulk": 2200.0,
+                "fluid_fraction": 0.5,
+                "permeability": 2e-5,
+                "drained": {"z_min": HEIGHT},
+                "scheme": scheme,
+            }
+            | changes,
+            "fixed": [{"set": "z_min", "axes": "z"}, *sides],
+            "traction": [{"where": {"z_min": HEIGHT}, "value": [0, 0, LOAD]}],
+            "solve": {"dt": duration * DIFFUSION_TIME / steps, "steps": steps},
+        }
+    )
+
+
+def test_terzaghis_consolidation():
+    at = np.array([0.05, 0.1, 0.197, 0.5, 0.848, 1.0])
+    settled = np.array([0.2523, 0.3568, 0.5003, 0.7640, 0.9000, 0.9313])
+    base = np.array([0.9969, 0.9493, 0.7777, 0.3708, 0.1571, 0.1080])
+    at_once, at_last = LOAD / (MODULUS + 2200) * HEIGHT, LOAD / MODULUS * HEIGHT
+    p0 = -LOAD * 2200 / (MODULUS + 2200)
+    errors = []
+    for layers, steps in ((6, 250), (12, 500)):
+        result = lj.simulate(column(layers, steps, 1.0)).check()
+        k = np.rint(at * steps).astype(int) - 1
+        top = np.asarray(result.positions)[k, :, 2].max(axis=1) - HEIGHT
+        U, p = (top - at_once) / (at_last - at_once), np.asarray(result.pressure)[k, 0] / p0
+        errors.append(max(np.abs(U - settled).max(), np.abs(p - base).max()))
+    assert errors[1] < 0.01
+    assert errors[0] / errors[1] > 1.6  # first order in the step, which is halved with the layers
+
+
+@pytest.mark.parametrize("duration", [1e-3, 1.0, 1e4])
+def test_the_implicit_scheme_is_stable_at_any_step(duration):
+    # Ten steps of 1e-4 to 1e3 diffusion times.
+    result = lj.simulate(column(8, 10, duration)).check()
+    top = float(jnp.max(result.positions[-1, :, 2])) - HEIGHT
+    at_once, at_last = LOAD / (MODULUS + 2200) * HEIGHT, LOAD / MODULUS * HEIGHT
+    assert np.isfinite(np.asarray(result.pressure)).all()
+    # From the undrained settlement (to the order of the load) to the drained one.
+    assert top / at_once > 0.99 and top / at_last < 1.01
+    if duration > 1:
+        assert np.isclose(top, at_last, rtol=1e-2)
+
+
+def test_the_chapters_scheme_is_not():
+    # Nothing flows in a step: the explicit volume change overshoots where K_lim exceeds the sponge's stiffness.
+    short = lj.simulate(column(8, 40, 0.004, "chapter"))
+    assert np.abs(np.asarray(short.pressure)[-1]).max() > 10 * np.abs(LOAD)
+    long = lj.simulate(column(8, 40, 40.0, "chapter")).check()
+    at_last = LOAD / MODULUS * HEIGHT
+    assert np.isclose(float(jnp.max(long.positions[-1, :, 2])) - HEIGHT, at_last, rtol=1e-2)
+
+
+def test_bulk_is_not_counted_twice():
+    scene = column(2, 1, 1.0)
+    assert porosity.law_in_force(scene.porosity, scene.law).bulk is None
+    assert porosity.law_in_force(column(2, 1, 1.0, keep_bulk=True).porosity, scene.law).bulk == 1.0
+    assert porosity.law_in_force(None, scene.law).bulk == 1.0
+
+
+def test_sealed_and_tight_keeps_all_fluid():
+    # Sealed: the pressure's mean follows the mean change of volume, P = -K_lim (J - 1) to first order.
+    scene = column(4, 5, 1e-3)
+    sealed = replace(scene, porosity=SPONGE)
+    result = lj.simulate(sealed).check()
+    J = 1 + (float(jnp.max(result.positions[-1, :, 2])) / HEIGHT - 1)
+    assert np.isclose(float(jnp.mean(result.pressure[-1])), -2200 * (J - 1), rtol=2e-2)
+
+
+def test_gradient_by_the_permeability():
+    scene = column(2, 2, 0.5)
+    scene = replace(scene, solve=replace(scene.solve, tolerance=1e-11))
+
+    @jax.jit
+    def settled(kappa):
+        return lj.simulate(lj.with_parameters(scene, {"porosity.permeability": kappa})).positions[-1, -1, 2]
+
+    exact, h = float(jax.jit(jax.grad(settled))(2e-5)), 2e-8
+    assert np.isclose((settled(2e-5 + h) - settled(2e-5 - h)) / (2 * h), exact, rtol=1e-6)
+
+
+def test_only_a_porous_scene_has_pressure():
+    scene = column(1, 1, 1.0)
+    assert initial_state(scene).fluid is not None
+    dry = replace(scene, porosity=None)
+    assert initial_state(dry).fluid is None and lj.simulate(dry).pressure is None
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"limit_bulk": 300.0}, "must be above bulk"),
+        ({"fluid_fraction": 1.5}, "out of bounds"),
+        ({"permeability": -1.0}, "out of bounds"),
+        ({"scheme": "explicit"}, "use implicit or chapter"),
+        ({"drained": {"z_min": 1.0}}, "meets no node"),
+        ({"keep_bulk": 1}, "true or false"),
+    ],
+)
+def test_unusable_porosity_is_refused(change, sentence):
+    with pytest.raises(lj.InputError, match=sentence):
+        column(1, 1, 1.0, **change)
