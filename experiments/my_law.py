@@ -1,7 +1,7 @@
 """A law of one's own, in ten lines and without touching the package.
 
 ``python -m liverjax check experiments/my_law.py:Gent`` checks it, ``python -m liverjax plot experiments/my_law.py:Gent
-yeoh`` draws it, and it simulates, fits and differentiates like a shipped one: its derivatives come from its energy.
+yeoh`` draws it, and it simulates and differentiates like a shipped one: its derivatives come from its energy.
 """
 
 import jax.numpy as jnp

@@ -1,6 +1,7 @@
 """``python -m fitting SWEEP.csv`` and ``python -m fitting curves LAW FILES``: parameters with their uncertainty."""
 
 import argparse
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -142,9 +143,13 @@ def identify_laws(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from fitting import curves, curves_report, stress_stretch
+    from liverjax import laws
 
     candidates = stress_stretch.candidates(options.law, options.terms)
     found, notes = curves.read_curves(options.files, options.unit)
+    if options.law == "all":
+        left = [n for n in laws.LAWS if not stress_stretch.incompressible_form(n)]
+        notes.append(f"left out, being no isochoric energy plus U(J): {', '.join(left)}")
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)
@@ -170,6 +175,9 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 if __name__ == "__main__":

@@ -26,8 +26,14 @@ class Curve(NamedTuple):
 
     @property
     def driven(self) -> np.ndarray:
-        """The amount of shear, or the stretch along axis 1."""
-        return self.F[:, 0, 1] if self.component == (0, 1) else self.F[:, 0, 0]
+        """The component of F that the stress works on; where it does not vary, the shear or stretch that does."""
+        own, shear = self.F[:, *self.component], self.F[:, 0, 1]
+        return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
+
+    @property
+    def rises(self) -> bool:
+        """Whether the stress of a stable material rises with `driven`: it does all the work of the test."""
+        return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
 
     @property
     def scale(self) -> float:
@@ -52,6 +58,11 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         curves += found
         if not named:
             notes.append(f"{file.name}: its stress column names no unit, read as {unit} (--unit Pa, kPa or MPa)")
+    seen: dict[str, int] = {}
+    for k, curve in enumerate(curves):
+        seen[curve.label] = seen.get(curve.label, 0) + 1
+        if seen[curve.label] > 1:
+            curves[k] = curve._replace(label=f"{curve.label} ({seen[curve.label]})")
     return curves, notes
 
 
@@ -68,17 +79,20 @@ def _rows(file: Path) -> list[dict[str, str]]:
     if len(lines) < 2:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
     rows = [{k.strip(): (v or "").strip() for k, v in r.items() if k} for r in csv.DictReader(lines)]
+    rows = [row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
+    if not rows:
+        raise InputError(f"{file} holds no rows: give a CSV file of curves")
     if "F11" not in rows[0] and not {"test", "stretch"} <= set(rows[0]):
         raise InputError(
-            f"{file} has columns {', '.join(rows[0])}: give F11 … F33, P11 … P33, or test, stretch, shear, "
-            "nominal_stress_kPa"
+            f"{file} has columns {', '.join(list(rows[0])[:-1])[:100]}: give F11 … F33, P11 … P33, "
+            "or test, stretch, shear, nominal_stress_kPa"
         )
     return rows
 
 
 def _column(file: Path, rows: list[dict], name: str, default: float | None = None) -> np.ndarray:
     values = []
-    for k, row in enumerate(rows, 1):
+    for row in rows:
         text = row.get(name, "")
         if not text and default is not None:
             values.append(default)
@@ -86,9 +100,10 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
         try:
             values.append(float(text))
         except ValueError:
-            raise InputError(f"{file}, data row {k}: {name} = {text!r} is not a number: give one") from None
+            where = f"{file}, data row {row['row']}"
+            raise InputError(f"{where}: {name} = {text[:40]!r} is not a number: give one") from None
         if not np.isfinite(values[-1]):
-            raise InputError(f"{file}, data row {k}: {name} = {text} is not finite: leave the row out")
+            raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite: leave the row out")
     return np.array(values)
 
 
@@ -130,6 +145,8 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
 
 def _kind(F: np.ndarray) -> str:
     a, b, c = F[:, 0, 0], F[:, 1, 1], F[:, 2, 2]
+    if np.any(F[:, 1, 0] != 0):
+        return "general"
     if np.any(F[:, 0, 1] != 0):
         return "simple_shear"
     for name, one, two in (("uniaxial", b, c), ("equibiaxial", a, b), ("pure_shear", b, np.ones_like(b))):
@@ -167,10 +184,15 @@ def _curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, s
     worst = int(np.argmax(np.abs(J - 1)))
     if abs(J[worst] - 1) > 1e-3:
         raise InputError(f"{file}: det F = {J[worst]:.4g} in row {worst + 1}: volume must be kept (det F = 1)")
-    if len(stress) < 3 or not np.any(stress):
-        raise InputError(f"{file}: {label} has {len(stress)} points: give at least 3, not all zero")
+    if len(stress) < 3:
+        raise InputError(f"{file}: {label} has {len(stress)} points: give at least 3")
+    rms = np.sqrt(np.mean(stress**2))
+    if not 1e-100 < rms < 1e100:
+        raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa: give measured stresses")
+    if np.ptp(F, axis=0).max() == 0:
+        raise InputError(f"{file}: {label} has the same deformation in every row: give a curve")
     # Rounded digits of F: the volume is made 1 by the free side.
     F = F.copy()
     F[:, 2, 2] /= J
-    order = np.argsort(F[:, 0, 1] if component == (0, 1) else F[:, 0, 0], kind="stable")
+    order = np.argsort(Curve(label, test, F, component, stress).driven, kind="stable")
     return Curve(label, test, F[order], component, stress[order])

@@ -64,19 +64,22 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
     Raises:
         InputError: unknown law, or one whose energy is no isochoric one plus U(J).
     """
+    if terms is not None and name not in ("ogden", "all"):
+        raise InputError(f"--terms {terms} is of ogden only, not of {name}: leave it out")
     if name == "all":
-        singles = [c for n in laws.LAWS if n != "ogden" and _incompressible_form(n) for c in candidates(n)]
-        return singles + [_ogden(k) for k in (2, 3)]  # one term is bogen
+        singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
+        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is bogen
     cls = laws.find(name)
-    if not _incompressible_form(name):
-        usable = ", ".join(n for n in laws.LAWS if _incompressible_form(n))
+    if not incompressible_form(name):
+        usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
         raise InputError(f"law {name} is not an isochoric energy plus U(J), so its curves need more: use {usable}")
     if cls is laws.Ogden:
         return [_ogden(k) for k in ((1, 2, 3) if terms is None else (terms,))]
     return [_bogen() if cls is laws.Bogen else _single(name)]
 
 
-def _incompressible_form(name: str) -> bool:
+def incompressible_form(name: str) -> bool:
+    """Whether a law is an isochoric energy plus U(J)."""
     return laws.isochoric_part(laws.typical(name)) is not None
 
 
@@ -149,7 +152,8 @@ def initial_modulus(curves: list[Curve]) -> float:
     for c in curves:
         model = np.asarray(homogeneous.nominal_stress(unit, jnp.asarray(c.F)))[:, c.component[0], c.component[1]]
         keep = np.abs(model) > 0.02 * np.abs(model).max()
-        ratios.append(np.median(c.stress[keep] / model[keep]))
+        if keep.any():
+            ratios.append(np.median(c.stress[keep] / model[keep]))
     positive = [r for r in ratios if r > 0]
     if not positive:
         raise InputError("the stresses point against the stretches in every curve: check signs and axes")
@@ -166,7 +170,8 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
     rows = jnp.arange(F.shape[0])
     inside = np.setdiff1d(np.arange(1, F.shape[0]), at)  # neighbours within a curve
     driven = np.concatenate([c.driven for c in curves])
-    rising = jnp.asarray(np.sign(driven[inside] - driven[inside - 1]))
+    works = np.repeat([c.rises for c in curves], np.diff(at))[inside]
+    rising = jnp.asarray(np.where(works, np.sign(driven[inside] - driven[inside - 1]), 0.0))
 
     def relative_stress(u):
         P = homogeneous.nominal_stress(candidate.law(candidate.values(u, scale)), F, constant=True)
@@ -196,7 +201,7 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
     noise = float(np.sqrt(np.sum(misfit**2) / max(1, n - p)))
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
     half, s = spread(J[:n], noise, slope)
-    errors = np.linalg.norm(half, axis=1)
+    errors = np.linalg.norm(half, axis=1) if n > p else np.full(p, np.nan)
     law = candidate.law(jnp.asarray(values))
     split = np.split(misfit, np.cumsum([len(c.stress) for c in curves])[:-1])
     criterion = n * np.log(np.sum(misfit**2) / n)
@@ -227,6 +232,8 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
 
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:
     told = []
+    if sum(len(c.stress) for c in curves) <= len(fit.values):
+        told.append(f"as many parameters as points ({len(fit.values)}): nothing can be said of their errors")
     if not fit.converged:
         told.append("the fit did not converge from its best start")
     quantile = scipy.stats.t.ppf(0.975, max(1, sum(len(c.stress) for c in curves) - len(fit.values)))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from liverjax import laws
 from liverjax.errors import InputError
+from liverjax.laws.volumetric import VOLUMETRIC
 
 
 def _bounds(metadata) -> str:
@@ -21,6 +22,7 @@ def _bounds(metadata) -> str:
 
 def list_laws() -> None:
     """Print every law with its energy, parameters, units and bounds."""
+    print(f"every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
     for name, cls in laws.LAWS.items():
         print(f"{name}\n    {cls.__doc__.splitlines()[0]}")
         for field in laws.parameters(cls):
@@ -33,8 +35,11 @@ def list_laws() -> None:
 
 def check_law(name: str, out: Path) -> int:
     """Print the table of a law's gradient check and draw it; 1 if a row failed."""
+    import jax
+
     from liverjax import check, figures
 
+    jax.config.update("jax_enable_x64", True)  # its limits are those of 64 bits
     law = check.load(name)
     file = _target(out, f"check_{_label(name)}.png")
     result = check.check(law)
@@ -42,7 +47,7 @@ def check_law(name: str, out: Path) -> int:
     figures.gradient_check(result, _label(name), file)
     print(f"written: {file}")
     for row in result.failed:
-        print(f"failed: {row.name}: {row.found} ({row.limit})", file=sys.stderr)
+        print(f"failed: {row.name}: {row.found}{f' ({row.limit})' if row.limit else ''}", file=sys.stderr)
     return 1 if result.failed else 0
 
 
@@ -54,7 +59,9 @@ def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
         raise InputError(
             f"--stretch {stretches[0]:g} {stretches[1]:g} is no range about 1: give e.g. --stretch 0.6 1.6"
         )
-    named = {_label(name): check.load(name) for name in (laws.LAWS if names == ["all"] else names)}
+    names = [n for name in names for n in (laws.LAWS if name == "all" else [name])]
+    labels = [_label(name) for name in names]
+    named = {n if labels.count(k) > 1 else k: check.load(n) for k, n in zip(labels, names, strict=True)}
     file = _target(out, "laws.png")
     figures.curves(named, file, tuple(stretches))
     print(f"written: {file}")
@@ -74,8 +81,6 @@ def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
 
     read = scene.load_scene(file)
     target = _target(out, "result.h5")
-    if target.is_dir():
-        raise InputError(f"--out {out}: result.h5 in it is a folder; name another folder for the results")
     begin = time.perf_counter()
     program = jax.jit(simulate).lower(read).compile()
     compiled = time.perf_counter()
@@ -115,6 +120,8 @@ def _target(out: Path, name: str) -> Path:
             pass
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
+    if (out / name).is_dir():
+        raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
     return out / name
 
 

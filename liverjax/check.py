@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -62,21 +63,50 @@ def load(name: str) -> Law:
         raise InputError(f"{name} names no law: give FILE.py:LAW")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    spec = importlib.util.spec_from_file_location(Path(file).stem, file)
+    # Under a private name that is registered: dataclasses look their module up, and the file may be called jax.py.
+    spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    sys.path.insert(0, str(Path(file).resolve().parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
-        raise InputError(f"{file} does not run ({type(error).__name__}: {error}): mend it first") from None
+    except (Exception, SystemExit) as error:
+        raise InputError(f"{file} does not run ({_reason(error)}): mend it first") from None
+    finally:
+        sys.path.pop(0)
     found = getattr(module, attribute, None)
     if found is None:
-        offered = [n for n, v in vars(module).items() if _is_law(v) and getattr(v, "__module__", "") == module.__name__]
+        own = {n: v if inspect.isclass(v) else type(v) for n, v in vars(module).items() if _is_law(v)}
+        offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
         raise InputError(f"{file} has no {attribute}: {'use ' + ' or '.join(offered) if offered else 'define a law'}")
     if not _is_law(found):
         raise InputError(f"{name} is no law: derive it from liverjax.Law and decorate it with liverjax.struct")
-    return _typical(found, name) if inspect.isclass(found) else found
+    law = _typical(found, name) if inspect.isclass(found) else found
+    _try(law, name)
+    return law
+
+
+def _reason(error: BaseException) -> str:
+    """Kind and first line of an exception, at most 150 characters."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:150]
+
+
+def _try(law: Law, name: str) -> None:
+    """Evaluate the law once: whatever it raises becomes one sentence."""
+    for shape in ((), (2,)):
+        F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
+        for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
+            try:
+                found = jax.eval_shape(getattr(law, what), F).shape
+            except Exception as error:
+                raise InputError(
+                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): mend the law, name every invariant "
+                    "it uses in `invariants`, and give one direction for fibres"
+                ) from None
+            if found != expected:
+                raise InputError(f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: mend the law")
 
 
 def _is_law(value: Any) -> bool:
@@ -90,7 +120,12 @@ def _typical(cls: type[Law], name: str) -> Law:
     missing = [n for n, v in values.items() if v is None]
     if missing:
         raise InputError(f"{name}: parameter {missing[0]} has no typical value: give param(…, typical=…) or an object")
-    return cls(**values)
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise InputError(
+            f"{name} cannot be made ({_reason(error)}): give every field a typical value or default"
+        ) from None
 
 
 def check(law: Law) -> Check:
@@ -173,7 +208,7 @@ def _rest(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> li
     for name, value, method in (("shear modulus", shear, "shear_modulus"), ("bulk modulus", bulk, "bulk_modulus")):
         try:
             stated = float(getattr(law, method)())
-        except InputError:
+        except Exception:  # not stated, or stated by a function that does not run
             rows.append(Row(f"ground-state {name}", f"{value:.6g} Pa", "not stated", None))
             continue
         agrees = bool(abs(value - stated) < 1e-9 * (abs(shear) + abs(bulk)))
@@ -227,7 +262,7 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
     """The nominal stress rises; at the ends by one-sided differences."""
     stress = np.asarray(homogeneous.measured(test, P))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
 
 

@@ -36,8 +36,9 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
             style = ("-", "--", ":")[k // len(COLOURS) % 3]
             axis.plot(driven, stress, style, color=COLOURS[k % len(COLOURS)], label=name)
             ends.append((np.nanmin(stress), np.nanmax(stress)))
-        low, high = 3 * np.median(ends, axis=0)  # an exponential law must not hide the others
-        axis.set_ylim(max(low, axis.get_ylim()[0]), min(high, axis.get_ylim()[1]))
+        low, high = 3 * np.nanmedian(ends, axis=0)  # an exponential law must not hide the others
+        if low < high:  # false for NaN
+            axis.set_ylim(max(low, axis.get_ylim()[0]), min(high, axis.get_ylim()[1]))
         axis.set(title=test.replace("_", " "), xlabel="amount of shear" if what == "shear" else "stretch")
         axis.grid(alpha=0.3)
         axis.axhline(0, color=GREY, lw=0.5)

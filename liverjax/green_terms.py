@@ -32,30 +32,30 @@ class Moduli(NamedTuple):
     curvature: Any
 
 
-def components(direction: Any) -> Vector:
-    """A direction (3,), or one an element (E, 3), as a unit vector of components."""
-    direction = jnp.asarray(direction)
+def components(direction: Any, like: Any) -> Vector:
+    """A direction (3,), or one an element (E, 3), as a unit vector of components in the precision of `like`."""
+    direction = jnp.asarray(direction, jnp.result_type(like))
     return unit(tuple(direction[..., i] for i in range(3)))
 
 
-def material_axes(law: Any) -> Matrix:
+def material_axes(law: Any, like: Any) -> Matrix:
     """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes where a law has no fibre."""
     if not hasattr(law, "fibre"):
         return IDENTITY
-    f, s = components(law.fibre), components(law.sheet)
+    f, s = components(law.fibre, like), components(law.sheet, like)
     s = unit(add(s, scale(-dot(f, s), f)))
     return transpose((f, s, cross(f, s)))
 
 
 def stress(law: Any, F: Matrix) -> Matrix:
     """Second Piola-Kirchhoff stress [Pa] of w alone."""
-    A = material_axes(law)
+    A = material_axes(law, F[0][0])
     return rotated(_stress(law, green_strain(matmul(F, A))), A)
 
 
 def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
-    A = material_axes(law)
+    A = material_axes(law, F[0][0])
     FA = matmul(F, A)
     E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]
     if not hasattr(law, "green_derivatives"):

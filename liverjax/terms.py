@@ -65,7 +65,7 @@ def state(law: Any, F: Matrix) -> State:
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
     I1 = None if C is None else C[0][0] + C[1][1] + C[2][2]
-    fibres = {key: green_terms.components(part.fibre) for key, part in fibre_invariants(law).items()}
+    fibres = {key: green_terms.components(part.fibre, F[0][0]) for key, part in fibre_invariants(law).items()}
     frame = principal(F) if any(hasattr(part, "stretch_energy") for part in summands(law)) else None
     return State(law, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres, frame)
 

@@ -205,6 +205,25 @@ def test_components_that_cannot_be_used_are_refused(tmp_path, capsys):
     assert "zero or missing" in run(silent, silent, silent)
 
 
+def test_tension_along_another_axis(tmp_path):
+    l = np.linspace(0.8, 1.4, 13)
+    names = ",".join(f"{a}{i}{j}" for a in "FP" for i in (1, 2, 3) for j in (1, 2, 3))
+    rows = [f"{v**-0.5},0,0,0,{v},0,0,0,{v**-0.5},0,0,0,0,{2000 * (v - v**-2)},0,0,0,0" for v in l]
+    (tmp_path / "axis2.csv").write_text("\n".join([names, *rows]))
+    found, _ = curves.read_curves([tmp_path / "axis2.csv", tmp_path / "axis2.csv"])
+    assert len({c.label for c in found}) == 2
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    assert np.isclose(stress_stretch.fit(candidate, found).values[0], 2000.0)
+
+
+def test_as_many_parameters_as_points_is_told():
+    curve = synthetic(KNOWN["yeoh"], 0.05)[0]
+    three = curve._replace(F=curve.F[[0, 13, 26]], stress=curve.stress[[0, 13, 26]])
+    (candidate,) = stress_stretch.candidates("yeoh")
+    found = stress_stretch.fit(candidate, [three])
+    assert np.isnan(found.standard_errors).all() and any("as many parameters" in w for w in found.warnings)
+
+
 def test_laws_without_isochoric_form_are_refused(capsys):
     assert main(["curves", "costa", str(DATA / "rubber_curves.csv")]) == 2
     assert "use neo_hookean, mooney_rivlin" in capsys.readouterr().err

@@ -57,7 +57,6 @@ def laws(n: int) -> dict:
         "I4, one an element": Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=a),
         "two families": Holzapfel(mu=500.0, k1=100.0, k2=2.0, bulk=5000.0, fibre=a)
         + Holzapfel(mu=0.0, k1=300.0, k2=1.0, bulk=0.0, fibre=b),
-        "fibres and stretches": lj.laws.create("costa", **COSTA, fibre=a, sheet=b) + lj.laws.typical("bogen"),
         "user's energy of Green's strain": FungOfGreen(c=500.0) + lj.laws.typical("neo_hookean"),
     }
 

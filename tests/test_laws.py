@@ -180,5 +180,10 @@ def test_create_under_tracing_and_optional_parameters():
     with pytest.raises(lj.InputError, match=r"bulk = None|not finite"):
         lj.laws.create("neo_hookean", mu=770.0, bulk=None)
     assert lj.laws.create("mooney_rivlin", c10=1.0, c01=1.0, c20=None, bulk=10.0).c20 is None
+    ogden = jax.grad(
+        lambda m: lj.laws.create("ogden", mu=[m, -40.0], alpha=[2.5, -4.0], bulk=7e3).energy(1.1 * jnp.eye(3))
+    )
+    assert np.isfinite(ogden(700.0))
+    assert LAWS["costa"].tangent(jnp.eye(3, dtype=jnp.float32)).dtype == jnp.float32
     integer = np.array([[2, 0, 0], [0, 1, 0], [0, 0, 1]])
     assert np.allclose(LAWS["neo_hookean"].first_piola(integer), LAWS["neo_hookean"].first_piola(integer * 1.0))

@@ -114,7 +114,11 @@ def create(name: str, **values: Any) -> Law:
 
 def _sequence(value: Any) -> Any:
     """One number a term as a tuple, so that each is a leaf; directions of elements stay an array."""
-    return jnp.asarray(value) if np.ndim(value) > 1 else tuple(value)
+    if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
+        return tuple(value)
+    if jnp.ndim(value) == 0:
+        raise InputError(f"{value} is one number where a list of numbers is asked for: give a list")
+    return jnp.asarray(value) if jnp.ndim(value) > 1 else tuple(value)
 
 
 def _check_value(where: str, metadata: Any, value: Any) -> None:
@@ -123,6 +127,8 @@ def _check_value(where: str, metadata: Any, value: Any) -> None:
             raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")
         return
     if isinstance(value, jax.core.Tracer):  # a number only under jit or grad: nothing to check yet
+        return
+    if isinstance(value, (list, tuple)) and any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)):
         return
     try:
         if isinstance(value, str):

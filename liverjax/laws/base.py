@@ -80,7 +80,11 @@ class Law:
         raise InputError(f"law {type(self).__name__} states no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
-        """Ground-state bulk modulus [Pa]."""
+        """Ground-state bulk modulus [Pa]: `bulk` of a law whose other energies are isochoric."""
+        if type(self).strain_energy is not Law.strain_energy or hasattr(self, "green_energy"):
+            raise InputError(
+                f"law {type(self).__name__} states no ground-state bulk modulus: define bulk_modulus(self)"
+            )
         return 0.0 if self.bulk is None else self.bulk
 
     # -- what a law can then do --------------------------------------------------------------------------------------
@@ -89,10 +93,10 @@ class Law:
         """What `strain_energy` takes, at the tuple matrix F."""
         I = invariants(self.invariants, F)
         if "I4" in self.invariants:
-            Fa = matvec(F, components(self.fibre))
+            Fa = matvec(F, components(self.fibre, F[0][0]))
             I = I._replace(I4=dot(Fa, Fa))
         if hasattr(self, "green_energy"):
-            I = I._replace(E=green_strain(matmul(F, material_axes(self))))
+            I = I._replace(E=green_strain(matmul(F, material_axes(self, F[0][0]))))
         if hasattr(self, "stretch_energy"):
             I = I._replace(stretches=stretches(F))
         return I if self.bulk is None else I._replace(J=determinant(F))
@@ -113,6 +117,8 @@ class Law:
         return jnp.stack([r[0] for r in rows], axis=-3)
 
     def __add__(self, other: "Law") -> "Sum":
+        if not isinstance(other, Law):
+            return NotImplemented
         return Sum(laws=summands(self) + summands(other))
 
 
