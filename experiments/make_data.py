@@ -36,7 +36,7 @@ frequency_Hz,storage_modulus_Pa,loss_modulus_Pa
 RUBBER = """\
 # Nominal stress of vulcanised rubber (8 % sulphur) in uniaxial tension, equibiaxial tension and pure shear.
 # Source: Treloar 1944, Trans. Faraday Soc. 40, 59-70, as digitised in the repository
-# Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); tabulated by experiments/make_data.py.
+# Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); tabulated by experiments/make_data.py. Units: stretch 1, stress MPa.
 test,stretch,nominal_stress_MPa
 """
 
@@ -44,6 +44,7 @@ BRAIN = """\
 # Nominal stress of human brain cortex in tension, compression and simple shear (quasi-static, first loading).
 # Source: Budday et al. 2017, Acta Biomaterialia 48, 319-340, as digitised in the repository
 # Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); every second point, tabulated by experiments/make_data.py.
+# Units: stretch and shear 1, stress kPa.
 test,stretch,shear,nominal_stress_kPa
 """
 

@@ -22,6 +22,7 @@ from liverjax.kinematics import (
     outer,
     right_cauchy_green,
     scale,
+    scale_matrix,
     transpose,
 )
 from liverjax.laws import products
@@ -85,11 +86,6 @@ def _at(law: Any, F: Matrix) -> _At:
 def _stress(t: _Term, s: _At) -> Matrix:
     """S^k = 2 dg/dC, no inverse."""
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
-
-
-def scale_matrix(w: Any, A: Matrix) -> Matrix:
-    """Scalar times matrix."""
-    return tuple(scale(w, row) for row in A)
 
 
 def first_piola(law: Any, F: Matrix) -> Matrix:

@@ -46,6 +46,11 @@ def scale(s: Any, a: Vector) -> Vector:
     return (s * a[0], s * a[1], s * a[2])
 
 
+def scale_matrix(w: Any, A: Matrix) -> Matrix:
+    """Scalar times matrix."""
+    return tuple(scale(w, row) for row in A)
+
+
 def matvec(A: Matrix, v: Vector) -> Vector:
     """Matrix times vector."""
     return (dot(A[0], v), dot(A[1], v), dot(A[2], v))

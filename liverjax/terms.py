@@ -27,6 +27,7 @@ from liverjax.kinematics import (
     outer,
     right_cauchy_green,
     scale,
+    scale_matrix,
     transpose,
 )
 from liverjax.spectral import principal
@@ -96,11 +97,6 @@ def stress(s: State) -> Stress:
     if W2 is None and "I1" in s.first:
         S = tuple(tuple(S[i][j] + (2 * W1 if i == j else 0.0) for j in range(3)) for i in range(3))
     return Stress(S, p)
-
-
-def scale_matrix(w: Any, A: Matrix) -> Matrix:
-    """Scalar times matrix."""
-    return tuple(scale(w, row) for row in A)
 
 
 def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax import terms
+from liverjax.axes_terms import SIX, symmetric
 from liverjax.errors import InputError
 from liverjax.kinematics import Matrix, matmul
 from liverjax.laws.base import Law, isochoric_part, volumetric_part
@@ -22,7 +23,6 @@ from liverjax.struct import param, static, struct
 
 SCHEMES = ("exponential", "chapter")
 PARTS = ("all", "isochoric")
-_SIX = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @struct
@@ -127,7 +127,7 @@ def recall(prony: Prony, history: History, dt: Any) -> Recall:
     past = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
     if history.stress is not None:
         past = past + jnp.sum(c) * history.stress
-    return Recall(_matrix(past), 1 - jnp.sum(a))
+    return Recall(symmetric(tuple(past)), 1 - jnp.sum(a))
 
 
 def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> History:
@@ -145,7 +145,7 @@ def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
     """The second Piola-Kirchhoff stress that relaxes, (6, E) [Pa]: S_h, or its isochoric part."""
     s = terms.state(_relaxing(prony, law), F)
     S = terms.second_piola(F, terms.stress(s))
-    return jnp.stack([S[i][j] for i, j in _SIX])
+    return jnp.stack([S[i][j] for i, j in SIX])
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
@@ -162,8 +162,3 @@ def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
 
 def _relaxing(prony: Prony, law: Law) -> Law:
     return law if prony.part == "all" else isochoric_part(law)
-
-
-def _matrix(six: jax.Array) -> Matrix:
-    xx, yy, zz, xy, xz, yz = six
-    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
