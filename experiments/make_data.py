@@ -36,7 +36,8 @@ frequency_Hz,storage_modulus_Pa,loss_modulus_Pa
 RUBBER = """\
 # Nominal stress of vulcanised rubber (8 % sulphur) in uniaxial tension, equibiaxial tension and pure shear.
 # Source: Treloar 1944, Trans. Faraday Soc. 40, 59-70, as digitised in the repository
-# Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); tabulated by experiments/make_data.py. Units: stretch 1, stress MPa.
+# Chongran-Zhao/Calibration-Hyperelasticity (MIT licence); tabulated by experiments/make_data.py.
+# Units: stretch 1, stress MPa.
 test,stretch,nominal_stress_MPa
 """
 

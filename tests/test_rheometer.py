@@ -229,6 +229,7 @@ def test_shipped_tables_name_their_source():
     for path in sorted((ROOT / "data").glob("*.csv")):
         head = [line for line in path.read_text().splitlines() if line.startswith("#")]
         assert "Source" in " ".join(head) and "Units" in " ".join(head)
+    for path in sorted((ROOT / "data").glob("*_frequency_sweep.csv")):
         assert len(read_sweep(path).angular_frequency) >= 16
 
 
