@@ -3,10 +3,10 @@
 import argparse
 import os
 import sys
-import tempfile
 from pathlib import Path
 
 from liverjax.errors import InputError
+from liverjax.folders import writable
 
 
 def _modes(text: str) -> int | str:
@@ -72,21 +72,6 @@ def _progress(sweep_size: int):
     return update, bar
 
 
-def _writable(out: Path, files: tuple[str, ...]) -> None:
-    """Make the folder and try to write into it before anything is computed."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out {out} is a file: name a folder for the results")
-    for name in files:
-        if (out / name).is_dir():
-            raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
-
-
 def identify(options: argparse.Namespace) -> int:
     """Run the fit that the options ask for; the exit code."""
     from fitting import fit, prony, report, rheometer, uncertainty
@@ -106,7 +91,7 @@ def identify(options: argparse.Namespace) -> int:
     if options.modes != "auto":
         fit.check_modes(sweep, options.modes)
     dense = prony.refuse_impossible(sweep)
-    _writable(options.out, ("fit.json", "fit.png", "fit.h5"))
+    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
     if options.modes == "auto":
         closed = fit.choose_modes(sweep, dense, options.optimizer)[0]
     else:
@@ -153,7 +138,7 @@ def identify_laws(options: argparse.Namespace) -> int:
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)
-    _writable(options.out, ("curves.json", "curves.png"))
+    writable(options.out, ("curves.json", "curves.png"))
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [stress_stretch.fit(candidate, found) for candidate in bar]
     curves_report.write(options.out, found, fits)

@@ -4,11 +4,11 @@ import argparse
 import dataclasses
 import os
 import sys
-import tempfile
 from pathlib import Path
 
 from liverjax import laws
 from liverjax.errors import InputError
+from liverjax.folders import writable
 from liverjax.laws.volumetric import VOLUMETRIC
 
 
@@ -113,15 +113,8 @@ def _label(name: str) -> str:
 
 
 def _target(out: Path, name: str) -> Path:
-    """A file in folder `out`, which is made and tried before anything is computed."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
-    if (out / name).is_dir():
-        raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
+    """File `name` in folder `out`, which is made and tried before anything is computed."""
+    writable(out, (name,))
     return out / name
 
 

@@ -90,13 +90,10 @@ def solve(
 def _follow(residual, start, precondition, options):
     dtype = start.dtype
 
-    def evaluate(q, s):
-        return residual(q, s)
-
     def step(c: _Point) -> _Point:
         trial = jnp.where(c.launch, c.q_begin, c.q + c.t * c.dq)
         s = jnp.where(c.launch, c.s_begin, c.s)
-        r, slope, force = jax.linearize(evaluate, trial, s, has_aux=True)
+        r, slope, force = jax.linearize(residual, trial, s, has_aux=True)
         size = jnp.linalg.norm(r)
         relative = size / jnp.where(force > 0, force, 1.0)
         finite = jnp.isfinite(size) & jnp.isfinite(force)
@@ -112,7 +109,6 @@ def _follow(residual, start, precondition, options):
         launch_now = c.launch | (converged & ~arrived)  # a new part begins at this very point
         ds = jnp.where(converged, jnp.minimum(2 * c.ds, 1 - s), jnp.where(failed, 0.5 * c.ds, c.ds))
         ds = jnp.where(1 - s - ds < 1e-9, 1 - s, ds) * ~failed + ds * failed
-        # Rounding ends a descent too: a residual that no halving lowers any more.
         done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite)
         go_on = (launch_now | better) & ~done & ~failed
         change = slope(jnp.zeros_like(trial), jnp.ones((), dtype))
