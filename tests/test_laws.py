@@ -184,6 +184,9 @@ def test_create_under_tracing_and_optional_parameters():
         lambda m: lj.laws.create("ogden", mu=[m, -40.0], alpha=[2.5, -4.0], bulk=7e3).energy(1.1 * jnp.eye(3))
     )
     assert np.isfinite(ogden(700.0))
+    both = sum([LAWS["yeoh"], LAWS["ogden"]])
+    assert np.isclose(both.shear_modulus(), 2 * 770.0)
+    assert lj.laws.scaled(lj.laws.Ogden(mu=[1.0], alpha=[2.0], bulk=3.0), 2.0).mu == (2.0,)
     assert LAWS["costa"].tangent(jnp.eye(3, dtype=jnp.float32)).dtype == jnp.float32
     integer = np.array([[2, 0, 0], [0, 1, 0], [0, 0, 1]])
     assert np.allclose(LAWS["neo_hookean"].first_piola(integer), LAWS["neo_hookean"].first_piola(integer * 1.0))

@@ -171,4 +171,4 @@ def scaled(law: Law, factor: Any) -> Law:
 
 
 def _times(value: Any, factor: Any) -> Any:
-    return tuple(v * factor for v in value) if isinstance(value, tuple) else jnp.multiply(value, factor)
+    return tuple(v * factor for v in value) if isinstance(value, (tuple, list)) else jnp.multiply(value, factor)

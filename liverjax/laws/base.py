@@ -121,6 +121,10 @@ class Law:
             return NotImplemented
         return Sum(laws=summands(self) + summands(other))
 
+    def __radd__(self, other: Any) -> "Law":
+        """0 + law, so that Python's `sum` adds a list of laws."""
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
 
 def _floating(F: Any) -> jax.Array:
     """`F` as an array of floating-point numbers; integers become the default precision."""
