@@ -35,10 +35,11 @@ class Displaced:
 
 @struct
 class Traction:
-    """A dead load on boundary triangles: its direction and the reference area count."""
+    """A load on boundary triangles: dead (`value`), or a pressure that follows them."""
 
-    triangles: Any = param("1", "node numbers (m, 3)")
-    value: Any = param("Pa", "force per reference area (3,)")
+    triangles: Any = param("1", "node numbers (m, 3), normals outwards")
+    value: Any = param("Pa", "force per reference area (3,); direction and reference area count", default=None)
+    pressure: Any = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
 
 
 def select(
@@ -122,12 +123,32 @@ def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
     """Dead nodal forces (V, 3) [N]: a third of reference area times traction at each corner."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for load in tractions:
+        if load.value is None:
+            continue
         corner = mesh.points[load.triangles]
         normal = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         area = 0.5 * jnp.sqrt(jnp.sum(normal * normal, axis=1))
         share = (area / 3)[:, None] * jnp.asarray(load.value, force.dtype)[None]
         for a in range(3):
             force = force.at[load.triangles[:, a]].add(share)
+    return force
+
+
+def follows(tractions: tuple) -> bool:
+    """Whether a load follows the body: then the tangent is not symmetric."""
+    return any(load.pressure is not None for load in tractions)
+
+
+def follower_forces(tractions: tuple, x: jax.Array) -> jax.Array:
+    """Nodal forces (V, 3) [N] of the pressures at positions x (V, 3) [m]: a third of -p n da at each corner."""
+    force = jnp.zeros_like(x)
+    for load in tractions:
+        if load.pressure is None:
+            continue
+        corner = x[load.triangles]
+        twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        for a in range(3):
+            force = force.at[load.triangles[:, a]].add(-load.pressure / 6 * twice)
     return force
 
 

@@ -6,13 +6,13 @@ jumped to. A part that fails is halved. Only the root at s = 1 counts, and deriv
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from liverjax import status
-from liverjax.linear import conjugate_gradients, differentiable_solve
+from liverjax.linear import differentiable_solve
 
 
 class StepStatistics(NamedTuple):
@@ -58,26 +58,31 @@ class _Point(NamedTuple):
 
 
 def solve(
-    residual: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
+    residual: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array, Any]],
+    direction: Callable[[jax.Array, jax.Array, Any], Callable],
     start: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
     options: StepOptions = StepOptions(),
+    symmetric: bool = True,
 ) -> tuple[jax.Array, StepStatistics]:
     """Root in q of r(q, 1), followed from `start` at s = 0.
 
     Args:
-        residual: (q, s) -> (r, force): a flat vector (n,) with a symmetric derivative in q, and the size of the forces
-            that it is small against. May close over traced parameters; derivatives are exact at the root.
+        residual: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that it is small against, and
+            what `direction` needs beside. May close over traced parameters; derivatives are exact at the root.
+        direction: (q, s, by) -> a function (b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations).
         start: flat vector (n,); carries no derivative.
-        precondition: approximate inverse of the tangent; carries no derivative.
+        precondition: approximate inverse of the tangent for derivatives; carries none itself.
         options: tolerances and limits.
+        symmetric: whether dr/dq is.
     """
 
     def iterate(_, start):
-        return _follow(residual, start, precondition, options)
+        return _follow(residual, direction, start, options)
 
     def tangent_solve(linear, y):
-        return differentiable_solve(linear, y, precondition, options.adjoint_tolerance, options.max_linear_iterations)
+        limits = (options.adjoint_tolerance, options.max_linear_iterations)
+        return differentiable_solve(linear, y, precondition, *limits, symmetric)
 
     def at_end(q):
         return residual(q, jnp.ones((), q.dtype))[0]
@@ -87,13 +92,14 @@ def solve(
     return root, StepStatistics(*counts, statistics.residual)
 
 
-def _follow(residual, start, precondition, options):
+def _follow(residual, direction, start, options):
     dtype = start.dtype
+    one = jnp.ones((), dtype)
 
     def step(c: _Point) -> _Point:
         trial = jnp.where(c.launch, c.q_begin, c.q + c.t * c.dq)
         s = jnp.where(c.launch, c.s_begin, c.s)
-        r, slope, force = jax.linearize(residual, trial, s, has_aux=True)
+        r, force, by = residual(trial, s)
         size = jnp.linalg.norm(r)
         relative = size / jnp.where(force > 0, force, 1.0)
         finite = jnp.isfinite(size) & jnp.isfinite(force)
@@ -111,14 +117,18 @@ def _follow(residual, start, precondition, options):
         ds = jnp.where(1 - s - ds < 1e-9, 1 - s, ds) * ~failed + ds * failed
         done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite)
         go_on = (launch_now | better) & ~done & ~failed
-        change = slope(jnp.zeros_like(trial), jnp.ones((), dtype))
-        load = jnp.where(go_on, -r - jnp.where(launch_now, ds, 0.0) * change, jnp.zeros_like(r))
+        change = jax.lax.cond(
+            launch_now, lambda: jax.jvp(lambda s: residual(trial, s)[0], (s,), (one,))[1], lambda: jnp.zeros_like(r)
+        )
+        load = jnp.where(go_on, -r - ds * change, jnp.zeros_like(r))
         forcing = jnp.where(
             launch_now, options.linear_tolerance, 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
         )
         forcing = jnp.clip(forcing, 1e-12, options.linear_tolerance)
-        dq, linear = conjugate_gradients(
-            lambda v: slope(v, jnp.zeros((), dtype)), load, precondition, forcing, options.max_linear_iterations
+        dq, linear = jax.lax.cond(
+            go_on,
+            lambda: direction(trial, s, by)(load, forcing, options.max_linear_iterations),
+            lambda: (jnp.zeros_like(r), jnp.zeros((), jnp.int32)),
         )
         accepted = better | launch_now
         return _Point(
@@ -135,13 +145,13 @@ def _follow(residual, start, precondition, options):
             iterations=jnp.where(launch_now, 1, c.iterations + better),
             halvings=halvings,
             total=c.total + (go_on & ~arrived),
-            linear=c.linear + linear.iterations,
+            linear=c.linear + linear,
             cuts=cuts,
             relative=jnp.where(accepted | ~finite, relative, c.relative),
             done=done,
         )
 
-    zero, no, one = jnp.zeros((), jnp.int32), jnp.array(False), jnp.ones((), dtype)
+    zero, no = jnp.zeros((), jnp.int32), jnp.array(False)
     begin = _Point(
         q=start,
         size=jnp.full((), jnp.inf, dtype),

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.errors import InputError
+from liverjax.pattern import Pattern, pattern
 from liverjax.struct import param, struct
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
@@ -26,6 +27,7 @@ class TetMesh:
     shape_vectors: jax.Array = param("1/m", "D_a = grad N_a of nodes a = 1, 2, 3, shape (3, 3, E); D_0 = -(sum)")
     volumes: jax.Array = param("m^3", "reference volumes (E,)")
     node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
+    pattern: Pattern = param("1", "which nodes share an element")
 
     @property
     def number_of_nodes(self) -> int:
@@ -43,7 +45,10 @@ def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = No
 
     The shape vectors are the rows of the inverse edge matrix, written as cross products over six times the volume.
     """
+    if isinstance(tetrahedra, jax.core.Tracer):
+        raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
     points = jnp.asarray(points, dtype=float)
+    neighbours = pattern(tetrahedra, points.shape[0])
     tetrahedra = jnp.asarray(tetrahedra, dtype=jnp.int32)
     corner = points[tetrahedra]
     e = corner[:, 1:] - corner[:, :1]
@@ -56,6 +61,7 @@ def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = No
         shape_vectors=jnp.transpose(normals / six_volumes[None, :, None], (0, 2, 1)),
         volumes=six_volumes / 6,
         node_sets=sets,
+        pattern=neighbours,
     )
 
 

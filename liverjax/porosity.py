@@ -7,7 +7,7 @@ chapter prints J0 without the factor r_w: then the slope would be r_w K_lim). Vo
 at the beginning of a step, so that it is linear in P:
 
 * "implicit": P belongs to the end of the step, with the volume change of the step itself. P is eliminated, P(x), which
-  leaves a symmetric problem in x alone: stable at any step.
+  leaves a symmetric problem in x alone: stable at any step. Newton's direction comes from the coupled matrix of (x, P).
 * "chapter": P from the volume change of the step before; conditionally stable.
 """
 
@@ -17,11 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax import assembly, terms
 from liverjax.errors import InputError
-from liverjax.kinematics import Matrix, cofactor, determinant, dot, matvec
+from liverjax.kinematics import Matrix, Vector, cofactor, determinant, dot, matvec, scale
 from liverjax.laws.base import Law, isochoric_part
-from liverjax.linear import differentiable_solve
+from liverjax.linear import chebyshev, differentiable_solve
 from liverjax.mesh import TetMesh
+from liverjax.pattern import PAIRS
 from liverjax.struct import param, static, struct
 
 SCHEMES = ("implicit", "chapter")
@@ -85,54 +87,130 @@ def volumetric_stress(porosity: Porosity, J: Any) -> Any:
     return logarithm + K_lim * jnp.minimum(J - J0, 0.0)
 
 
+def volumetric_slope(porosity: Porosity, J: Any) -> Any:
+    """d sigma_Heq / dJ [Pa]."""
+    K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
+    J0 = 1 - r_w + r_w * K0 / K_lim
+    return jnp.where(J > J0, K0 / (1 + (jnp.maximum(J, J0) - 1) / r_w), K_lim)
+
+
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     """No pressure, reference volumes."""
     J = jnp.ones_like(mesh.volumes)
     return Fluid(jnp.zeros(mesh.points.shape[0], J.dtype), J, J if porosity.scheme == "chapter" else None)
 
 
-def pressure(
-    porosity: Porosity, mesh: TetMesh, fluid: Fluid, F_begin: Matrix, J_end: Any, dt: Any, tolerance: float
-) -> jax.Array:
-    """P (V,) [Pa] at the end of a step that begins at F_begin and ends with volumes J_end (E,).
+class Flow(NamedTuple):
+    """dt times storage rate plus Darcy's Laplacian, in the positions at the beginning of a step: made once a step."""
 
-    `tolerance` is that of the linear solve, relative to its right-hand side.
-    """
-    increment = fluid.J - fluid.J_before if porosity.scheme == "chapter" else J_end - fluid.J
-    matvec_A, diagonal, mask = _operator(porosity, mesh, F_begin, fluid.J, dt)
-    store = _scatter(mesh, mesh.volumes * fluid.J / 4) / porosity.limit_bulk
-    rate = -_scatter(mesh, mesh.volumes * increment / 4)
-    # Everything times dt: the storage term stays of the size of a volume whatever the step.
-    rhs = mask * (store * fluid.pressure + rate)
-    return differentiable_solve(matvec_A, rhs, lambda r: r / diagonal, tolerance, 2000)
+    matrix: assembly.BlockMatrix  # symmetric positive definite, 1 x 1 blocks
+    store: jax.Array  # (V,) [m^3/Pa]
+    mask: jax.Array  # (V,) 0 where P is given
+    tolerance: float  # of a solve, relative to its right-hand side
 
 
-def _operator(porosity: Porosity, mesh: TetMesh, F: Matrix, J: Any, dt: Any) -> tuple[Any, jax.Array, jax.Array]:
-    """dt times storage rate plus Darcy's Laplacian in the positions F, its diagonal, and the mask of wet nodes."""
-    mask = jnp.ones(mesh.points.shape[0], J.dtype)
+def flow(porosity: Porosity, mesh: TetMesh, fluid: Fluid, F: Matrix, dt: Any, tolerance: float) -> Flow:
+    """The matrix of the pressure equation for a step of dt [s] that begins at F."""
+    mask = jnp.ones(mesh.points.shape[0], fluid.J.dtype)
     if porosity.drained is not None:
         mask = mask.at[porosity.drained].set(0.0)
-    store = _scatter(mesh, mesh.volumes * J / 4) / porosity.limit_bulk
+    # Everything times dt: the storage term stays of the size of a volume whatever the step.
+    store = _scatter(mesh, mesh.volumes * fluid.J / 4) / porosity.limit_bulk
+    g = _gradients(mesh, F)
+    # grad N_a = cof(F) D_a / J per current volume J V0.
+    weight = dt * porosity.permeability * mesh.volumes / fluid.J
+    rows = assembly.off_diagonal(mesh, {(a, b): ((weight * dot(g[a], g[b]),),) for a, b in PAIRS})
+    diagonal = ((store - assembly.row_sums(rows)[0][0],),)
+    return Flow(assembly.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes), store, mask, tolerance)
+
+
+def _gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
+    """cof(F) D_a = dJ/dx_a of the four nodes."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.shape_vectors[a])) for a in range(3)]
-    g = [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
-    # grad N_a = cof(F) D_a / J per current volume J V0.
-    weight = dt * porosity.permeability * mesh.volumes / J
-    pairs = {(a, b): weight * dot(g[a], g[b]) for a in range(4) for b in range(a, 4)}
-    diagonal = store
-    for a in range(4):
-        diagonal = diagonal.at[mesh.tetrahedra[:, a]].add(pairs[a, a])
-    diagonal = mask * diagonal + (1 - mask)
+    return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
+
+
+def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
+    """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
+    increment = fluid.J - fluid.J_before if porosity.scheme == "chapter" else J_end - fluid.J
+    rate = -_scatter(mesh, mesh.volumes * increment / 4)
+    rhs = flow.mask * (flow.store * fluid.pressure + rate)
 
     def apply(p):
-        held, p = (1 - mask) * p, mask * p  # a unit row where drained: adjoint loads need not vanish there
-        corner = [p[mesh.tetrahedra[:, a]] for a in range(4)]
-        flow = jnp.zeros_like(p)
-        for a in range(4):
-            flow = flow.at[mesh.tetrahedra[:, a]].add(sum(pairs[min(a, b), max(a, b)] * corner[b] for b in range(4)))
-        return mask * (store * p + flow) + held
+        # A unit row where drained: adjoint loads need not vanish there.
+        Ap = assembly.product(flow.matrix, (flow.mask * p)[:, None])[:, 0]
+        return flow.mask * Ap + (1 - flow.mask) * p
 
-    return apply, diagonal, mask
+    diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
+    return differentiable_solve(apply, rhs, lambda r: r / diagonal, flow.tolerance, 2000)
+
+
+#: Error of the polynomial that stands for the inverse of the pressure's matrix in Newton's direction, and its degree.
+_POLYNOMIAL_ERROR, _MAX_DEGREE = 0.03, 1000
+
+
+def nearly_solved(flow: Flow, b: jax.Array) -> jax.Array:
+    """Near A^-1 b for b (V,), A the matrix of the pressure: linear and symmetric, within 3 % where the bounds hold."""
+    A = flow.matrix
+    d = A.diagonal[0][0]
+    # Gershgorin above; the quotient of a uniform pressure below, where the polynomial is weaker but still positive.
+    high = jnp.max(1 + jnp.sum(jnp.abs(A.rows[0][0]), axis=0) / d)
+    low = jnp.sum(flow.store) / jnp.sum(d)
+    degree = jnp.ceil(0.5 * jnp.sqrt(high / low) * jnp.log(2 / _POLYNOMIAL_ERROR))
+    degree = jnp.clip(degree, 1, _MAX_DEGREE).astype(jnp.int32)
+
+    def apply(p):
+        return flow.mask * assembly.product(A, p[:, None])[:, 0]
+
+    return chebyshev(apply, flow.mask * b, d, (low, high), degree)
+
+
+class _Volume(NamedTuple):
+    """The stress sigma_Heq - P as a law of J alone, for `terms.blocks`."""
+
+    stress: Any
+    slope: Any
+    invariants: tuple = ("J",)
+
+    def measures(self, F: Matrix) -> Matrix:
+        return F
+
+    def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
+        return {"J": self.stress}, {("J", "J"): self.slope}
+
+
+def blocks(
+    porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+) -> list[Matrix]:
+    """Derivative of `first_piola` at a given pressure as `terms.blocks`, per volume."""
+    J = determinant(F)
+    sponge = _Volume(volumetric_stress(porosity, J) - _mean(mesh, P), volumetric_slope(porosity, J))
+    return terms.blocks(terms.state(sponge, F), D, pairs)
+
+
+def coupled(mesh: TetMesh, K: dict, inertia: Any, F: Matrix, flow: Flow) -> assembly.BlockMatrix:
+    """Derivative of forces and minus the pressure equation by (x, P): symmetric, indefinite, 4 x 4 blocks.
+
+    Args:
+        K: blocks (E,) of the forces at given pressure, by pairs of nodes.
+        inertia: (V,) what inertia adds to the diagonal, or None.
+        F: deformation gradient at the end of the step.
+        flow: matrix of the pressure equation.
+    """
+    q = [scale(mesh.volumes / 4, g) for g in _gradients(mesh, F)]
+    bordered = {}
+    for (a, b), block in K.items():
+        rows = [(*block[r], -q[a][r]) for r in range(3)]
+        bordered[a, b] = (*rows, (*(-x for x in q[b]), None))
+    rows = assembly.off_diagonal(mesh, bordered)
+    rows = (*rows[:3], (*rows[3][:3], -flow.matrix.rows[0][0]))
+    sums = assembly.row_sums(rows)
+    # No force under translation: the columns of x add up to zero along a row.
+    corner = [[-sums[r][c] + (inertia if inertia is not None and r == c else 0.0) for c in range(3)] for r in range(3)]
+    border = [-sums[3][c] for c in range(3)]
+    diagonal = (*((*corner[r], border[r]) for r in range(3)), (*border, -flow.matrix.diagonal[0][0]))
+    return assembly.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)
 
 
 def _scatter(mesh: TetMesh, share: jax.Array) -> jax.Array:
@@ -142,18 +220,16 @@ def _scatter(mesh: TetMesh, share: jax.Array) -> jax.Array:
     return total
 
 
+def _mean(mesh: TetMesh, P: jax.Array) -> jax.Array:
+    return sum(P[mesh.tetrahedra[:, a]] for a in range(4)) / 4
+
+
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:
     """(sigma_Heq(J) - P) cof F [Pa], P the mean over an element's nodes."""
-    mean = sum(P[mesh.tetrahedra[:, a]] for a in range(4)) / 4
-    sigma = volumetric_stress(porosity, determinant(F)) - mean
+    sigma = volumetric_stress(porosity, determinant(F)) - _mean(mesh, P)
     return tuple(tuple(sigma * c for c in row) for row in cofactor(F))
 
 
 def advance(porosity: Porosity, fluid: Fluid, P: jax.Array, F: Matrix) -> Fluid:
     """The state after an accepted step."""
     return Fluid(P, determinant(F), fluid.J if porosity.scheme == "chapter" else None)
-
-
-def undrained(porosity: Porosity) -> Any:
-    """K0 + K_lim [Pa], the bulk modulus before anything flows; for preconditioners."""
-    return porosity.bulk + porosity.limit_bulk

@@ -52,7 +52,7 @@ class Scene:
     body: Body | None = param("1", "density and gravity", default=None)
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
-    traction: tuple[Traction, ...] = param("1", "dead loads", default=())
+    traction: tuple[Traction, ...] = param("1", "loads", default=())
     solve: Solve = param("1", "how", default=Solve())
 
 
@@ -65,7 +65,7 @@ _KEYS = {
     "body": ("density", "gravity"),
     "fixed": ("where", "set", "axes"),
     "displaced": ("where", "set", "axes", "by", "history"),
-    "traction": ("where", "set", "value"),
+    "traction": ("where", "set", "value", "pressure"),
     "solve": tuple(f.name for f in dataclasses.fields(Solve)),
 }
 _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
@@ -262,14 +262,15 @@ def _displaced(mesh: TetMesh, k: int, table: dict, folder: Path) -> Displaced:
 
 def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     name = f"traction.{k}"
-    if "value" not in table:
-        raise InputError(f"{name} needs value = [x, y, z] in Pa: give it")
+    if ("value" in table) == ("pressure" in table):
+        raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
     triangles = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
     if len(triangles) == 0:
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
-    return Traction(
-        triangles=jnp.asarray(triangles, jnp.int32), value=jnp.asarray(_numbers(f"{name} value", table["value"], 3))
-    )
+    triangles = jnp.asarray(triangles, jnp.int32)
+    if "pressure" in table:
+        return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]))
+    return Traction(triangles=triangles, value=jnp.asarray(_numbers(f"{name} value", table["value"], 3)))
 
 
 def _solve(table: dict) -> Solve:

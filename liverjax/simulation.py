@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import boundary, continuation, mjed, porosity, status, terms, viscosity
+from liverjax import boundary, continuation, mjed, porosity, status, tangent, terms, viscosity
 from liverjax.continuation import StepOptions, StepStatistics
 from liverjax.errors import InputError
 from liverjax.kinematics import add_matrices, deformation_gradient, determinant
-from liverjax.laws import Volumetric
 from liverjax.scene import Scene
 from liverjax.struct import param, struct
 
@@ -55,7 +54,8 @@ def initial_state(scene: Scene) -> State:
         # m a = f at rest: Newmark's method keeps its order from the first step.
         mass = scene.body.density * boundary.nodal_volumes(scene.mesh)
         mask = boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced)
-        acceleration = mask * _loads(scene) / mass[:, None]
+        follower = boundary.follower_forces(scene.traction, x)
+        acceleration = mask * (_loads(scene) + follower) / mass[:, None]
     history = None
     if scene.viscosity is not None:
         history = viscosity.initial_history(scene.viscosity, scene.mesh.number_of_elements, x.dtype)
@@ -82,53 +82,73 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     loads = _loads(scene)
     memory = None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt)
     mass = scene.body.density * boundary.nodal_volumes(mesh) if state.velocity is not None else None
-    moving = len(scene.displaced) > 0
+    moving, follows = len(scene.displaced) > 0, boundary.follows(scene.traction)
     ramped = dt is None
-    F_begin = None if sponge is None else deformation_gradient(mesh, state.x)
+    flow = None
+    if sponge is not None:
+        F_begin = deformation_gradient(mesh, state.x)
+        flow = porosity.flow(sponge, mesh, state.fluid, F_begin, dt, 1e-3 * solve.tolerance)
 
     def fluid_pressure(F):
-        return porosity.pressure(sponge, mesh, state.fluid, F_begin, determinant(F), dt, 1e-3 * solve.tolerance)
+        return porosity.pressure(sponge, mesh, state.fluid, flow, determinant(F))
 
     # The chapter's pressure does not depend on where the step ends: solved for once.
     known = None if sponge is None or sponge.scheme == "implicit" else fluid_pressure(F_begin)
 
+    def acting(s):
+        """Part of the loads that acts: they grow with the load steps where there is no time."""
+        return (k - 1 + s) / solve.steps if ramped else jnp.ones((), dtype)
+
     def conditions(s):
         """Positions of held degrees of freedom (V, 3), 0 elsewhere, and dead loads at part s of the step."""
-        at = (k - 1 + s) / solve.steps
         held = mesh.points
         if moving:
-            held = held + boundary.prescribed(mesh, scene.displaced, 0.0 if dt is None else dt * (k - 1 + s), at)
-        return (1 - mask) * held, at * loads if ramped else loads
+            time = 0.0 if dt is None else dt * (k - 1 + s)
+            held = held + boundary.prescribed(mesh, scene.displaced, time, (k - 1 + s) / solve.steps)
+        return (1 - mask) * held, acting(s) * loads if ramped else loads
 
     def positions(q, s):
         return mask * q.reshape(-1, 3) + conditions(s)[0]
 
     def forces(q, s):
-        """Internal, inertial and dead forces (V, 3)."""
+        """Internal, inertial and outer forces (V, 3), and the fluid's pressure."""
         x = positions(q, s)
         F = deformation_gradient(mesh, x)
         P = terms.first_piola(law, F) if memory is None else viscosity.first_piola(scene.viscosity, memory, law, F)
+        fluid = None
         if sponge is not None:
             fluid = fluid_pressure(F) if known is None else known
             P = add_matrices(P, porosity.first_piola(sponge, mesh, fluid, F))
         internal = mjed.nodal_force(mesh, P)
         inertial = None if mass is None else mass[:, None] * _acceleration(solve.integrator, state, x, dt)
-        return internal, inertial, conditions(s)[1]
+        outer = conditions(s)[1]
+        if follows:
+            outer = outer + acting(s) * boundary.follower_forces(scene.traction, x)
+        return internal, inertial, outer, fluid
 
     def residual(q, s):
-        internal, inertial, load = forces(q, s)
+        internal, inertial, load, fluid = forces(q, s)
         total = internal - load if inertial is None else internal + inertial - load
         at_work = jnp.linalg.norm(internal) + jnp.linalg.norm(load)
         if inertial is not None:
             at_work = at_work + jnp.linalg.norm(inertial)
-        return (mask * total).ravel(), jax.lax.stop_gradient(at_work)
+        return (mask * total).ravel(), jax.lax.stop_gradient(at_work), fluid
 
-    precondition = _block_jacobi(scene, state, mask, mass, memory)
+    inertia = None if mass is None else {"euler": 1.0, "newmark": 4.0}[solve.integrator] / dt**2 * mass
+
+    def direction(q, s, fluid):
+        coupling = flow if known is None else None
+        return tangent.direction(scene, memory, coupling, fluid, inertia, mask, positions(q, s), acting(s))
+
+    begin = jax.lax.stop_gradient((scene, memory, state, inertia))
+    precondition = _precondition(*begin, mask)
     options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
-    q, statistics = continuation.solve(residual, (mask * state.x).ravel(), precondition, options)
+    q, statistics = continuation.solve(
+        residual, direction, (mask * state.x).ravel(), precondition, options, symmetric=not follows
+    )
     one = jnp.ones((), dtype)
     x = positions(q, one)
-    internal, inertial, load = forces(q, one)
+    internal, inertial, load, _ = forces(q, one)
     reactions = (1 - mask) * (internal - load if inertial is None else internal + inertial - load)
     velocity, acceleration = _motion(solve.integrator, state, x, dt)
     history, fluid = None, None
@@ -157,40 +177,10 @@ def _motion(integrator: str, state: State, x: jax.Array, dt: Any) -> tuple[jax.A
     return state.velocity + 0.5 * dt * (state.acceleration + a), a
 
 
-def _block_jacobi(scene: Scene, state: State, mask: jax.Array, mass: Any, memory: Any) -> Any:
-    """Inverse 3 x 3 diagonal blocks of the tangent at the beginning of the step; carries no derivative."""
-    scene, state, mass, memory = jax.lax.stop_gradient((scene, state, mass, memory))
-    mesh = scene.mesh
-    law = porosity.law_in_force(scene.porosity, scene.law)
-    if scene.porosity is not None:  # at its stiffest, before anything flows
-        law = law + Volumetric(bulk=porosity.undrained(scene.porosity))
-    K = mjed.all_blocks(mjed.element_stiffness(mesh, law, state.x))
-    now = 1.0 if memory is None else memory.now
-    blocks = [[jnp.zeros(mesh.number_of_nodes, state.x.dtype) for _ in range(3)] for _ in range(3)]
-    for r in range(3):
-        for c in range(r, 3):
-            for a in range(4):
-                blocks[r][c] = blocks[r][c].at[mesh.tetrahedra[:, a]].add(now * K[a][a][r][c])
-            blocks[c][r] = blocks[r][c]
-    if mass is not None:
-        weight = {"euler": 1.0, "newmark": 4.0}[scene.solve.integrator] / scene.solve.dt**2
-        for r in range(3):
-            blocks[r][r] = blocks[r][r] + weight * mass
-    # Held degrees of freedom get a unit row; a block that is not positive definite its mean diagonal.
-    A = jnp.stack([jnp.stack(row, axis=-1) for row in blocks], axis=-2)
-    A = A * mask[:, :, None] * mask[:, None, :] + (1 - mask)[:, :, None] * jnp.eye(3, dtype=A.dtype)[None]
-    det2 = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] ** 2
-    det3 = jnp.linalg.det(A)
-    positive = (A[:, 0, 0] > 0) & (det2 > 0) & (det3 > 0) & jnp.isfinite(det3)
-    size = jnp.abs(A[:, 0, 0]) + jnp.abs(A[:, 1, 1]) + jnp.abs(A[:, 2, 2])
-    fallback = jnp.where((size > 0) & jnp.isfinite(size), size / 3, 1.0)
-    A = jnp.where(positive[:, None, None], A, fallback[:, None, None] * jnp.eye(3, dtype=A.dtype)[None])
-    inverse = jnp.linalg.inv(A)
-
-    def apply(r):
-        return (mask * jnp.einsum("vij,vj->vi", inverse, mask * r.reshape(-1, 3))).ravel()
-
-    return apply
+def _precondition(scene: Scene, memory: Any, state: State, inertia: Any, mask: jax.Array) -> Any:
+    """Inverse diagonal blocks of the tangent at the beginning of the step, for derivatives; carries none itself."""
+    fluid = None if state.fluid is None else state.fluid.pressure
+    return tangent.block_jacobi(tangent.stiffness(scene, memory, fluid, inertia, state.x), mask)
 
 
 @jax.jit

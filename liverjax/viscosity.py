@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from liverjax import terms
 from liverjax.axes_terms import SIX, symmetric
 from liverjax.errors import InputError
-from liverjax.kinematics import Matrix, matmul
+from liverjax.kinematics import Matrix, Vector, add_matrices, dot, matmul, matvec, scale_matrix
 from liverjax.laws.base import Law, isochoric_part, volumetric_part
 from liverjax.struct import param, static, struct
 
@@ -158,6 +158,22 @@ def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
         return P
     U = terms.first_piola(rest, F)
     return tuple(tuple(P[i][j] + U[i][j] for j in range(3)) for i in range(3))
+
+
+def blocks(
+    prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+) -> list[Matrix]:
+    """Derivative of `first_piola` as `terms.blocks`: (1 - sum a) K_h - (D_i . past D_j) Id, all per volume."""
+    K = terms.blocks(terms.state(_relaxing(prony, law), F), D, pairs)
+    K = [scale_matrix(memory.now, block) for block in K]
+    result = []
+    for (i, j), block in zip(pairs, K, strict=True):
+        metric = dot(D[i], matvec(memory.past, D[j]))
+        result.append(tuple(tuple(block[r][c] - (metric if r == c else 0.0) for c in range(3)) for r in range(3)))
+    rest = volumetric_part(law) if prony.part == "isochoric" else None
+    if rest is None:
+        return result
+    return [add_matrices(a, b) for a, b in zip(result, terms.blocks(terms.state(rest, F), D, pairs), strict=True)]
 
 
 def _relaxing(prony: Prony, law: Law) -> Law:

@@ -8,6 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax import boundary, continuation, mjed, status
 from liverjax.continuation import StepOptions
+from liverjax.linear import conjugate_gradients
 from liverjax.simulation import initial_state, step
 from liverjax.struct import replace
 
@@ -50,9 +51,19 @@ def test_patch_test_is_exact():
 
     def residual(q, s):
         f = mjed.internal_force(mesh, LAW, mask * q.reshape(-1, 3) + (1 - mask) * x)
-        return (mask * f).ravel(), jnp.linalg.norm(f)
+        return (mask * f).ravel(), jnp.linalg.norm(f), None
 
-    q, statistics = jax.jit(lambda q: continuation.solve(residual, q, lambda r: r, StepOptions(tolerance=1e-13)))(
+    def direction(q, s, _):
+        slope = jax.linearize(lambda q: residual(q, s)[0], q)[1]
+
+        def solve(b, *limits):
+            dq, s = conjugate_gradients(slope, b, lambda r: r, *limits)
+            return dq, s.iterations
+
+        return solve
+
+    options = StepOptions(tolerance=1e-13)
+    q, statistics = jax.jit(lambda q: continuation.solve(residual, direction, q, lambda r: r, options))(
         (mask * start).ravel()
     )
     assert int(statistics.status) == status.CONVERGED

@@ -1,0 +1,104 @@
+"""Symmetric matrices of node blocks in padded rows: assembled from element blocks, multiplied without a search.
+
+Only the blocks of edges are scattered, each once: a matrix of forces that do not change under translation has its
+diagonal blocks as minus the sum of its rows, and what else stands there is given.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.kinematics import cofactor, dot
+from liverjax.mesh import TetMesh
+from liverjax.pattern import PAIRS, Pattern
+
+#: An m x m matrix as nested tuples of arrays.
+Block = tuple[tuple[Any, ...], ...]
+
+
+class BlockMatrix(NamedTuple):
+    """A symmetric matrix (V m, V m) of m x m blocks, every entry an array over the nodes."""
+
+    rows: Block  # of arrays (W, V): blocks of a node and its neighbours
+    diagonal: Block  # of arrays (V,)
+    nodes: jax.Array  # (W, V)
+
+
+def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
+    """Blocks of nodes and their neighbours, m x m of (W, V), from those of `PAIRS` of every element, m x m of (E,).
+
+    An entry that is None in every block stays None.
+    """
+    pattern: Pattern = mesh.pattern
+    m = len(blocks[PAIRS[0]])
+    number = pattern.edges.shape[1]
+    swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
+    edge = [[None] * m for _ in range(m)]
+    for r in range(m):
+        for c in range(m):
+            if blocks[PAIRS[0]][r][c] is None:
+                continue
+            total = jnp.zeros(number + 1, mesh.points.dtype)
+            for k, pair in enumerate(PAIRS):
+                K = blocks[pair]
+                value = K[r][c] if r == c else jnp.where(swapped[pair], K[c][r], K[r][c])
+                total = total.at[pattern.element_edges[k]].add(value)
+            edge[r][c] = total
+    gathered = [[None if e is None else e[pattern.row_edges] for e in row] for row in edge]
+    upward = jnp.arange(mesh.number_of_nodes, dtype=jnp.int32)[None] < pattern.row_nodes
+    return tuple(
+        tuple(gathered[r][c] if r == c else jnp.where(upward, gathered[r][c], gathered[c][r]) for c in range(m))
+        for r in range(m)
+    )
+
+
+def row_sums(rows: Block) -> Block:
+    """Sums over the neighbours, m x m of (V,)."""
+    return tuple(tuple(jnp.sum(entry, axis=0) for entry in row) for row in rows)
+
+
+def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], inertia: Any = None) -> BlockMatrix:
+    """The matrix of forces (3 x 3 blocks, without the elements' own diagonal ones) and of `inertia` (V,), or None."""
+    rows = off_diagonal(mesh, blocks)
+    sums = row_sums(rows)
+    own = [[-sums[min(r, c)][max(r, c)] for c in range(3)] for r in range(3)]
+    if inertia is not None:
+        own = [[own[r][c] + (inertia if r == c else 0.0) for c in range(3)] for r in range(3)]
+    return BlockMatrix(rows, tuple(map(tuple, own)), mesh.pattern.row_nodes)
+
+
+def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
+    """Inverse 3 x 3 blocks; unit rows where `mask` (V, 3) is 0, that of the mean where one is not positive definite."""
+    A = [
+        [diagonal[r][c] * mask[:, r] * mask[:, c] + (1 - mask[:, r] if r == c else 0.0) for c in range(3)]
+        for r in range(3)
+    ]
+    rows = tuple(map(tuple, A))
+    cof = cofactor(rows)
+    det = dot(rows[0], cof[0])
+    positive = (A[0][0] > 0) & (cof[2][2] > 0) & (det > 0) & jnp.isfinite(det)
+    size = jnp.abs(A[0][0]) + jnp.abs(A[1][1]) + jnp.abs(A[2][2])
+    mean = jnp.where((size > 0) & jnp.isfinite(size), size / 3, 1.0)
+    safe = jnp.where(positive, det, 1.0)
+    return tuple(
+        tuple(jnp.where(positive, cof[r][c] / safe, 1 / mean if r == c else 0.0) for c in range(3)) for r in range(3)
+    )
+
+
+def product(A: BlockMatrix, v: jax.Array) -> jax.Array:
+    """A v for v (V, k): the first k columns of its blocks, all of its rows."""
+    k = v.shape[1]
+    if len(A.rows) == 1:  # one neighbour after the other: the gather is never written out
+        p = v[:, 0]
+        total = A.diagonal[0][0] * p
+        for slot in range(A.nodes.shape[0]):
+            total = total + A.rows[0][0][slot] * p[A.nodes[slot]]
+        return total[:, None]
+    columns = [v[:, c] for c in range(k)]
+    near = [column[A.nodes] for column in columns]
+    result = []
+    for far, own in zip(A.rows, A.diagonal, strict=True):
+        total = jnp.sum(sum(far[c] * near[c] for c in range(k)), axis=0)
+        result.append(total + sum(own[c] * columns[c] for c in range(k)))
+    return jnp.stack(result, axis=-1)

@@ -1,0 +1,49 @@
+"""Which nodes of a mesh share an element: the sparsity of every matrix assembled on it. Made once, on the host."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.struct import param, struct
+
+#: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
+PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+@struct
+class Pattern:
+    """Edges, and the neighbours of every node in rows padded to one length W (ELL): no search when assembling."""
+
+    edges: jax.Array = param("1", "node numbers (2, N), the lower first")
+    element_edges: jax.Array = param("1", "number of the edge of each of `PAIRS` (6, E)")
+    row_nodes: jax.Array = param("1", "neighbours of every node (W, V), padded with the node itself")
+    row_edges: jax.Array = param("1", "the edges to them (W, V), padded with N")
+
+
+def pattern(tetrahedra: Any, number_of_nodes: int) -> Pattern:
+    """The pattern of elements (E, 4); host side, sorted so that equal meshes give equal patterns."""
+    tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
+    if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
+        tets = tets[:0]  # a mesh that `check_mesh` refuses
+    both = np.stack([np.sort(tets[:, p], axis=1) for p in PAIRS])  # (6, E, 2)
+    code, inverse = np.unique(both[..., 0].astype(np.int64) * number_of_nodes + both[..., 1], return_inverse=True)
+    low, high = np.divmod(code, number_of_nodes)
+    number = len(code)
+    rows, columns = np.concatenate([low, high]), np.concatenate([high, low])
+    edge = np.tile(np.arange(number), 2)
+    order = np.lexsort((columns, rows))
+    rows, columns, edge = rows[order], columns[order], edge[order]
+    count = np.bincount(rows, minlength=number_of_nodes)
+    slot = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+    width = max(int(count.max(initial=0)), 1)
+    row_nodes = np.tile(np.arange(number_of_nodes), (width, 1))
+    row_edges = np.full((width, number_of_nodes), number)
+    row_nodes[slot, rows], row_edges[slot, rows] = columns, edge
+    return Pattern(
+        edges=jnp.asarray(np.stack([low, high]), jnp.int32),
+        element_edges=jnp.asarray(inverse.reshape(both.shape[:2]), jnp.int32),
+        row_nodes=jnp.asarray(row_nodes, jnp.int32),
+        row_edges=jnp.asarray(row_edges, jnp.int32),
+    )

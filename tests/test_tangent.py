@@ -1,0 +1,167 @@
+"""The assembled tangent of a scene against autodiff of its forces, and the solvers that use it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import assembly, boundary, mjed, porosity, tangent, terms, viscosity
+from liverjax.kinematics import add_matrices, deformation_gradient, determinant
+from liverjax.linear import chebyshev, stabilised_biconjugate_gradients
+from liverjax.pattern import pattern
+
+rng = np.random.default_rng(5)
+LAW = lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=2200.0)
+PRONY = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
+SPONGE = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
+MESH = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 3))
+X = MESH.points + 0.008 * jnp.asarray(rng.uniform(-1, 1, MESH.points.shape))
+V = jnp.asarray(rng.standard_normal(MESH.points.shape))
+
+
+def test_pattern_names_every_neighbour_once():
+    p = pattern(np.asarray(MESH.tetrahedra), MESH.number_of_nodes)
+    tets = np.asarray(MESH.tetrahedra)
+    number = p.edges.shape[1]
+    for node in (0, 17, MESH.number_of_nodes - 1):
+        real = np.asarray(p.row_edges)[:, node] < number
+        expected = np.setdiff1d(tets[(tets == node).any(axis=1)], node)
+        assert np.array_equal(np.sort(np.asarray(p.row_nodes)[real, node]), expected)
+        ends = np.asarray(p.edges)[:, np.asarray(p.row_edges)[real, node]]
+        assert (ends == node).any(axis=0).all() and (ends[0] < ends[1]).all()
+
+
+def test_assembled_stiffness_is_the_sparse_one():
+    scene = lj.Scene(mesh=MESH, law=LAW)
+    A = jax.jit(lambda x: tangent.stiffness(scene, None, None, None, x))(X)
+    K = mjed.stiffness_matrix(MESH, LAW, X)
+    expected = (K @ np.asarray(V).ravel()).reshape(-1, 3)
+    assert np.abs(np.asarray(assembly.product(A, V)) - expected).max() < 1e-13 * abs(K).max() * 10
+
+
+@pytest.mark.parametrize("part", ["all", "isochoric"])
+def test_viscous_and_porous_tangent_against_autodiff(part):
+    prony = lj.Prony(ratios=PRONY.ratios, relaxation_times=PRONY.relaxation_times, part=part)
+    scene = lj.Scene(mesh=MESH, law=LAW, viscosity=prony, porosity=SPONGE)
+    F0 = deformation_gradient(MESH, X + 0.004 * V)
+    law = porosity.law_in_force(SPONGE, LAW)
+    if part == "isochoric":  # a volumetric part for the other branch
+        law, scene = (
+            LAW,
+            lj.Scene(mesh=MESH, law=LAW, viscosity=prony, porosity=lj.Porosity(**{**vars(SPONGE), "keep_bulk": True})),
+        )
+    history = viscosity.advance(prony, viscosity.initial_history(prony, MESH.number_of_elements), law, F0, 0.05)
+    memory = viscosity.recall(prony, history, 0.05)
+    P = jnp.asarray(rng.uniform(-50, 50, MESH.number_of_nodes))
+
+    def forces(x):
+        F = deformation_gradient(MESH, x)
+        stress = viscosity.first_piola(prony, memory, law, F)
+        return mjed.nodal_force(MESH, add_matrices(stress, porosity.first_piola(SPONGE, MESH, P, F)))
+
+    expected = jax.jit(lambda: jax.jvp(forces, (X,), (V,))[1])()
+    A = jax.jit(lambda: tangent.stiffness(scene, memory, P, None, X))()
+    error = np.asarray(assembly.product(A, V) - expected)
+    assert np.abs(error).max() < 1e-12 * np.abs(np.asarray(expected)).max()
+
+
+def test_coupled_matrix_against_autodiff():
+    scene = lj.Scene(mesh=MESH, law=LAW, porosity=SPONGE)
+    law = porosity.law_in_force(SPONGE, LAW)
+    n, fluid = MESH.number_of_nodes, porosity.initial_fluid(SPONGE, MESH)
+    P, dP = jnp.asarray(rng.uniform(-50, 50, n)), jnp.asarray(rng.standard_normal(n))
+
+    @jax.jit
+    def both():
+        F = deformation_gradient(MESH, X)
+        flow = porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, MESH.points), 0.05, 1e-10)
+        A = porosity.coupled(MESH, tangent.element_blocks(scene, None, P, F), None, F, flow)
+
+        def equations(x, P):
+            F = deformation_gradient(MESH, x)
+            stress = add_matrices(terms.first_piola(law, F), porosity.first_piola(SPONGE, MESH, P, F))
+            volume = porosity._scatter(MESH, MESH.volumes * determinant(F) / 4)
+            flux = assembly.product(flow.matrix, P[:, None])
+            return jnp.concatenate([mjed.nodal_force(MESH, stress), -flux - volume[:, None]], axis=1)
+
+        exact = jax.jvp(equations, (X, P), (V, dP))[1]
+        return assembly.product(A, jnp.concatenate([V, dP[:, None]], axis=1)), exact
+
+    ours, exact = map(np.asarray, both())
+    for column in (slice(0, 3), slice(3, 4)):  # forces and volumes: each to its own size
+        assert np.abs(ours[:, column] - exact[:, column]).max() < 1e-12 * np.abs(exact[:, column]).max()
+
+
+def test_darcys_laplacian_and_its_polynomial():
+    fluid = porosity.initial_fluid(SPONGE, MESH)
+    flow = jax.jit(lambda: porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, X), 0.05, 1e-10))()
+    n = MESH.number_of_nodes
+    A = np.asarray(jax.vmap(lambda e: assembly.product(flow.matrix, e[:, None])[:, 0])(jnp.eye(n)))
+    assert np.allclose(A, A.T, rtol=0, atol=1e-15 * A.max())
+    assert np.allclose(A.sum(axis=1), np.asarray(flow.store), rtol=1e-9)  # a uniform pressure does not flow
+    B = np.asarray(jax.vmap(lambda e: porosity.nearly_solved(flow, e))(jnp.eye(n)))
+    assert np.allclose(B, B.T, rtol=0, atol=1e-12 * B.max())
+    eigenvalues = np.linalg.eigvals(B @ A).real
+    assert eigenvalues.min() > 0.9 and eigenvalues.max() < 1.1
+
+
+def test_chebyshev_meets_its_bound():
+    d = jnp.asarray(rng.uniform(1, 2, 30))
+    Q = np.linalg.qr(rng.standard_normal((30, 30)))[0]
+    eigenvalues = np.linspace(0.05, 3.0, 30)
+    A = np.sqrt(d)[:, None] * (Q * eigenvalues) @ Q.T * np.sqrt(d)[None]
+    for degree in (5, 20):
+        B = np.stack([chebyshev(lambda v: jnp.asarray(A) @ v, e, d, (0.05, 3.0), degree) for e in jnp.eye(30)])
+        error = np.abs(1 - np.linalg.eigvals(B @ A).real).max()
+        assert error < 2 * np.exp(-2 * degree * np.sqrt(0.05 / 3.0))
+
+
+def test_bicgstab_solves_without_symmetry():
+    A = jnp.asarray(np.diag(np.arange(1.0, 21)) + 0.3 * rng.standard_normal((20, 20)))
+    b = jnp.asarray(rng.standard_normal(20))
+    x, s = stabilised_biconjugate_gradients(lambda v: A @ v, b, lambda r: r / jnp.diag(A), 1e-12, 100)
+    assert np.allclose(A @ x, b, atol=1e-10) and s.residual < 1e-11 and 3 < s.iterations < 40
+    zero, s = stabilised_biconjugate_gradients(lambda v: A @ v, 0 * b, lambda r: r, 1e-12, 100)
+    assert s.iterations == 0 and not zero.any()
+
+
+def inflated(pressure: float, **solve) -> lj.Scene:
+    """A block held below, with a pressure on its upper face."""
+    return lj.Scene(
+        mesh=MESH,
+        law=LAW,
+        fixed=(lj.Fixed(nodes=MESH.node_sets["z_min"]),),
+        traction=(
+            lj.Traction(
+                triangles=jnp.asarray(boundary.boundary_triangles(MESH, MESH.node_sets["z_max"])), pressure=pressure
+            ),
+        ),
+        solve=lj.Solve(**solve),
+    )
+
+
+def test_follower_pressure_follows():
+    # On a closed surface a pressure has no resultant, and on a face that of its current area.
+    closed = (lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(MESH)), pressure=3.0),)
+    assert np.abs(np.asarray(boundary.follower_forces(closed, X).sum(axis=0))).max() < 1e-15
+    turned = MESH.points @ jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]).T
+    force = boundary.follower_forces(inflated(4.0).traction, turned).sum(axis=0)
+    assert np.allclose(force, [-4.0 * 0.01, 0, 0], atol=1e-15)
+
+
+def test_follower_pressure_in_equilibrium_and_its_gradient():
+    scene = inflated(150.0, steps=2, tolerance=1e-11)
+    result = jax.jit(lj.simulate)(scene).check()
+    x = result.positions[-1]
+    residual = mjed.internal_force(MESH, LAW, x) - boundary.follower_forces(scene.traction, x) - result.reactions[-1]
+    assert np.abs(np.asarray(residual)).max() < 1e-10 * np.abs(np.asarray(result.reactions[-1])).sum()
+    assert float(x[:, 2].max()) < 0.1 and int(result.statistics.iterations.sum()) < 12  # quadratic: the true tangent
+
+    @jax.jit
+    def bulge(p):
+        return lj.simulate(lj.with_parameters(scene, {"traction.0.pressure": p})).positions[-1, -1, 0]
+
+    h = 0.1
+    exact = float(jax.jit(jax.grad(bulge))(150.0))
+    assert np.isclose((bulge(150 + h) - bulge(150 - h)) / (2 * h), exact, rtol=1e-6)
