@@ -30,7 +30,9 @@ class StepOptions(NamedTuple):
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
     max_iterations: int = 25  # a part; 1 takes one step of Newton and asks for no convergence
-    linear_tolerance: float = 1e-3
+    linear_tolerance: float = 5e-2  # of a direction, the loosest
+    one_step_tolerance: float = 1e-4  # of the one direction where there is but one iteration
+    contraction: float = 0.15  # of |r| in an iteration; a tangent that does worse is made anew
     adjoint_tolerance: float = 1e-11
     max_linear_iterations: int = 3000
     max_halvings: int = 6
@@ -40,6 +42,8 @@ class StepOptions(NamedTuple):
 class _Point(NamedTuple):
     q: jax.Array  # best point of the current part
     size: jax.Array  # |r| there
+    aim: jax.Array  # |r| that the last direction was to remove
+    tangent: Any  # as last made
     dq: jax.Array
     t: jax.Array  # part of dq to try next
     s: jax.Array
@@ -57,44 +61,50 @@ class _Point(NamedTuple):
     done: jax.Array
 
 
-def solve(
-    residual: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array, Any]],
-    direction: Callable[[jax.Array, jax.Array, Any], Callable],
-    start: jax.Array,
-    precondition: Callable[[jax.Array], jax.Array],
-    options: StepOptions = StepOptions(),
-    symmetric: bool = True,
-) -> tuple[jax.Array, StepStatistics]:
-    """Root in q of r(q, 1), followed from `start` at s = 0.
+class Method(NamedTuple):
+    """A problem and how its linear systems are solved."""
 
-    Args:
-        residual: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that it is small against, and
-            what `direction` needs beside. May close over traced parameters; derivatives are exact at the root.
-        direction: (q, s, by) -> a function (b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations).
-        start: flat vector (n,); carries no derivative.
-        precondition: approximate inverse of the tangent for derivatives; carries none itself.
-        options: tolerances and limits.
-        symmetric: whether dr/dq is.
-    """
+    #: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that it is small against, and what
+    #: `tangent` needs beside. May close over traced parameters; derivatives are exact at the root.
+    residual: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array, Any]]
+    #: (q, s, by, near) -> any pytree that stands for dr/dq, used again while iterations converge fast with it; near
+    #: is None, or whether an earlier one is near enough to take parts from, and that one.
+    tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
+    #: (tangent, b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations).
+    solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]]
+    #: tangent -> approximate inverse of dr/dq, for derivatives.
+    preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
+    #: Whether dr/dq is.
+    symmetric: bool = True
+
+
+def solve(method: Method, start: jax.Array, options: StepOptions = StepOptions()) -> tuple[jax.Array, StepStatistics]:
+    """Root in q of r(q, 1), followed from `start` (n,) at s = 0, which carries no derivative."""
+    start = jax.lax.stop_gradient(start)
+    residual = method.residual
 
     def iterate(_, start):
-        return _follow(residual, direction, start, options)
+        return _follow(method, start, options)
 
     def tangent_solve(linear, y):
+        begin = jnp.zeros((), start.dtype)
+        K = method.tangent(start, begin, jax.lax.stop_gradient(residual(start, begin)[2]), None)
         limits = (options.adjoint_tolerance, options.max_linear_iterations)
-        return differentiable_solve(linear, y, precondition, *limits, symmetric)
+        return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric)
 
     def at_end(q):
         return residual(q, jnp.ones((), q.dtype))[0]
 
-    root, statistics = jax.lax.custom_root(at_end, jax.lax.stop_gradient(start), iterate, tangent_solve, has_aux=True)
+    root, statistics = jax.lax.custom_root(at_end, start, iterate, tangent_solve, has_aux=True)
     counts = (n.astype(jnp.int32) for n in statistics[:4])
     return root, StepStatistics(*counts, statistics.residual)
 
 
-def _follow(residual, direction, start, options):
+def _follow(method, start, options):
+    residual = method.residual
     dtype = start.dtype
     one = jnp.ones((), dtype)
+    loosest = options.one_step_tolerance if options.max_iterations == 1 else options.linear_tolerance
 
     def step(c: _Point) -> _Point:
         trial = jnp.where(c.launch, c.q_begin, c.q + c.t * c.dq)
@@ -121,19 +131,26 @@ def _follow(residual, direction, start, options):
             launch_now, lambda: jax.jvp(lambda s: residual(trial, s)[0], (s,), (one,))[1], lambda: jnp.zeros_like(r)
         )
         load = jnp.where(go_on, -r - ds * change, jnp.zeros_like(r))
-        forcing = jnp.where(
-            launch_now, options.linear_tolerance, 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
-        )
-        forcing = jnp.clip(forcing, 1e-12, options.linear_tolerance)
+        aim = jnp.linalg.norm(load)
+        renew = launch_now | (go_on & (size > options.contraction * c.aim))
+        near = (~launch_now, c.tangent)
+        K = jax.lax.cond(renew, lambda: method.tangent(trial, s, by, near), lambda: c.tangent)
+        # No direction is solved for beyond what it can remove (Eisenstat and Walker 1996), nor beyond the goal.
+        ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
+        reach = 0.3 * jnp.where(renew, ratio**2, ratio)
+        goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
+        forcing = jnp.where(launch_now, loosest, jnp.maximum(reach, jnp.maximum(goal, 1e-12)))
         dq, linear = jax.lax.cond(
             go_on,
-            lambda: direction(trial, s, by)(load, forcing, options.max_linear_iterations),
+            lambda: method.solve(K, load, jnp.minimum(forcing, loosest), options.max_linear_iterations),
             lambda: (jnp.zeros_like(r), jnp.zeros((), jnp.int32)),
         )
         accepted = better | launch_now
         return _Point(
             q=jnp.where(accepted, trial, c.q),
             size=jnp.where(accepted, size, c.size),
+            aim=jnp.where(go_on, aim, c.aim),
+            tangent=K,
             dq=jnp.where(go_on, dq, c.dq),
             t=jnp.where(go_on, 1.0, 0.5 * c.t),
             s=jnp.where(launch_now, s + ds, s),
@@ -152,9 +169,12 @@ def _follow(residual, direction, start, options):
         )
 
     zero, no = jnp.zeros((), jnp.int32), jnp.array(False)
+    made = jax.eval_shape(lambda q: method.tangent(q, 0 * one, residual(q, 0 * one)[2], None), start)
     begin = _Point(
         q=start,
         size=jnp.full((), jnp.inf, dtype),
+        aim=0 * one,
+        tangent=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made),
         dq=jnp.zeros_like(start),
         t=one,
         s=0 * one,

@@ -1,4 +1,4 @@
-"""Which nodes of a mesh share an element: the sparsity of every matrix assembled on it. Made once, on the host."""
+"""Which nodes of a mesh share an element, and patches of near ones: made once a mesh, on the host."""
 
 from typing import Any
 
@@ -11,6 +11,9 @@ from liverjax.struct import param, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
+#: Nodes a patch, and the most patches: the coarse matrix is dense, with 12 unknowns a patch.
+PATCH_SIZE, MOST_PATCHES = 80, 32
+
 
 @struct
 class Pattern:
@@ -20,9 +23,12 @@ class Pattern:
     element_edges: jax.Array = param("1", "number of the edge of each of `PAIRS` (6, E)")
     row_nodes: jax.Array = param("1", "neighbours of every node (W, V), padded with the node itself")
     row_edges: jax.Array = param("1", "the edges to them (W, V), padded with N")
+    edge_slots: jax.Array = param("1", "place of an edge in the flattened rows, that of its lower node (N,)")
+    patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
+    patch_sizes: jax.Array = param("1", "nodes of every patch (P,)")
 
 
-def pattern(tetrahedra: Any, number_of_nodes: int) -> Pattern:
+def pattern(tetrahedra: Any, number_of_nodes: int, patches: np.ndarray) -> Pattern:
     """The pattern of elements (E, 4); host side, sorted so that equal meshes give equal patterns."""
     tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
     if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
@@ -41,9 +47,29 @@ def pattern(tetrahedra: Any, number_of_nodes: int) -> Pattern:
     row_nodes = np.tile(np.arange(number_of_nodes), (width, 1))
     row_edges = np.full((width, number_of_nodes), number)
     row_nodes[slot, rows], row_edges[slot, rows] = columns, edge
+    slots = np.zeros(number, dtype=int)
+    upward = rows < columns
+    slots[edge[upward]] = slot[upward] * number_of_nodes + rows[upward]
     return Pattern(
         edges=jnp.asarray(np.stack([low, high]), jnp.int32),
         element_edges=jnp.asarray(inverse.reshape(both.shape[:2]), jnp.int32),
         row_nodes=jnp.asarray(row_nodes, jnp.int32),
         row_edges=jnp.asarray(row_edges, jnp.int32),
+        edge_slots=jnp.asarray(slots, jnp.int32),
+        patches=jnp.asarray(patches, jnp.int32),
+        patch_sizes=jnp.asarray(np.bincount(patches), jnp.int32),
     )
+
+
+def patches(points: np.ndarray) -> np.ndarray:
+    """Number of the patch of every node (V,): boxes halved at the median of their longest side; host side."""
+    groups = [np.arange(len(points))]
+    while len(groups) < min(-(-len(points) // PATCH_SIZE), MOST_PATCHES):
+        nodes = groups.pop(max(range(len(groups)), key=lambda k: len(groups[k])))
+        axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
+        order = nodes[np.argsort(points[nodes, axis], kind="stable")]
+        groups += [order[: len(order) // 2], order[len(order) // 2 :]]
+    number = np.zeros(len(points), dtype=np.int32)
+    for k, nodes in enumerate(groups):
+        number[nodes] = k
+    return number

@@ -136,16 +136,16 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
 
     inertia = None if mass is None else {"euler": 1.0, "newmark": 4.0}[solve.integrator] / dt**2 * mass
 
-    def direction(q, s, fluid):
-        coupling = flow if known is None else None
-        return tangent.direction(scene, memory, coupling, fluid, inertia, mask, positions(q, s), acting(s))
-
-    begin = jax.lax.stop_gradient((scene, memory, state, inertia))
-    precondition = _precondition(*begin, mask)
-    options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
-    q, statistics = continuation.solve(
-        residual, direction, (mask * state.x).ravel(), precondition, options, symmetric=not follows
+    setting = tangent.Setting(scene, memory, flow if known is None else None, inertia, mask)
+    method = continuation.Method(
+        residual=residual,
+        tangent=lambda q, s, fluid, near: tangent.tangent(setting, fluid, positions(q, s), acting(s), near),
+        solve=partial(tangent.solve, setting),
+        preconditioner=partial(tangent.preconditioner, setting),
+        symmetric=not follows,
     )
+    options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
+    q, statistics = continuation.solve(method, (mask * state.x).ravel(), options)
     one = jnp.ones((), dtype)
     x = positions(q, one)
     internal, inertial, load, _ = forces(q, one)
@@ -175,12 +175,6 @@ def _motion(integrator: str, state: State, x: jax.Array, dt: Any) -> tuple[jax.A
         return (x - state.x) / dt, None
     a = _acceleration(integrator, state, x, dt)
     return state.velocity + 0.5 * dt * (state.acceleration + a), a
-
-
-def _precondition(scene: Scene, memory: Any, state: State, inertia: Any, mask: jax.Array) -> Any:
-    """Inverse diagonal blocks of the tangent at the beginning of the step, for derivatives; carries none itself."""
-    fluid = None if state.fluid is None else state.fluid.pressure
-    return tangent.block_jacobi(tangent.stiffness(scene, memory, fluid, inertia, state.x), mask)
 
 
 @jax.jit

@@ -1,17 +1,19 @@
-"""The tangent of a scene's forces, from hand-derived blocks, and Newton's direction by it.
+"""The tangent of a scene's forces, from hand-derived blocks, and linear solves with it.
 
 What the scene has decides the matrix and the method: conjugate gradients, with the pressure of a fluid eliminated where
-there is one; BiCGSTAB where loads follow the body. All with the inverse diagonal blocks as preconditioner.
+there is one; BiCGSTAB where loads follow the body. All with the same
+preconditioner: the inverse diagonal blocks and, where slow motions hold them up, a coarse space.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from liverjax import assembly, boundary, mjed, porosity, terms, viscosity
 from liverjax.assembly import BlockMatrix
+from liverjax.coarse import Coarse, coarse, corrected, worthwhile
 from liverjax.kinematics import Matrix, add_matrices, deformation_gradient, scale_matrix
 from liverjax.linear import conjugate_gradients, stabilised_biconjugate_gradients
 from liverjax.pattern import PAIRS
@@ -43,85 +45,79 @@ def stiffness(scene: Scene, memory: Any, pressure: Any, inertia: Any, x: jax.Arr
     return assembly.force_matrix(scene.mesh, K, inertia)
 
 
-def block_jacobi(A: BlockMatrix, mask: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    """Inverse diagonal blocks as a function of flat vectors (3 V,)."""
-    inverse = assembly.inverse_blocks(A.diagonal, mask)
-    return lambda r: _apply(inverse, mask * r.reshape(-1, 3), mask).ravel()
+class Setting(NamedTuple):
+    """What is constant during a step."""
+
+    scene: Scene
+    memory: Any  # of the viscosity, or None
+    flow: Any  # matrix of the fluid's pressure where that depends on x, or None
+    inertia: Any  # (V,) [kg/s^2] what inertia adds to the diagonal, or None
+    mask: jax.Array  # (V, 3) 1 where free
 
 
-def _apply(inverse: Any, r: jax.Array, mask: jax.Array) -> jax.Array:
-    return mask * jnp.stack([sum(inverse[i][j] * r[:, j] for j in range(3)) for i in range(3)], axis=-1)
+class Tangent(NamedTuple):
+    """A tangent ready to be solved with: assembled at one point, good for some iterations near it."""
+
+    matrix: BlockMatrix
+    inverse: assembly.Block  # of its diagonal blocks
+    slow: Coarse
+    x: jax.Array | None  # (V, 3) where it was made, for loads that follow
+    at: Any  # part of them that acts
 
 
-def direction(
-    scene: Scene, memory: Any, flow: Any, pressure: Any, inertia: Any, mask: jax.Array, x: jax.Array, at: Any
-) -> Callable[[jax.Array, Any, int], tuple[jax.Array, jax.Array]]:
-    """Function (b, tolerance, max_iterations) -> (solution of K dq = b, iterations), flat vectors (3 V,).
+def tangent(setting: Setting, pressure: Any, x: jax.Array, at: Any, near: tuple[Any, Tangent] | None = None) -> Tangent:
+    """The derivative of the forces at positions x (V, 3) [m], of which the part `at` of the follower loads.
 
-    Args:
-        scene: the scene.
-        memory, flow, pressure: of the step, where the scene has them; `flow` only where P depends on x.
-        inertia: (V,) diagonal of the inertial forces, or None.
-        mask: (V, 3) 1 where free.
-        x: (V, 3) positions [m].
-        at: part of the follower loads that acts.
+    `pressure` (V,) [Pa] is the fluid's, or None; `near` a flag and a tangent whose coarse space will do where the flag
+    is set. Everything in the result is without derivative.
     """
-    loads = scene.traction if boundary.follows(scene.traction) else None
-
-    def follower(dx):
-        return jax.jvp(lambda x: at * boundary.follower_forces(loads, x), (x,), (dx,))[1]
-
+    setting, pressure, x, at = jax.lax.stop_gradient((setting, pressure, x, at))
+    scene, flow, mask = setting.scene, setting.flow, setting.mask
     if flow is None:
-        A = stiffness(scene, memory, pressure, inertia, x)
+        A = stiffness(scene, setting.memory, pressure, setting.inertia, x)
+        diagonal = A.diagonal
+    else:
+        F = deformation_gradient(scene.mesh, x)
+        K = element_blocks(scene, setting.memory, pressure, F)
+        A = porosity.coupled(scene.mesh, K, setting.inertia, F, flow)
+        diagonal = porosity.undrained_diagonal(A, flow)
+    inverse = assembly.inverse_blocks(diagonal, mask)
 
-        def matvec(v):
-            dx = mask * v.reshape(-1, 3)
-            force = assembly.product(A, dx)
-            return (mask * (force if loads is None else force - follower(dx))).ravel()
+    def new():
+        return coarse(scene.mesh, A, mask, worthwhile(A, setting.inertia))
 
-        method = conjugate_gradients if loads is None else stabilised_biconjugate_gradients
-        precondition = block_jacobi(A, mask)
-
-        def solve(b, tolerance, max_iterations):
-            dq, s = method(matvec, b, precondition, tolerance, max_iterations)
-            return dq, s.iterations
-
-        return solve
-    return _coupled_direction(scene, memory, flow, pressure, inertia, mask, x, None if loads is None else follower)
+    slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
+    following = boundary.follows(scene.traction)
+    return Tangent(A, inverse, slow, x if following else None, at if following else None)
 
 
-def _coupled_direction(scene, memory, flow, pressure, inertia, mask, x, follower):
-    """The fluid's pressure eliminated by a polynomial near the inverse of its matrix: a fixed, symmetric operator."""
-    F = deformation_gradient(scene.mesh, x)
-    A = porosity.coupled(scene.mesh, element_blocks(scene, memory, pressure, F), inertia, F, flow)
-    precondition = _undrained_jacobi(A, flow, mask)
+def preconditioner(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
+    """Inverse diagonal blocks, with the coarse solution added, as a function of flat vectors (3 V,)."""
+    mask, inverse = setting.mask, K.inverse
+
+    def fine(r):
+        r = mask * r.reshape(-1, 3)
+        columns = [sum(inverse[i][j] * r[:, j] for j in range(3)) for i in range(3)]
+        return (mask * jnp.stack(columns, axis=-1)).ravel()
+
+    return corrected(setting.scene.mesh, K.slow, mask, fine)
+
+
+def solve(
+    setting: Setting, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
+) -> tuple[jax.Array, jax.Array]:
+    """Solution of K dq = b and the iterations it took, flat vectors (3 V,)."""
+    A, mask, loads = K.matrix, setting.mask, setting.scene.traction
 
     def matvec(v):
         dx = mask * v.reshape(-1, 3)
-        both = assembly.product(A, dx)
-        dP = porosity.nearly_solved(flow, both[:, 3])
-        near = dP[A.nodes]
-        pull = [jnp.sum(A.rows[r][3] * near, axis=0) + A.diagonal[r][3] * dP for r in range(3)]
-        force = both[:, :3] + jnp.stack(pull, axis=-1)
-        return (mask * (force if follower is None else force - follower(dx))).ravel()
+        force = assembly.product(A, dx)
+        if setting.flow is not None:
+            force = porosity.with_flow(setting.scene.mesh, setting.flow, A, force)
+        if K.x is not None:
+            force = force - jax.jvp(lambda x: K.at * boundary.follower_forces(loads, x), (K.x,), (dx,))[1]
+        return (mask * force).ravel()
 
-    method = conjugate_gradients if follower is None else stabilised_biconjugate_gradients
-
-    def solve(b, tolerance, max_iterations):
-        dq, s = method(matvec, b, precondition, tolerance, max_iterations)
-        return dq, s.iterations
-
-    return solve
-
-
-def _undrained_jacobi(A: BlockMatrix, flow: Any, mask: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the pressure's matrix: right where nothing flows."""
-    soft = flow.mask / flow.matrix.diagonal[0][0]
-    near = soft[A.nodes]
-    blocks = [list(A.diagonal[r][:3]) for r in range(3)]
-    for r in range(3):
-        for c in range(3):
-            pull = jnp.sum(A.rows[r][3] * near * A.rows[c][3], axis=0)
-            blocks[r][c] = blocks[r][c] + pull + A.diagonal[r][3] * soft * A.diagonal[c][3]
-    inverse = assembly.inverse_blocks(blocks, mask)
-    return lambda r: _apply(inverse, r.reshape(-1, 3), mask).ravel()
+    method = conjugate_gradients if K.x is None else stabilised_biconjugate_gradients
+    dq, s = method(matvec, b, preconditioner(setting, K), tolerance, max_iterations)
+    return dq, s.iterations

@@ -1,5 +1,7 @@
 """Runs of scenes: patch test, balances, orders, other programs' solutions, gradients, and what is left out."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,19 +55,14 @@ def test_patch_test_is_exact():
         f = mjed.internal_force(mesh, LAW, mask * q.reshape(-1, 3) + (1 - mask) * x)
         return (mask * f).ravel(), jnp.linalg.norm(f), None
 
-    def direction(q, s, _):
-        slope = jax.linearize(lambda q: residual(q, s)[0], q)[1]
+    def solved(at, b, *limits):
+        slope = jax.linearize(lambda q: residual(q, 1.0)[0], at)[1]
+        dq, s = conjugate_gradients(slope, b, lambda r: r, *limits)
+        return dq, s.iterations
 
-        def solve(b, *limits):
-            dq, s = conjugate_gradients(slope, b, lambda r: r, *limits)
-            return dq, s.iterations
-
-        return solve
-
+    method = continuation.Method(residual, lambda q, s, *_: q, solved, lambda _: lambda r: r)
     options = StepOptions(tolerance=1e-13)
-    q, statistics = jax.jit(lambda q: continuation.solve(residual, direction, q, lambda r: r, options))(
-        (mask * start).ravel()
-    )
+    q, statistics = jax.jit(lambda q: continuation.solve(method, q, options))((mask * start).ravel())
     assert int(statistics.status) == status.CONVERGED
     assert np.abs(np.asarray(q).reshape(-1, 3)[inner] - x[inner]).max() < 1e-11 * 0.1
 
@@ -326,9 +323,16 @@ def test_a_scene_carries_only_what_it_has():
     assert len(jax.tree.leaves(initial_state(slow))) == 3  # positions, memory, last stress
     body = lj.Body(density=1000.0)
     assert len(jax.tree.leaves(initial_state(replace(plain, body=body, solve=lj.Solve(dt=0.1, kind="dynamic"))))) == 2
-    # Without viscosity no exponential of the time step, without motion no interpolation.
-    text = str(jax.make_jaxpr(lj.simulate)(plain))
-    assert "exp2" not in text and " exp " not in text
+    # And computes only that: the memory's exponentials, the sponge's logarithm, the load that follows.
+    sponge = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
+    porous = replace(plain, porosity=sponge, solve=lj.Solve(dt=0.1))
+    assert not {"exp", "expm1", "log1p"} & _primitives(plain)
+    assert {"exp", "expm1"} <= _primitives(slow) and "log1p" not in _primitives(slow)
+    assert "log1p" in _primitives(porous) and "expm1" not in _primitives(porous)
+
+
+def _primitives(scene: lj.Scene) -> set[str]:
+    return set(re.findall(r"= (\w+)", str(jax.make_jaxpr(lj.simulate)(scene))))
 
 
 def test_one_newton_iteration_is_the_chapters_scheme():
