@@ -44,6 +44,8 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| there
     aim: jax.Array  # |r| that the last direction was to remove
     tangent: Any  # as last made
+    stale: jax.Array  # dq is of a tangent that was made before q
+    remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
     t: jax.Array  # part of dq to try next
     s: jax.Array
@@ -107,24 +109,27 @@ def _follow(method, start, options):
     loosest = options.one_step_tolerance if options.max_iterations == 1 else options.linear_tolerance
 
     def step(c: _Point) -> _Point:
-        trial = jnp.where(c.launch, c.q_begin, c.q + c.t * c.dq)
+        trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
         s = jnp.where(c.launch, c.s_begin, c.s)
         r, force, by = residual(trial, s)
         size = jnp.linalg.norm(r)
         relative = size / jnp.where(force > 0, force, 1.0)
         finite = jnp.isfinite(size) & jnp.isfinite(force)
-        better = finite & ((size < c.size) | c.first) & ~c.launch
+        better = finite & ((size < c.size) | c.first | c.remake) & ~c.launch
         converged = better & (relative <= options.tolerance)
         if options.max_iterations == 1:
             converged = better
         arrived = converged & (s >= 1)
-        halvings = jnp.where(better | c.launch, 0, c.halvings + 1)
+        # A direction of an earlier tangent that leads nowhere is not halved: the tangent is made anew first.
+        remake = ~better & ~c.launch & c.stale
+        halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
         spent = (c.iterations >= options.max_iterations) | (halvings > options.max_halvings)
-        failed = ~c.launch & ~converged & (spent | (c.first & ~finite))
+        failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))
         cuts = c.cuts + failed
         launch_now = c.launch | (converged & ~arrived)  # a new part begins at this very point
-        ds = jnp.where(converged, jnp.minimum(2 * c.ds, 1 - s), jnp.where(failed, 0.5 * c.ds, c.ds))
-        ds = jnp.where(1 - s - ds < 1e-9, 1 - s, ds) * ~failed + ds * failed
+        longer = jnp.minimum(2 * c.ds, 1 - s)
+        longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
+        ds = jnp.where(converged, longer, jnp.where(failed, 0.5 * c.ds, c.ds))
         done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite)
         go_on = (launch_now | better) & ~done & ~failed
         change = jax.lax.cond(
@@ -132,7 +137,7 @@ def _follow(method, start, options):
         )
         load = jnp.where(go_on, -r - ds * change, jnp.zeros_like(r))
         aim = jnp.linalg.norm(load)
-        renew = launch_now | (go_on & (size > options.contraction * c.aim))
+        renew = launch_now | (go_on & (c.remake | (size > options.contraction * c.aim)))
         near = (~launch_now, c.tangent)
         K = jax.lax.cond(renew, lambda: method.tangent(trial, s, by, near), lambda: c.tangent)
         # No direction is solved for beyond what it can remove (Eisenstat and Walker 1996), nor beyond the goal.
@@ -151,6 +156,8 @@ def _follow(method, start, options):
             size=jnp.where(accepted, size, c.size),
             aim=jnp.where(go_on, aim, c.aim),
             tangent=K,
+            stale=jnp.where(go_on, ~renew, c.stale),
+            remake=remake,
             dq=jnp.where(go_on, dq, c.dq),
             t=jnp.where(go_on, 1.0, 0.5 * c.t),
             s=jnp.where(launch_now, s + ds, s),
@@ -175,6 +182,8 @@ def _follow(method, start, options):
         size=jnp.full((), jnp.inf, dtype),
         aim=0 * one,
         tangent=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made),
+        stale=no,
+        remake=no,
         dq=jnp.zeros_like(start),
         t=one,
         s=0 * one,
