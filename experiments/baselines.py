@@ -1,0 +1,112 @@
+"""Two solvers to compare with, elastic only: total Lagrangian explicit dynamics, and corotational linear elasticity.
+
+They take a `Scene` with a body and fixed nodes, and share meshes, laws and assembly with `simulate`; nothing else is
+supported, nothing is differentiable.
+"""
+
+import jax
+import jax.numpy as jnp
+
+import liverjax as lj
+from liverjax import assembly, boundary, kinematics, mjed, tangent
+from liverjax.linear import conjugate_gradients
+from liverjax.pattern import PAIRS
+
+
+def _mass_and_weight(scene: lj.Scene) -> tuple[jax.Array, jax.Array]:
+    mass = (scene.body.density * boundary.nodal_volumes(scene.mesh))[:, None]
+    return mass, mass * jnp.asarray(scene.body.gravity)
+
+
+@jax.jit
+def critical_step(scene: lj.Scene) -> jax.Array:
+    """2 / omega_max [s] of the rest state by power iteration: above it central differences blow up."""
+    mass, _ = _mass_and_weight(scene)
+    A = tangent.stiffness(scene, None, None, None, scene.mesh.points)
+    mask = boundary.free_degrees(scene.mesh, scene.fixed, ())
+
+    def iterate(_, v):
+        w = mask * assembly.product(A, mask * v) / mass
+        return w / jnp.linalg.norm(w)
+
+    v = jax.lax.fori_loop(0, 200, iterate, mask * jax.random.normal(jax.random.key(0), mask.shape))
+    return 2 / jnp.sqrt(jnp.vdot(v, mask * assembly.product(A, v) / mass))
+
+
+def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
+    """Central differences with a lumped mass (Miller et al. 2007): every `keep`-th of the positions (T, V, 3)."""
+    mesh = scene.mesh
+    mass, weight = _mass_and_weight(scene)
+    mask = boundary.free_degrees(mesh, scene.fixed, ())
+
+    def advance(state, _):
+        x, v = state
+        v = v + dt * mask * (weight - mjed.internal_force(mesh, scene.law, x)) / mass
+        return (x + dt * v, v), None
+
+    def block(state, _):
+        state, _ = jax.lax.scan(advance, state, length=keep)
+        return state, state[0]
+
+    # Velocities live half a step apart from positions.
+    v = -0.5 * dt * mask * weight / mass
+    return jax.lax.scan(block, (mesh.points, v), length=steps // keep)[1]
+
+
+def _rotation(F: kinematics.Matrix) -> kinematics.Matrix:
+    """The rotation of a polar decomposition: nine of Higham's iterations R <- (R + R^-T) / 2."""
+    for _ in range(9):
+        cof = kinematics.cofactor(F)
+        det = kinematics.determinant(F)
+        F = tuple(tuple(0.5 * (F[i][j] + cof[i][j] / det) for j in range(3)) for i in range(3))
+    return F
+
+
+def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
+    """Linear elasticity in rotated frames, implicit Euler, one linear solve a step: positions (T, V, 3).
+
+    The element stiffness is that of the law at rest (Mueller and Gross 2004).
+    """
+    mesh = scene.mesh
+    mass, weight = _mass_and_weight(scene)
+    mask = boundary.free_degrees(mesh, scene.fixed, ())
+    rest = tangent.element_blocks(scene, None, None, kinematics.deformation_gradient(mesh, mesh.points))
+    own = mjed.element_stiffness(mesh, scene.law, mesh.points)
+    full = mjed.all_blocks(own)
+    corners = [tuple(mesh.points[mesh.tetrahedra[:, a]].T) for a in range(4)]
+
+    def rotated(R, K):
+        return kinematics.matmul(kinematics.matmul(R, K), kinematics.transpose(R))
+
+    def advance(state, _):
+        x, v = state
+        R = _rotation(kinematics.deformation_gradient(mesh, x))
+        turned_back = [
+            kinematics.add(
+                kinematics.matvec(kinematics.transpose(R), tuple(x[mesh.tetrahedra[:, a]].T)),
+                kinematics.scale(-1.0, corners[a]),
+            )
+            for a in range(4)
+        ]
+        force = jnp.zeros_like(x)
+        for a in range(4):
+            f = (0.0, 0.0, 0.0)
+            for b in range(4):
+                f = kinematics.add(f, kinematics.matvec(full[a][b], turned_back[b]))
+            force = force.at[mesh.tetrahedra[:, a]].add(jnp.stack(kinematics.matvec(R, f), axis=-1))
+        A = assembly.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, mass[:, 0] / dt**2)
+        inverse = assembly.inverse_blocks(A.diagonal, mask)
+
+        def precondition(r):
+            r = r.reshape(-1, 3)
+            return jnp.stack([sum(inverse[i][j] * r[:, j] for j in range(3)) for i in range(3)], axis=-1).ravel()
+
+        def matvec(u):
+            return (mask * assembly.product(A, mask * u.reshape(-1, 3))).ravel()
+
+        b = mask * (weight - force + mass * v / dt)
+        dx, _ = conjugate_gradients(matvec, b.ravel(), precondition, 1e-4, 2000)
+        dx = dx.reshape(-1, 3)
+        return (x + dx, dx / dt), x + dx
+
+    return jax.lax.scan(advance, (mesh.points, jnp.zeros_like(mesh.points)), length=steps)[1]
