@@ -78,6 +78,8 @@ class Method(NamedTuple):
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: Whether dr/dq is.
     symmetric: bool = True
+    #: Whether r depends on s.
+    moved: bool = True
 
 
 def solve(method: Method, start: jax.Array, options: StepOptions = StepOptions()) -> tuple[jax.Array, StepStatistics]:
@@ -108,6 +110,10 @@ def _follow(method, start, options):
     one = jnp.ones((), dtype)
     loosest = options.one_step_tolerance if options.max_iterations == 1 else options.linear_tolerance
 
+    def along(q, s):
+        """dr/ds: how prescribed motion and loads change the residual."""
+        return jax.jvp(lambda s: residual(q, s)[0], (s,), (one,))[1]
+
     def step(c: _Point) -> _Point:
         trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
         s = jnp.where(c.launch, c.s_begin, c.s)
@@ -132,10 +138,10 @@ def _follow(method, start, options):
         ds = jnp.where(converged, longer, jnp.where(failed, 0.5 * c.ds, c.ds))
         done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite)
         go_on = (launch_now | better) & ~done & ~failed
-        change = jax.lax.cond(
-            launch_now, lambda: jax.jvp(lambda s: residual(trial, s)[0], (s,), (one,))[1], lambda: jnp.zeros_like(r)
-        )
-        load = jnp.where(go_on, -r - ds * change, jnp.zeros_like(r))
+        load = -r
+        if method.moved:
+            load = load - jax.lax.cond(launch_now, lambda: ds * along(trial, s), lambda: jnp.zeros_like(r))
+        load = jnp.where(go_on, load, jnp.zeros_like(r))
         aim = jnp.linalg.norm(load)
         renew = launch_now | (go_on & (c.remake | (size > options.contraction * c.aim)))
         near = (~launch_now, c.tangent)

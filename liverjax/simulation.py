@@ -87,7 +87,7 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     flow = None
     if sponge is not None:
         F_begin = deformation_gradient(mesh, state.x)
-        flow = porosity.flow(sponge, mesh, state.fluid, F_begin, dt, 1e-3 * solve.tolerance)
+        flow = porosity.flow(sponge, mesh, state.fluid, F_begin, dt, 1e-2 * solve.tolerance)
 
     def fluid_pressure(F):
         return porosity.pressure(sponge, mesh, state.fluid, flow, determinant(F))
@@ -143,12 +143,13 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
         solve=partial(tangent.solve, setting),
         preconditioner=partial(tangent.preconditioner, setting),
         symmetric=not follows,
+        moved=moving or ramped,
     )
     options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
     q, statistics = continuation.solve(method, (mask * state.x).ravel(), options)
     one = jnp.ones((), dtype)
     x = positions(q, one)
-    internal, inertial, load, _ = forces(q, one)
+    internal, inertial, load, pressed = forces(q, one)
     reactions = (1 - mask) * (internal - load if inertial is None else internal + inertial - load)
     velocity, acceleration = _motion(solve.integrator, state, x, dt)
     history, fluid = None, None
@@ -157,7 +158,7 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     if memory is not None:
         history = viscosity.advance(scene.viscosity, state.history, law, F, dt)
     if sponge is not None:
-        fluid = porosity.advance(sponge, state.fluid, fluid_pressure(F) if known is None else known, F)
+        fluid = porosity.advance(sponge, state.fluid, pressed, F)
     return State(x, velocity, acceleration, history, fluid), reactions, statistics
 
 

@@ -144,3 +144,44 @@ def test_only_a_porous_scene_has_pressure():
 def test_unusable_porosity_is_refused(change, sentence):
     with pytest.raises(lj.InputError, match=sentence):
         column(1, 1, 1.0, **change)
+
+
+def test_confined_compression_of_febio(febio):
+    # FEBio's biphasic material stores no fluid: the chapter's equation with K_lim far above every other stiffness.
+    nodes = np.loadtxt(febio / "column_nodes.csv", delimiter=",")
+    tets = np.loadtxt(febio / "column_tets.csv", delimiter=",", dtype=int)
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    top = np.flatnonzero(nodes[:, 2] > high[2] - 1e-9)
+    sides = tuple(
+        lj.Fixed(
+            nodes=jnp.asarray(np.flatnonzero(np.isclose(nodes[:, k], (low, high)[end][k], atol=1e-9))), axes="xyz"[k]
+        )
+        for k, end in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 0))
+    )
+    theirs = np.loadtxt(febio / "d0_relax0.01pct_neo-Hookean.csv", delimiter=",")
+    push = -1e-4 * high[2]
+    scene = lj.Scene(
+        mesh=lj.tet_mesh(nodes, tets),
+        law=lj.laws.NeoHookeanCompressible(mu=770.0, lame_lambda=3080.0),
+        porosity=lj.Porosity(
+            bulk=1e-3, limit_bulk=1e8, fluid_fraction=0.5, permeability=2e-8, drained=jnp.asarray(top)
+        ),
+        fixed=sides,
+        displaced=(
+            lj.Displaced(
+                nodes=jnp.asarray(top),
+                times=jnp.array([0.0, 0.05, 10.0]),
+                history=jnp.array([[0.0, 0, 0], [0, 0, push], [0, 0, push]]),
+                axes="z",
+            ),
+        ),
+        solve=lj.Solve(dt=0.005, steps=100, tolerance=1e-7),
+    )
+    result = lj.simulate(scene).check()
+    area = np.prod((high - low)[:2])
+    ours = -np.asarray(result.reactions)[:, top, 2].sum(axis=1) / area
+    base = np.asarray(result.pressure)[:, np.flatnonzero(nodes[:, 2] < low[2] + 1e-9)].mean(axis=1)
+    # Same elements and steps; what differs is their storage (none) and their integration of the permeability.
+    stress, pressure = theirs[1:101, 3], theirs[1:101, 5]
+    assert np.abs(ours - stress).max() < 0.01 * stress.max()
+    assert np.abs(base - pressure).max() < 0.01 * pressure.max()

@@ -189,6 +189,35 @@ def test_implicit_euler_only_dissipates():
     assert energies[0] - energies[-1] > 1e-3 * scale
 
 
+@pytest.mark.parametrize("integrator", ["euler", "newmark"])
+def test_momentum_changes_by_the_outer_forces(integrator):
+    # Sum of m a = weight + reactions, in every step, whatever happens inside.
+    mesh = box()
+    gravity = jnp.array([0.5, 0.0, -2.0])
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        viscosity=TABLE_2,
+        body=lj.Body(density=1060.0, gravity=gravity),
+        fixed=(bottom(mesh),),
+        solve=lj.Solve(kind="dynamic", dt=0.02, steps=6, integrator=integrator, tolerance=1e-10),
+    )
+    result = lj.simulate(scene).check()
+    m = 1060.0 * np.asarray(boundary.nodal_volumes(mesh))
+    x = np.concatenate([np.asarray(mesh.points)[None], np.asarray(result.positions)])
+    v = a = np.zeros_like(x[0])
+    if integrator == "newmark":
+        a = np.where(np.asarray(boundary.free_degrees(mesh, scene.fixed, ())) > 0, np.asarray(gravity), 0.0)
+    for n in range(6):
+        if integrator == "euler":
+            a, v = (x[n + 1] - x[n] - 0.02 * v) / 0.02**2, (x[n + 1] - x[n]) / 0.02
+        else:
+            new = 4 * (x[n + 1] - x[n] - 0.02 * v) / 0.02**2 - a
+            v, a = v + 0.01 * (a + new), new
+        outer = m.sum() * np.asarray(gravity) + np.asarray(result.reactions)[n].sum(axis=0)
+        assert np.abs((m[:, None] * a).sum(axis=0) - outer).max() < 1e-8 * m.sum() * 2.0
+
+
 def test_free_fall_is_exact():
     # A body that nothing holds moves rigidly: no stress, and implicit Euler's own sum of velocities.
     mesh = box()
@@ -364,3 +393,28 @@ def test_single_precision_says_so():
     double = lj.simulate(replace(scene, solve=lj.Solve()))
     assert single.positions.dtype == jnp.float32
     assert np.abs(np.asarray(single.positions) - np.asarray(double.positions)).max() < 1e-4 * 0.01
+
+
+def test_cooks_membrane():
+    # Miehe 1994, plane strain: the middle of the right edge rises by 14.74 mm.
+    errors = []
+    for n in (32, 64):
+        flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
+        s, t, w = np.asarray(flat.points).T
+        points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * 1e-3
+        mesh = lj.tet_mesh(points, flat.tetrahedra, flat.node_sets)
+        right = boundary.boundary_triangles(mesh, mesh.node_sets["x_max"])
+        scene = lj.Scene(
+            mesh=mesh,
+            law=lj.laws.NeoHookean(mu=422.5e3, bulk=2 * 422.5e3 * 1.3 / (3 * 0.4), volumetric="simo"),
+            fixed=(
+                lj.Fixed(nodes=mesh.node_sets["x_min"]),
+                lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="z"),
+            ),
+            traction=(lj.Traction(triangles=jnp.asarray(right), value=jnp.array([0.0, 1 / 16e-6, 0.0])),),
+        )
+        x = np.asarray(lj.simulate(scene).check().positions[-1])
+        k = np.argmin(np.linalg.norm(points - np.array([0.048, 0.052, 0]), axis=1))
+        errors.append(abs((x - points)[k, 1] / 14.74e-3 - 1))
+    assert errors[1] < 0.01
+    assert errors[0] / errors[1] > 3  # near second order, with the corner's singularity
