@@ -71,28 +71,35 @@ def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
 def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
     """Simulate a scene file and write its results; 1 if a step failed, with what was computed kept."""
     import time
+    from functools import partial
 
     import jax
     import numpy as np
+    from tqdm import tqdm
 
-    from liverjax import output, scene, status
+    from liverjax import output, porosity, scene, status
     from liverjax.simulation import simulate
     from liverjax.versions import versions
 
     read = scene.load_scene(file)
     target = _target(out, "result.h5")
+    bar = tqdm(total=read.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
     begin = time.perf_counter()
-    program = jax.jit(simulate).lower(read).compile()
+    program = jax.jit(partial(simulate, report=None if bar.disable else lambda _: bar.update())).lower(read).compile()
     compiled = time.perf_counter()
     result = jax.block_until_ready(program(read))
+    bar.close()
     run_time, compile_time = time.perf_counter() - compiled, compiled - begin
     codes = np.asarray(result.status)
     attributes = {"scene": file.read_text(encoding="utf-8"), "run_time_s": run_time, "compile_time_s": compile_time}
+    if read.porosity is not None:
+        attributes["bulk"] = porosity.bulk_in_force(read.porosity, read.law)
+        print(attributes["bulk"])
     output.write_hdf5(target, read, result, attributes | {"versions": versions()})
     s = result.statistics
     print(
         f"{read.mesh.number_of_nodes} nodes, {read.mesh.number_of_elements} tetrahedra, {len(codes)} steps: "
-        f"{int(np.sum(s.iterations))} Newton and {int(np.sum(s.linear_iterations))} CG iterations, "
+        f"{int(np.sum(s.iterations))} Newton and {int(np.sum(s.linear_iterations))} linear iterations, "
         f"largest residual {float(np.max(np.asarray(s.residual))):.1e} of the forces\n"
         f"run {run_time:.3g} s ({len(codes) / run_time:.3g} steps a second), compile {compile_time:.3g} s"
     )

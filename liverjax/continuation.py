@@ -50,6 +50,7 @@ class _Point(NamedTuple):
     t: jax.Array  # part of dq to try next
     s: jax.Array
     q_begin: jax.Array  # where the current part began
+    guessing: jax.Array  # it began at the guess
     s_begin: jax.Array
     ds: jax.Array
     launch: jax.Array  # the next evaluation is at the beginning of a part
@@ -82,13 +83,16 @@ class Method(NamedTuple):
     moved: bool = True
 
 
-def solve(method: Method, start: jax.Array, options: StepOptions = StepOptions()) -> tuple[jax.Array, StepStatistics]:
-    """Root in q of r(q, 1), followed from `start` (n,) at s = 0, which carries no derivative."""
+def solve(
+    method: Method, start: jax.Array, options: StepOptions = StepOptions(), guess: jax.Array | None = None
+) -> tuple[jax.Array, StepStatistics]:
+    """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative."""
     start = jax.lax.stop_gradient(start)
+    guess = start if guess is None else jax.lax.stop_gradient(guess)
     residual = method.residual
 
     def iterate(_, start):
-        return _follow(method, start, options)
+        return _follow(method, start, guess, options)
 
     def tangent_solve(linear, y):
         begin = jnp.zeros((), start.dtype)
@@ -104,7 +108,7 @@ def solve(method: Method, start: jax.Array, options: StepOptions = StepOptions()
     return root, StepStatistics(*counts, statistics.residual)
 
 
-def _follow(method, start, options):
+def _follow(method, start, guess, options):
     residual = method.residual
     dtype = start.dtype
     one = jnp.ones((), dtype)
@@ -131,12 +135,14 @@ def _follow(method, start, options):
         halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
         spent = (c.iterations >= options.max_iterations) | (halvings > options.max_halvings)
         failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))
-        cuts = c.cuts + failed
-        launch_now = c.launch | (converged & ~arrived)  # a new part begins at this very point
+        # A guess that leads nowhere costs no cut: the last equilibrium is next.
+        lost = c.guessing & (failed | (c.launch & ~finite))
+        cuts = c.cuts + (failed & ~lost)
+        launch_now = (c.launch & ~lost) | (converged & ~arrived)  # a new part begins at this very point
         longer = jnp.minimum(2 * c.ds, 1 - s)
         longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
-        ds = jnp.where(converged, longer, jnp.where(failed, 0.5 * c.ds, c.ds))
-        done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite)
+        ds = jnp.where(converged, longer, jnp.where(failed & ~lost, 0.5 * c.ds, c.ds))
+        done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite & ~lost)
         go_on = (launch_now | better) & ~done & ~failed
         load = -r
         if method.moved:
@@ -167,10 +173,11 @@ def _follow(method, start, options):
             dq=jnp.where(go_on, dq, c.dq),
             t=jnp.where(go_on, 1.0, 0.5 * c.t),
             s=jnp.where(launch_now, s + ds, s),
-            q_begin=jnp.where(launch_now, trial, c.q_begin),
+            q_begin=jnp.where(lost, start, jnp.where(launch_now, trial, c.q_begin)),
+            guessing=c.guessing & ~lost & ~(converged & ~arrived),
             s_begin=jnp.where(launch_now, s, c.s_begin),
             ds=ds,
-            launch=failed,
+            launch=failed | lost,
             first=launch_now,
             iterations=jnp.where(launch_now, 1, c.iterations + better),
             halvings=halvings,
@@ -184,7 +191,7 @@ def _follow(method, start, options):
     zero, no = jnp.zeros((), jnp.int32), jnp.array(False)
     made = jax.eval_shape(lambda q: method.tangent(q, 0 * one, residual(q, 0 * one)[2], None), start)
     begin = _Point(
-        q=start,
+        q=guess,
         size=jnp.full((), jnp.inf, dtype),
         aim=0 * one,
         tangent=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made),
@@ -193,7 +200,8 @@ def _follow(method, start, options):
         dq=jnp.zeros_like(start),
         t=one,
         s=0 * one,
-        q_begin=start,
+        q_begin=guess,
+        guessing=jnp.array(True),
         s_begin=0 * one,
         ds=one,
         launch=jnp.array(True),

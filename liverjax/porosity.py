@@ -80,6 +80,16 @@ def law_in_force(porosity: Porosity | None, law: Law) -> Law:
     return law if split is None else split
 
 
+def bulk_in_force(porosity: Porosity, law: Law) -> str:
+    """One sentence: which bulk modulus acts."""
+    sponge = f"bulk modulus in force: the sponge's, {float(porosity.bulk):g} Pa"
+    if porosity.keep_bulk:
+        return f"{sponge}, and the law's own (keep_bulk)"
+    if isochoric_part(law) is None:
+        return f"{sponge}, and what {type(law).__name__} has in one with its shear"
+    return f"{sponge}; the law's own volumetric energy is off"
+
+
 def volumetric_stress(porosity: Porosity, J: Any) -> Any:
     """sigma_Heq(J) [Pa]: Hencky's logarithm above J0, its tangent line below; finite for every J."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction

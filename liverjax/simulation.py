@@ -1,5 +1,6 @@
 """Run a scene: load steps or time steps, each a Newton solve with implicit differentiation."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -146,7 +147,10 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
         moved=moving or ramped,
     )
     options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
-    q, statistics = continuation.solve(method, (mask * state.x).ravel(), options)
+    guess = None
+    if mass is not None and not moving and solve.newton_iterations > 1:
+        guess = (mask * (state.x + dt * state.velocity)).ravel()  # straight on; one iteration starts at x, as printed
+    q, statistics = continuation.solve(method, (mask * state.x).ravel(), options, guess)
     one = jnp.ones((), dtype)
     x = positions(q, one)
     internal, inertial, load, pressed = forces(q, one)
@@ -178,8 +182,8 @@ def _motion(integrator: str, state: State, x: jax.Array, dt: Any) -> tuple[jax.A
     return state.velocity + 0.5 * dt * (state.acceleration + a), a
 
 
-@jax.jit
-def _run(scene: Scene) -> Result:
+@partial(jax.jit, static_argnames="report")
+def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
     steps = scene.solve.steps
     dtype = scene.mesh.points.dtype
 
@@ -189,6 +193,8 @@ def _run(scene: Scene) -> Result:
         good = statistics.status != status.NOT_FINITE
         new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
         P = None if new.fluid is None else new.fluid.pressure
+        if report is not None:
+            jax.debug.callback(report, k)
         return new, (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
@@ -198,13 +204,21 @@ def _run(scene: Scene) -> Result:
     return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
 
 
-def simulate(scene: Scene) -> Result:
-    """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`."""
+def simulate(scene: Scene, report: Callable[[int], None] | None = None) -> Result:
+    """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
+
+    Args:
+        scene: `Scene`.
+        report: called on the host with the number of every finished step, for progress.
+
+    Raises:
+        InputError: precision "float64" where JAX's 64-bit mode is off.
+    """
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif not jax.config.jax_enable_x64:
         raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
-    return _run(scene)
+    return _run(scene, report)
 
 
 def _cast(value: Any, dtype: Any) -> Any:
