@@ -52,7 +52,7 @@ def main() -> None:
 
 def motion(curves: dict, rows: list) -> plt.Figure:
     """The tip's path, and what a step costs beside its error."""
-    fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    fig, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4), layout="constrained")
     for (name, curve), colour in zip(curves.items(), COLOURS, strict=False):
         left.plot(curve["times"], 100 * np.array(curve["tip_m"]), color=colour, label=name)
         for newton, marker in ((1, "o"), (25, "s")):
@@ -65,14 +65,15 @@ def motion(curves: dict, rows: list) -> plt.Figure:
                 label=f"{name}, {'one iteration' if newton == 1 else 'to 1e-6'}",
             )
     left.set(xlabel="time [s]", ylabel="tip along gravity [cm]", title="liver phantom, 2 m/s$^2$, steps of 5 ms")
-    left.legend()
+    left.legend(loc="upper right", ncols=3, fontsize=7)
+    left.set_ylim(top=11.5)
     right.axvline(1.0, color="black", lw=0.8)
     right.set(
         xlabel="simulated time / run time (right of 1: faster than real time)",
         ylabel="error of positions [%]",
         title="implicit Euler, steps of 0.05, 0.15, 0.3 s (left to right)",
     )
-    right.legend(fontsize=7)
+    right.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return fig
 
 
@@ -91,7 +92,7 @@ def pressure_row(mesh, result) -> plt.Figure:
     triangles = boundary_triangles(mesh)
     P = np.asarray(result.pressure)[_at(result)]
     most = np.abs(P).max()
-    fig = plt.figure(figsize=(11, 2.9), layout="constrained")
+    fig = plt.figure(figsize=(12, 2.9), layout="constrained")
     all_axes = []
     for n, k in enumerate(_at(result)):
         axes = fig.add_subplot(1, len(PICTURES), n + 1, projection="3d")
@@ -104,8 +105,8 @@ def pressure_row(mesh, result) -> plt.Figure:
         rest = 100 * np.asarray(mesh.points)
         middle, half = (rest.min(axis=0) + rest.max(axis=0)) / 2, np.ptp(rest, axis=0).max() / 2
         for d, letter in enumerate("xyz"):
-            getattr(axes, f"set_{letter}lim")(middle[d] - 0.8 * half, middle[d] + 0.8 * half)
-        axes.set_box_aspect((1, 1, 1), zoom=1.5)
+            getattr(axes, f"set_{letter}lim")(middle[d] - half, middle[d] + half)
+        axes.set_box_aspect((1, 1, 1), zoom=1.55)
         axes.view_init(elev=25, azim=-70)
         axes.set_axis_off()
         axes.set_title(f"t = {PICTURES[n]:.2f} s")

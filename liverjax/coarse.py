@@ -36,7 +36,7 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
         E = _galerkin(mesh, A, f, mask, number)
         d = jnp.diagonal(E)
         # A patch without free nodes along an axis, or a flat one, has motions that vanish: kept out of the inverse.
-        E = E + jnp.diag(jnp.where(d > 0, 1e-9 * d, 1.0))
+        E = E + jnp.diag(jnp.where(d > 0, max(1e-9, 100 * float(jnp.finfo(d.dtype).eps)) * d, 1.0))
         factor = jax.scipy.linalg.cho_factor(E)
         inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(len(E), dtype=E.dtype))
         return jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0.0)

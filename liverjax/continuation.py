@@ -29,7 +29,7 @@ class StepOptions(NamedTuple):
     """How hard to try; all static."""
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
-    max_iterations: int = 25  # a part; 1 takes one step of Newton and asks for no convergence
+    max_iterations: int = 25  # a part; 1: one step of Newton, no convergence asked for, derivatives not those of it
     linear_tolerance: float = 5e-2  # of a direction, the loosest
     one_step_tolerance: float = 1e-4  # of the one direction where there is but one iteration
     contraction: float = 0.15  # of |r| in an iteration; a tangent that does worse is made anew
@@ -88,7 +88,7 @@ def solve(
 ) -> tuple[jax.Array, StepStatistics]:
     """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative."""
     start = jax.lax.stop_gradient(start)
-    guess = start if guess is None else jax.lax.stop_gradient(guess)
+    guess = None if guess is None else jax.lax.stop_gradient(guess)
     residual = method.residual
 
     def iterate(_, start):
@@ -142,7 +142,8 @@ def _follow(method, start, guess, options):
         longer = jnp.minimum(2 * c.ds, 1 - s)
         longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
         ds = jnp.where(converged, longer, jnp.where(failed & ~lost, 0.5 * c.ds, c.ds))
-        done = arrived | (failed & (cuts > options.max_cuts)) | (c.launch & ~finite & ~lost)
+        hopeless = jnp.array(not method.moved) | (cuts > options.max_cuts)  # parts of nothing are all alike
+        done = arrived | (failed & ~lost & hopeless) | (c.launch & ~finite & ~lost)
         go_on = (launch_now | better) & ~done & ~failed
         load = -r
         if method.moved:
@@ -190,8 +191,9 @@ def _follow(method, start, guess, options):
 
     zero, no = jnp.zeros((), jnp.int32), jnp.array(False)
     made = jax.eval_shape(lambda q: method.tangent(q, 0 * one, residual(q, 0 * one)[2], None), start)
+    first = start if guess is None else guess
     begin = _Point(
-        q=guess,
+        q=first,
         size=jnp.full((), jnp.inf, dtype),
         aim=0 * one,
         tangent=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made),
@@ -200,8 +202,8 @@ def _follow(method, start, guess, options):
         dq=jnp.zeros_like(start),
         t=one,
         s=0 * one,
-        q_begin=guess,
-        guessing=jnp.array(True),
+        q_begin=first,
+        guessing=jnp.array(guess is not None),
         s_begin=0 * one,
         ds=one,
         launch=jnp.array(True),

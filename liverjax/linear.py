@@ -129,11 +129,13 @@ def differentiable_solve(
 ) -> jax.Array:
     """A solve as a linear map of `b`: its derivatives are further solves, not those of iterations.
 
-    Conjugate gradients for a symmetric A, positive definite as theirs; otherwise BiCGSTAB.
+    Conjugate gradients for a symmetric A, positive definite as theirs; otherwise BiCGSTAB. NaN where the true residual
+    stays above a thousandth of |b| (and the tolerance): no wrong solution passes for one.
     """
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients
 
     def solve(matvec, b):
-        return method(matvec, b, precondition, tolerance, max_iterations)[0]
+        x, s = method(matvec, b, precondition, tolerance, max_iterations)
+        return jnp.where(s.residual <= jnp.maximum(1e-3, 10 * tolerance), x, jnp.nan)
 
     return jax.lax.custom_linear_solve(matvec, b, solve=solve, transpose_solve=solve, symmetric=symmetric)

@@ -111,6 +111,10 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     return Fluid(jnp.zeros(mesh.points.shape[0], J.dtype), J, J if porosity.scheme == "chapter" else None)
 
 
+#: Flat and inverted elements store and conduct fluid as elements of this J.
+_LEAST_J = 1e-3
+
+
 class Flow(NamedTuple):
     """dt times storage rate plus Darcy's Laplacian, in the positions at the beginning of a step: made once a step."""
 
@@ -128,10 +132,11 @@ def flow(porosity: Porosity, mesh: TetMesh, fluid: Fluid, F: Matrix, dt: Any, to
     if porosity.drained is not None:
         mask = mask.at[porosity.drained].set(0.0)
     # Everything times dt: the storage term stays of the size of a volume whatever the step.
-    store = _scatter(mesh, mesh.volumes * fluid.J / 4) / porosity.limit_bulk
+    J = jnp.maximum(fluid.J, _LEAST_J)
+    store = _scatter(mesh, mesh.volumes * J / 4) / porosity.limit_bulk
     g = _gradients(mesh, F)
     # grad N_a = cof(F) D_a / J per current volume J V0.
-    weight = dt * porosity.permeability * mesh.volumes / fluid.J
+    weight = dt * porosity.permeability * mesh.volumes / J
     rows = assembly.off_diagonal(mesh, {(a, b): ((weight * dot(g[a], g[b]),),) for a, b in PAIRS})
     diagonal = ((store - assembly.row_sums(rows)[0][0],),)
     A = assembly.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)

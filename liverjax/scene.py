@@ -36,7 +36,7 @@ class Solve:
     kind: str = static("static", "static: no inertia; dynamic")
     steps: int = static(1, "load steps, or time steps of dt")
     tolerance: float = static(1e-8, "of the residual, relative to the forces at work")
-    newton_iterations: int = static(25, "of a step; 1 is the chapter's linearly implicit scheme")
+    newton_iterations: int = static(25, "of a step; 1 is the chapter's linearly implicit scheme (not for derivatives)")
     integrator: str = static("euler", "dynamic: euler (first order) or newmark (average acceleration, second order)")
     precision: str = static("float64", "float64 or float32")
 
@@ -273,13 +273,16 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     return Traction(triangles=triangles, value=jnp.asarray(_numbers(f"{name} value", table["value"], 3)))
 
 
+_CHOICES = {
+    "kind": ("static", "dynamic"),
+    "integrator": ("euler", "newmark"),
+    "precision": ("float64", "float32"),
+}
+
+
 def _solve(table: dict) -> Solve:
     values = dict(table)
-    for key, allowed in (
-        ("kind", ("static", "dynamic")),
-        ("integrator", ("euler", "newmark")),
-        ("precision", ("float64", "float32")),
-    ):
+    for key, allowed in _CHOICES.items():
         if key in values and values[key] not in allowed:
             raise InputError(f"[solve] {key} = {values[key]!r} is not known: use {' or '.join(allowed)}")
     for key in ("steps", "newton_iterations"):
@@ -294,13 +297,38 @@ def _solve(table: dict) -> Solve:
 # -- checks and changes ------------------------------------------------------------------------------------------------
 
 
+def check_choices(scene: Scene) -> None:
+    """Refuse choices that mean nothing; looks at no numbers, so that a traced scene passes as well.
+
+    Raises:
+        InputError: unknown kind, integrator or precision; a load or motion given twice, not at all, of wrong shape.
+    """
+    for key, allowed in _CHOICES.items():
+        value = getattr(scene.solve, key)
+        if value not in allowed:
+            raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
+    for k, load in enumerate(scene.traction):
+        if (load.value is None) == (load.pressure is None):
+            raise InputError(f"traction.{k} needs either value (3,) or pressure, in Pa: give one of them")
+        name, shape = ("pressure", ()) if load.value is None else ("value", (3,))
+        if np.shape(getattr(load, name)) != shape:
+            raise InputError(f"traction.{k} {name} has shape {np.shape(getattr(load, name))}: give shape {shape}")
+    for k, motion in enumerate(scene.displaced):
+        if (motion.by is None) == (motion.history is None):
+            raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
+
+
 def check_scene(scene: Scene) -> None:
     """Refuse a scene that cannot be simulated; host side, before any compile.
 
     Raises:
         InputError: an unusable mesh or viscosity, missing time step or mass, contradicting conditions, a loose body.
     """
+    check_choices(scene)
     check_mesh(scene.mesh)
+    for k, load in enumerate(scene.traction):
+        if not np.all(np.isfinite(np.asarray(load.pressure if load.value is None else load.value, dtype=float))):
+            raise InputError(f"traction.{k} is not finite: give numbers in Pa")
     if scene.viscosity is not None:
         viscosity.check(scene.viscosity, scene.law)
     if scene.porosity is not None:

@@ -12,7 +12,7 @@ from liverjax import boundary, continuation, mjed, porosity, status, tangent, te
 from liverjax.continuation import StepOptions, StepStatistics
 from liverjax.errors import InputError
 from liverjax.kinematics import add_matrices, deformation_gradient, determinant
-from liverjax.scene import Scene
+from liverjax.scene import Scene, check_choices
 from liverjax.struct import param, struct
 
 
@@ -73,8 +73,20 @@ def _loads(scene: Scene) -> jax.Array:
     return force + boundary.nodal_tractions(scene.mesh, scene.traction) if scene.traction else force
 
 
-def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStatistics]:
-    """Step k = 1 … steps: the next state, the reactions (V, 3) [N] and what the solve took."""
+def unit_strain_force(scene: Scene) -> jax.Array:
+    """Size [N] of the nodal forces of a stretch along x, per unit strain, at rest: roundoff is a part of it."""
+    mesh, law = scene.mesh, porosity.law_in_force(scene.porosity, scene.law)
+    along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], mesh.points.dtype)
+    force = jax.jvp(lambda x: mjed.internal_force(mesh, law, x), (mesh.points,), (along,))[1]
+    return jax.lax.stop_gradient(jnp.linalg.norm(force))
+
+
+def step(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> tuple[State, jax.Array, StepStatistics]:
+    """Step k = 1 … steps: the next state, the reactions (V, 3) [N] and what the solve took.
+
+    `stiff` is `unit_strain_force(scene)`, the same for every step.
+    """
+    stiff = unit_strain_force(scene) if stiff is None else stiff
     mesh, sponge, solve = scene.mesh, scene.porosity, scene.solve
     law = porosity.law_in_force(sponge, scene.law)
     dtype = mesh.points.dtype
@@ -85,6 +97,8 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     mass = scene.body.density * boundary.nodal_volumes(mesh) if state.velocity is not None else None
     moving, follows = len(scene.displaced) > 0, boundary.follows(scene.traction)
     ramped = dt is None
+    # Below this, forces are roundoff: an unloaded equilibrium has converged.
+    noise = 20 * float(np.finfo(np.float64).eps) / solve.tolerance * stiff
     flow = None
     if sponge is not None:
         F_begin = deformation_gradient(mesh, state.x)
@@ -97,16 +111,22 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     known = None if sponge is None or sponge.scheme == "implicit" else fluid_pressure(F_begin)
 
     def acting(s):
-        """Part of the loads that acts: they grow with the load steps where there is no time."""
-        return (k - 1 + s) / solve.steps if ramped else jnp.ones((), dtype)
+        """Part of the loads that acts: they grow with the load steps, or quasi-statically within the first step."""
+        if ramped:
+            return (k - 1 + s) / solve.steps
+        return jnp.ones((), dtype) if mass is not None else jnp.where(k == 1, s, 1.0).astype(dtype)
 
     def conditions(s):
         """Positions of held degrees of freedom (V, 3), 0 elsewhere, and dead loads at part s of the step."""
         held = mesh.points
         if moving:
-            time = 0.0 if dt is None else dt * (k - 1 + s)
-            held = held + boundary.prescribed(mesh, scene.displaced, time, (k - 1 + s) / solve.steps)
-        return (1 - mask) * held, acting(s) * loads if ramped else loads
+            # Straight from beginning to end: a history may bend within the step, and only its end counts.
+            before, after = (
+                boundary.prescribed(mesh, scene.displaced, 0.0 if dt is None else dt * n, n / solve.steps)
+                for n in (k - 1, k)
+            )
+            held = held + before + s * (after - before)
+        return (1 - mask) * held, acting(s) * loads
 
     def positions(q, s):
         return mask * q.reshape(-1, 3) + conditions(s)[0]
@@ -121,7 +141,7 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
             fluid = fluid_pressure(F) if known is None else known
             P = add_matrices(P, porosity.first_piola(sponge, mesh, fluid, F))
         internal = mjed.nodal_force(mesh, P)
-        inertial = None if mass is None else mass[:, None] * _acceleration(solve.integrator, state, x, dt)
+        inertial = None if mass is None else mass[:, None] * _motion(solve.integrator, state, x, dt, mask)[1]
         outer = conditions(s)[1]
         if follows:
             outer = outer + acting(s) * boundary.follower_forces(scene.traction, x)
@@ -130,7 +150,7 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     def residual(q, s):
         internal, inertial, load, fluid = forces(q, s)
         total = internal - load if inertial is None else internal + inertial - load
-        at_work = jnp.linalg.norm(internal) + jnp.linalg.norm(load)
+        at_work = noise + jnp.linalg.norm(internal) + jnp.linalg.norm(load)
         if inertial is not None:
             at_work = at_work + jnp.linalg.norm(inertial)
         return (mask * total).ravel(), jax.lax.stop_gradient(at_work), fluid
@@ -144,7 +164,7 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
         solve=partial(tangent.solve, setting),
         preconditioner=partial(tangent.preconditioner, setting),
         symmetric=not follows,
-        moved=moving or ramped,
+        moved=moving or mass is None,
     )
     options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
     guess = None
@@ -155,7 +175,9 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     x = positions(q, one)
     internal, inertial, load, pressed = forces(q, one)
     reactions = (1 - mask) * (internal - load if inertial is None else internal + inertial - load)
-    velocity, acceleration = _motion(solve.integrator, state, x, dt)
+    velocity, acceleration = (None, None) if mass is None else _motion(solve.integrator, state, x, dt, mask)
+    if state.acceleration is None:
+        acceleration = None
     history, fluid = None, None
     if memory is not None or sponge is not None:
         F = deformation_gradient(mesh, x)
@@ -166,20 +188,17 @@ def step(scene: Scene, state: State, k: Any) -> tuple[State, jax.Array, StepStat
     return State(x, velocity, acceleration, history, fluid), reactions, statistics
 
 
-def _acceleration(integrator: str, state: State, x: jax.Array, dt: Any) -> jax.Array:
-    """At the end of the step: implicit Euler, or Newmark's average acceleration."""
-    if integrator == "euler":
-        return (x - state.x - dt * state.velocity) / dt**2
-    return 4 * (x - state.x - dt * state.velocity) / dt**2 - state.acceleration
-
-
-def _motion(integrator: str, state: State, x: jax.Array, dt: Any) -> tuple[jax.Array | None, jax.Array | None]:
-    if state.velocity is None:
-        return None, None
-    if integrator == "euler":
-        return (x - state.x) / dt, None
-    a = _acceleration(integrator, state, x, dt)
-    return state.velocity + 0.5 * dt * (state.acceleration + a), a
+def _motion(integrator: str, state: State, x: jax.Array, dt: Any, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Velocity and acceleration at the end of the step: implicit Euler, or Newmark's average acceleration."""
+    velocity = (x - state.x) / dt
+    acceleration = (velocity - state.velocity) / dt
+    if integrator == "newmark":
+        # Free degrees only: where motion is prescribed the average acceleration would swing without end.
+        average = 4 * acceleration - state.acceleration
+        free = mask > 0
+        velocity = jnp.where(free, state.velocity + 0.5 * dt * (state.acceleration + average), velocity)
+        acceleration = jnp.where(free, average, acceleration)
+    return velocity, acceleration
 
 
 @partial(jax.jit, static_argnames="report")
@@ -188,16 +207,18 @@ def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
     dtype = scene.mesh.points.dtype
 
     def advance(state, k):
-        new, reactions, statistics = step(scene, state, k)
+        new, reactions, statistics = step(scene, state, k, stiff)
         # A state that is not finite spoils nothing further: the run stays where it last was.
-        good = statistics.status != status.NOT_FINITE
+        finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
+        good = finite & (statistics.status != status.NOT_FINITE)
+        statistics = statistics._replace(status=jnp.where(finite, statistics.status, status.NOT_FINITE))
         new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
         P = None if new.fluid is None else new.fluid.pressure
         if report is not None:
             jax.debug.callback(report, k)
         return new, (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
-    numbers = jnp.arange(1, steps + 1, dtype=dtype)
+    numbers, stiff = jnp.arange(1, steps + 1, dtype=dtype), unit_strain_force(scene)
     _, (x, reactions, P, statistics) = jax.lax.scan(advance, initial_state(scene), numbers)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status
@@ -212,8 +233,10 @@ def simulate(scene: Scene, report: Callable[[int], None] | None = None) -> Resul
         report: called on the host with the number of every finished step, for progress.
 
     Raises:
-        InputError: precision "float64" where JAX's 64-bit mode is off.
+        InputError: choices that mean nothing; precision "float64" where JAX's 64-bit mode is off. Numbers are checked
+            by `check_scene`, which reading a scene file calls.
     """
+    check_choices(scene)
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif not jax.config.jax_enable_x64:

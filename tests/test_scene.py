@@ -1,6 +1,7 @@
 """Scene files: what they say, what is refused in one sentence, what the command leaves behind."""
 
 import json
+import re
 import tomllib
 
 import h5py
@@ -13,6 +14,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.scene import scene_from
+from liverjax.struct import replace
 
 SCENE = """
 [mesh]
@@ -217,3 +219,18 @@ def test_a_mesh_file_with_sets_and_units(tmp_path):
     scene = scene_from(content, tmp_path)
     result = lj.simulate(scene).check()
     assert np.isclose(float(jnp.max(result.positions[-1])), 0.11)
+
+
+def test_scenes_made_in_python_are_refused_alike():
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=1.0, bulk=10.0), fixed=(lj.Fixed(nodes=jnp.arange(4)),))
+    triangles = jnp.array([[0, 1, 3]])
+    for change, sentence in (
+        ({"solve": lj.Solve(kind="Dynamic")}, "kind = 'Dynamic' is not known"),
+        ({"solve": lj.Solve(precision="single")}, "precision = 'single' is not known"),
+        ({"traction": (lj.Traction(triangles=triangles),)}, "either value"),
+        ({"traction": (lj.Traction(triangles=triangles, pressure=jnp.ones(3)),)}, "shape"),
+        ({"displaced": (lj.Displaced(nodes=jnp.array([7])),)}, "either by"),
+    ):
+        with pytest.raises(lj.InputError, match=re.escape(sentence)):
+            lj.simulate(replace(scene, **change))

@@ -418,3 +418,28 @@ def test_cooks_membrane():
         errors.append(abs((x - points)[k, 1] / 14.74e-3 - 1))
     assert errors[1] < 0.01
     assert errors[0] / errors[1] > 3  # near second order, with the corner's singularity
+
+
+def test_what_ends_unloaded_has_converged():
+    # Down and back to rest, with a bend inside a step: roundoff is no unbalanced force.
+    mesh = box(1)
+    history = dict(times=jnp.array([0.0, 0.05, 0.25]), history=jnp.array([[0.0, 0, 0], [0, 0, 0.01], [0, 0, 0]]))
+    scene = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, **history),))
+    result = lj.simulate(replace(scene, solve=lj.Solve(dt=0.1, steps=4))).check()
+    assert np.abs(np.asarray(result.positions[-1] - mesh.points)).max() < 1e-9
+    assert int(result.statistics.cuts.sum()) == 0
+
+
+def test_newmark_does_not_swing_where_motion_is_prescribed():
+    mesh = box(1)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        body=lj.Body(density=1000.0),
+        fixed=(bottom(mesh),),
+        displaced=(top(mesh, by=jnp.array([0.0, 0.0, 0.01])),),
+        solve=lj.Solve(kind="dynamic", dt=0.02, steps=40, integrator="newmark"),
+    )
+    pull = np.asarray(jnp.sum(lj.simulate(scene).check().reactions[:, scene.displaced[0].nodes, 2], axis=1))
+    # Constant speed: after the first step no inertia remains, the force follows the strain.
+    assert np.abs(np.diff(pull[2:], n=2)).max() < 0.02 * pull[-1]

@@ -152,16 +152,17 @@ def test_follower_pressure_follows():
 
 def test_follower_pressure_in_equilibrium_and_its_gradient():
     scene = inflated(150.0, steps=2, tolerance=1e-11)
-    result = jax.jit(lj.simulate)(scene).check()
+    result = lj.simulate(scene).check()
     x = result.positions[-1]
     residual = mjed.internal_force(MESH, LAW, x) - boundary.follower_forces(scene.traction, x) - result.reactions[-1]
     assert np.abs(np.asarray(residual)).max() < 1e-10 * np.abs(np.asarray(result.reactions[-1])).sum()
     assert float(x[:, 2].max()) < 0.1
 
     @jax.jit
+    @jax.value_and_grad
     def bulge(p):
         return lj.simulate(lj.with_parameters(scene, {"traction.0.pressure": p})).positions[-1, -1, 0]
 
     h = 0.1
-    exact = float(jax.jit(jax.grad(bulge))(150.0))
-    assert np.isclose((bulge(150 + h) - bulge(150 - h)) / (2 * h), exact, rtol=1e-6)
+    difference = (bulge(150 + h)[0] - bulge(150 - h)[0]) / (2 * h)
+    assert np.isclose(difference, bulge(150.0)[1], rtol=1e-6)
