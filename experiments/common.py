@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import matplotlib
+import matplotlib.ticker
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -45,6 +46,14 @@ def timed(function: Callable, *arguments: Any, rounds: int = 5) -> tuple[Any, Ti
 def environment() -> dict[str, Any]:
     """Where the numbers come from, without naming a machine."""
     return versions() | {"cores": os.cpu_count(), "architecture": platform.machine(), "backend": jax.default_backend()}
+
+
+def plain_ticks(*axes: Any) -> None:
+    """1, 2, 5, 10 … as plain numbers on logarithmic axes."""
+    for axis in axes:
+        axis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        axis.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
 
 def save(name: str, content: dict[str, Any], figure: Any = None) -> None:

@@ -8,7 +8,7 @@ and for Newton to 1e-6.
 """
 
 import numpy as np
-from common import plt, save
+from common import plain_ticks, plt, save
 from liver import error, models, timed_run, with_solve
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -67,6 +67,7 @@ def motion(curves: dict, rows: list) -> plt.Figure:
     left.set(xlabel="time [s]", ylabel="tip along gravity [cm]", title="liver phantom, 2 m/s$^2$, steps of 5 ms")
     left.legend(loc="upper right", ncols=3, fontsize=7)
     left.set_ylim(top=11.5)
+    plain_ticks(right.xaxis, right.yaxis)
     right.axvline(1.0, color="black", lw=0.8)
     right.set(
         xlabel="simulated time / run time (right of 1: faster than real time)",

@@ -15,7 +15,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import plt, save
+from common import plain_ticks, plt, save
 
 import liverjax as lj
 from liverjax import boundary, status
@@ -165,6 +165,7 @@ def figure(out: dict) -> plt.Figure:
     for r, e in zip(cook_rows, error, strict=True):
         axes[0].annotate(f"{r['tetrahedra']:,}", (r["run_s"], e), fontsize=7, xytext=(3, 3), textcoords="offset points")
     axes[0].set(title="Cook's membrane (tetrahedra beside)", xlabel="run time [s]", ylabel="error of the rise [%]")
+    plain_ticks(axes[0].yaxis)
     axes[1].axhspan(4.0, 4.2, color=GREEN, alpha=0.25, label="codes of Land et al.")
     axes[1].plot([r["run_s"] for r in out["land"]], [r["end_mm"] for r in out["land"]], "o-", color=BLUE)
     for r in out["land"]:

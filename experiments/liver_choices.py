@@ -11,7 +11,7 @@ import time
 import jax
 import numpy as np
 from baselines import corotational, critical_step, explicit
-from common import plt, save
+from common import plain_ticks, plt, save
 from liver import error, models, timed_run, with_solve
 
 from liverjax.colours import COLOURS
@@ -117,6 +117,7 @@ def main() -> None:
             shown = [r for r in rows if np.isfinite(r["error"]) and r["error"] < 10]
             axes.loglog([r["run_s"] for r in shown], [100 * r["error"] for r in shown], "o-", color=colour, label=name)
         axes.set(title=title, xlabel=f"run time of {SECONDS} s [s]", ylabel="error of positions [%]")
+        plain_ticks(axes.xaxis)
         axes.legend(fontsize=7)
     content = {
         title: {
