@@ -56,7 +56,7 @@ def motion(curves: dict, rows: list) -> plt.Figure:
     for (name, curve), colour in zip(curves.items(), COLOURS, strict=False):
         left.plot(curve["times"], 100 * np.array(curve["tip_m"]), color=colour, label=name)
         for newton, marker in ((1, "o"), (25, "s")):
-            own = [r for r in rows if r["model"] == name and r["newton"] == newton]
+            own = [r for r in rows if r["model"] == name and r["newton"] == newton and r["converged"]]
             right.loglog(
                 [r["steps_per_s"] * r["dt"] for r in own],
                 [100 * r["error"] for r in own],
@@ -107,7 +107,7 @@ def pressure_row(mesh, result) -> plt.Figure:
         middle, half = (rest.min(axis=0) + rest.max(axis=0)) / 2, np.ptp(rest, axis=0).max() / 2
         for d, letter in enumerate("xyz"):
             getattr(axes, f"set_{letter}lim")(middle[d] - half, middle[d] + half)
-        axes.set_box_aspect((1, 1, 1), zoom=1.55)
+        axes.set_box_aspect((1, 1, 1), zoom=1.3)
         axes.view_init(elev=25, azim=-70)
         axes.set_axis_off()
         axes.set_title(f"t = {PICTURES[n]:.2f} s")
