@@ -98,8 +98,7 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
         inverse = assembly.inverse_blocks(A.diagonal, mask)
 
         def precondition(r):
-            r = r.reshape(-1, 3)
-            return jnp.stack([sum(inverse[i][j] * r[:, j] for j in range(3)) for i in range(3)], axis=-1).ravel()
+            return assembly.applied(inverse, r.reshape(-1, 3)).ravel()
 
         def matvec(u):
             return (mask * assembly.product(A, mask * u.reshape(-1, 3))).ravel()

@@ -93,6 +93,11 @@ def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
     )
 
 
+def applied(blocks: Block, v: jax.Array) -> jax.Array:
+    """A block a node, m x m of (V,), times its part of v (V, m)."""
+    return jnp.stack([sum(entry * v[:, j] for j, entry in enumerate(row)) for row in blocks], axis=-1)
+
+
 def product(A: BlockMatrix, v: jax.Array) -> jax.Array:
     """A v for v (V, k): the first k columns of its blocks, all of its rows."""
     k = v.shape[1]

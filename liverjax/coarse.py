@@ -30,7 +30,7 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
         mask: (V, m) 1 where free: m = 3 for forces, 1 for a pressure.
         used: whether it is worth its cost (see `worthwhile`).
     """
-    f, number = _functions(mesh), mesh.pattern.patch_sizes.shape[0]
+    f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
 
     def invert(A):
         E = _galerkin(mesh, A, f, mask, number)
@@ -56,8 +56,8 @@ def worthwhile(A: BlockMatrix, inertia: Any) -> Any:
 
 def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """Z (Z^T A Z)^-1 Z^T as a function of (V, m), Z the coarse motions."""
-    f, patch = jax.lax.stop_gradient(_functions(mesh)), mesh.pattern.patches
-    m, number = mask.shape[1], mesh.pattern.patch_sizes.shape[0]
+    f, patch = mesh.pattern.patch_functions, mesh.pattern.patches
+    m, number = mask.shape[1], mesh.pattern.number_of_patches
 
     def apply(r):
         weighted = (f[:, :, None] * (mask * r)[:, None, :]).reshape(-1, 4 * m)
@@ -78,24 +78,6 @@ def corrected(
         return apply(r.reshape(-1, 3)).ravel()
 
     return lambda r: fine(r) + jax.lax.cond(coarse.used, add, jnp.zeros_like, r)
-
-
-def patch_width(mesh: TetMesh) -> jax.Array:
-    """Mean of the patches' widest extents [m]: what varies over a shorter length the coarse space does not see."""
-    points, patch = mesh.points, mesh.pattern.patches
-    count = mesh.pattern.patch_sizes.shape[0]
-    low = jnp.full((count, 3), jnp.inf, points.dtype).at[patch].min(points)
-    high = jnp.full((count, 3), -jnp.inf, points.dtype).at[patch].max(points)
-    return jnp.mean(jnp.max(high - low, axis=1))
-
-
-def _functions(mesh: TetMesh) -> jax.Array:
-    points, sizes, patch = mesh.points, mesh.pattern.patch_sizes, mesh.pattern.patches
-    middle = jnp.zeros((len(sizes), 3), points.dtype).at[patch].add(points) / sizes[:, None].astype(points.dtype)
-    place = points - middle[patch]
-    reach = jnp.zeros(len(sizes), points.dtype).at[patch].max(jnp.max(jnp.abs(place), axis=1))
-    reach = jnp.where(reach > 0, reach, 1.0)
-    return jnp.concatenate([jnp.ones_like(place[:, :1]), place / reach[patch][:, None]], axis=1)
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.errors import InputError
-from liverjax.pattern import Pattern, patches, pattern
+from liverjax.pattern import Pattern, pattern
 from liverjax.struct import param, struct
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
@@ -41,17 +41,15 @@ class TetMesh:
 
 
 def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = None) -> TetMesh:
-    """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`): traceable.
+    """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`).
 
+    The positions may be traced, the node numbers may not.
     The shape vectors are the rows of the inverse edge matrix, written as cross products over six times the volume.
     """
     if isinstance(tetrahedra, jax.core.Tracer):
         raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
     points = jnp.asarray(points, dtype=float)
-    # Positions may be traced (derivatives by the shape); then all nodes are one patch.
-    known = not isinstance(points, jax.core.Tracer)
-    near = patches(np.asarray(points)) if known else np.zeros(points.shape[0], int)
-    neighbours = pattern(tetrahedra, points.shape[0], near)
+    neighbours = pattern(tetrahedra, points)
     tetrahedra = jnp.asarray(tetrahedra, dtype=jnp.int32)
     corner = points[tetrahedra]
     e = corner[:, 1:] - corner[:, :1]

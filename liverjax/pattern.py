@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.struct import param, struct
+from liverjax.struct import param, static, struct
 
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
@@ -25,11 +25,20 @@ class Pattern:
     row_edges: jax.Array = param("1", "the edges to them (W, V), padded with N")
     edge_slots: jax.Array = param("1", "place of an edge in the flattened rows, that of its lower node (N,)")
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
-    patch_sizes: jax.Array = param("1", "nodes of every patch (P,)")
+    patch_functions: jax.Array = param("1", "1 and the place in its patch, about 1 in size, of every node (V, 4)")
+    patch_width: jax.Array = param("m", "mean of the patches' widest extents")
+    number_of_patches: int = static(1, "P")
 
 
-def pattern(tetrahedra: Any, number_of_nodes: int, patches: np.ndarray) -> Pattern:
-    """The pattern of elements (E, 4); host side, sorted so that equal meshes give equal patterns."""
+def pattern(tetrahedra: Any, points: jax.Array) -> Pattern:
+    """The pattern of elements (E, 4) on points (V, 3) [m]; host side, equal meshes give equal patterns.
+
+    The points may be traced (derivatives by the shape): then all nodes are one patch.
+    """
+    number_of_nodes = points.shape[0]
+    traced = isinstance(points, jax.core.Tracer)
+    near = np.zeros(number_of_nodes, dtype=np.int32) if traced else patches(np.asarray(points))
+    functions, widest = _patch_functions(jax.lax.stop_gradient(points), near)
     tets = np.asarray(tetrahedra, dtype=int).reshape(-1, 4)
     if tets.size and (tets.min() < 0 or tets.max() >= number_of_nodes):
         tets = tets[:0]  # a mesh that `check_mesh` refuses
@@ -56,8 +65,10 @@ def pattern(tetrahedra: Any, number_of_nodes: int, patches: np.ndarray) -> Patte
         row_nodes=jnp.asarray(row_nodes, jnp.int32),
         row_edges=jnp.asarray(row_edges, jnp.int32),
         edge_slots=jnp.asarray(slots, jnp.int32),
-        patches=jnp.asarray(patches, jnp.int32),
-        patch_sizes=jnp.asarray(np.bincount(patches), jnp.int32),
+        patches=jnp.asarray(near),
+        patch_functions=functions,
+        patch_width=widest,
+        number_of_patches=int(near.max(initial=0)) + 1,
     )
 
 
@@ -73,3 +84,13 @@ def patches(points: np.ndarray) -> np.ndarray:
     for k, nodes in enumerate(groups):
         number[nodes] = k
     return number
+
+
+def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    count = int(patch.max(initial=0)) + 1
+    low = jnp.full((count, 3), jnp.inf, points.dtype).at[patch].min(points)
+    high = jnp.full((count, 3), -jnp.inf, points.dtype).at[patch].max(points)
+    widest = jnp.max(high - low, axis=1)
+    half = jnp.where(widest > 0, widest / 2, 1.0)
+    place = (points - (low + high)[patch] / 2) / half[patch][:, None]
+    return jnp.concatenate([jnp.ones_like(place[:, :1]), place], axis=1), jnp.mean(widest)

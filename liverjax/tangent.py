@@ -1,15 +1,14 @@
 """The tangent of a scene's forces, from hand-derived blocks, and linear solves with it.
 
 What the scene has decides the matrix and the method: conjugate gradients, with the pressure of a fluid eliminated where
-there is one; BiCGSTAB where loads follow the body. All with the same
-preconditioner: the inverse diagonal blocks and, where slow motions hold them up, a coarse space.
+there is one; BiCGSTAB where loads follow the body. All with the same preconditioner: the inverse diagonal blocks and,
+where slow motions hold them up, a coarse space.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from liverjax import assembly, boundary, mjed, porosity, terms, viscosity
 from liverjax.assembly import BlockMatrix
@@ -96,9 +95,7 @@ def preconditioner(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Ar
     mask, inverse = setting.mask, K.inverse
 
     def fine(r):
-        r = mask * r.reshape(-1, 3)
-        columns = [sum(inverse[i][j] * r[:, j] for j in range(3)) for i in range(3)]
-        return (mask * jnp.stack(columns, axis=-1)).ravel()
+        return (mask * assembly.applied(inverse, mask * r.reshape(-1, 3))).ravel()
 
     return corrected(setting.scene.mesh, K.slow, mask, fine)
 

@@ -46,6 +46,14 @@ def test_differentiable_solve():
     assert np.isclose(jax.jvp(lambda s: f(s, b), (1.3,), (1.0,))[1], jax.grad(g)(1.3, b), rtol=1e-9)
 
 
+def test_a_wrong_solution_does_not_pass_for_one():
+    for solve in (
+        lambda: differentiable_solve(lambda v: -(A @ v), b, _none, 1e-13, 200),  # not positive definite
+        lambda: differentiable_solve(lambda v: A @ v, b, _none, 1e-13, 2),  # too few iterations
+    ):
+        assert np.isnan(solve()).all()
+
+
 def _solve(p, start=None, **options):
     """A x + p x^3 = b."""
     start = jnp.zeros_like(b) if start is None else start
