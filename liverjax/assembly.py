@@ -95,22 +95,22 @@ def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
 
 def applied(blocks: Block, v: jax.Array) -> jax.Array:
     """A block a node, m x m of (V,), times its part of v (V, m)."""
-    return jnp.stack([sum(entry * v[:, j] for j, entry in enumerate(row)) for row in blocks], axis=-1)
+    columns = [v[:, c] for c in range(v.shape[1])]
+    return jnp.stack([_row(row, columns) for row in blocks], axis=-1)
+
+
+def _row(entries: Any, columns: list[jax.Array]) -> jax.Array:
+    return sum(entry * column for entry, column in zip(entries, columns, strict=False))
 
 
 def product(A: BlockMatrix, v: jax.Array) -> jax.Array:
     """A v for v (V, k): the first k columns of its blocks, all of its rows."""
-    k = v.shape[1]
-    if len(A.rows) == 1:  # one neighbour after the other: the gather is never written out
-        p = v[:, 0]
-        total = A.diagonal[0][0] * p
-        for slot in range(A.nodes.shape[0]):
-            total = total + A.rows[0][0][slot] * p[A.nodes[slot]]
-        return total[:, None]
-    columns = [v[:, c] for c in range(k)]
-    near = [column[A.nodes] for column in columns]
-    result = []
-    for far, own in zip(A.rows, A.diagonal, strict=True):
-        total = jnp.sum(sum(far[c] * near[c] for c in range(k)), axis=0)
-        result.append(total + sum(own[c] * columns[c] for c in range(k)))
-    return jnp.stack(result, axis=-1)
+    columns = [v[:, c] for c in range(v.shape[1])]
+    start = tuple(_row(row, columns) for row in A.diagonal)
+
+    def add(slot, total):
+        near = [column[A.nodes[slot]] for column in columns]
+        return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
+
+    # One neighbour after the other, in a loop: what is gathered stays in cache.
+    return jnp.stack(jax.lax.fori_loop(0, A.nodes.shape[0], add, start), axis=-1)

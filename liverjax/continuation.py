@@ -6,6 +6,7 @@ jumped to. A part that fails is halved. Only the root at s = 1 counts, and deriv
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -33,17 +34,27 @@ class StepOptions(NamedTuple):
     linear_tolerance: float = 5e-2  # of a direction, the loosest
     one_step_tolerance: float = 1e-4  # of the one direction where there is but one iteration
     contraction: float = 0.15  # of |r| in an iteration; a tangent that does worse is made anew
+    wear: float = 1.2  # of the preconditioner: iterations a digit over those when it was new
     adjoint_tolerance: float = 1e-11
     max_linear_iterations: int = 3000
     max_halvings: int = 6
     max_cuts: int = 12
 
 
+class Kept(NamedTuple):
+    """A tangent that goes from step to step: good for the next one as long as iterations converge fast with it."""
+
+    tangent: Any
+    made: jax.Array  # False: there is none yet
+    pace: jax.Array  # linear iterations a digit, with its preconditioner when that was new
+    worn: jax.Array  # the preconditioner takes much longer by now
+
+
 class _Point(NamedTuple):
     q: jax.Array  # best point of the current part
     size: jax.Array  # |r| there
     aim: jax.Array  # |r| that the last direction was to remove
-    tangent: Any  # as last made
+    kept: Kept
     stale: jax.Array  # dq is of a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
@@ -77,148 +88,231 @@ class Method(NamedTuple):
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
+    #: tangent -> dr/dq as a function, where that is exact and symmetric: derivatives are then solved for with it.
+    product: Callable[[Any], Callable[[jax.Array], jax.Array]] | None = None
     #: Whether dr/dq is.
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
 
 
+def nothing_kept(method: Method, start: jax.Array) -> Kept:
+    """What the first of several steps is given."""
+    zero = jnp.zeros((), start.dtype)
+    made = jax.eval_shape(lambda q: method.tangent(q, zero, method.residual(q, zero)[2], None), start)
+    no = jnp.array(False)
+    return Kept(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made), no, zero, no)
+
+
 def solve(
-    method: Method, start: jax.Array, options: StepOptions = StepOptions(), guess: jax.Array | None = None
-) -> tuple[jax.Array, StepStatistics]:
-    """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative."""
+    method: Method,
+    start: jax.Array,
+    options: StepOptions = StepOptions(),
+    guess: jax.Array | None = None,
+    kept: Kept | None = None,
+) -> tuple[jax.Array, StepStatistics, Kept]:
+    """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative.
+
+    Returns the root, what it took, and the tangent for the next step; `kept` is that of the last.
+    """
     start = jax.lax.stop_gradient(start)
     guess = None if guess is None else jax.lax.stop_gradient(guess)
-    residual = method.residual
-
-    def iterate(_, start):
-        return _follow(method, start, guess, options)
-
-    def tangent_solve(linear, y):
-        begin = jnp.zeros((), start.dtype)
-        K = method.tangent(start, begin, jax.lax.stop_gradient(residual(start, begin)[2]), None)
-        limits = (options.adjoint_tolerance, options.max_linear_iterations)
-        return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric)
+    kept = nothing_kept(method, start) if kept is None else jax.lax.stop_gradient(kept)
+    one = jnp.ones((), start.dtype)
 
     def at_end(q):
-        return residual(q, jnp.ones((), q.dtype))[0]
+        return method.residual(q, one)[0]
 
-    root, statistics = jax.lax.custom_root(at_end, start, iterate, tangent_solve, has_aux=True)
-    counts = (n.astype(jnp.int32) for n in statistics[:4])
-    return root, StepStatistics(*counts, statistics.residual)
-
-
-def _follow(method, start, guess, options):
-    residual = method.residual
-    dtype = start.dtype
-    one = jnp.ones((), dtype)
-    loosest = options.one_step_tolerance if options.max_iterations == 1 else options.linear_tolerance
-
-    def along(q, s):
-        """dr/ds: how prescribed motion and loads change the residual."""
-        return jax.jvp(lambda s: residual(q, s)[0], (s,), (one,))[1]
-
-    def step(c: _Point) -> _Point:
-        trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
-        s = jnp.where(c.launch, c.s_begin, c.s)
-        r, force, by = residual(trial, s)
-        size = jnp.linalg.norm(r)
-        relative = size / jnp.where(force > 0, force, 1.0)
-        finite = jnp.isfinite(size) & jnp.isfinite(force)
-        better = finite & ((size < c.size) | c.first | c.remake) & ~c.launch
-        converged = better & (relative <= options.tolerance)
+    def follow(_, start):
         if options.max_iterations == 1:
-            converged = better
-        arrived = converged & (s >= 1)
-        # A direction of an earlier tangent that leads nowhere is not halved: the tangent is made anew first.
-        remake = ~better & ~c.launch & c.stale
-        halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
-        spent = (c.iterations >= options.max_iterations) | (halvings > options.max_halvings)
-        failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))
-        # A guess that leads nowhere costs no cut: the last equilibrium is next.
-        lost = c.guessing & (failed | (c.launch & ~finite))
-        cuts = c.cuts + (failed & ~lost)
-        launch_now = (c.launch & ~lost) | (converged & ~arrived)  # a new part begins at this very point
-        longer = jnp.minimum(2 * c.ds, 1 - s)
-        longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
-        ds = jnp.where(converged, longer, jnp.where(failed & ~lost, 0.5 * c.ds, c.ds))
-        hopeless = jnp.array(not method.moved) | (cuts > options.max_cuts)  # parts of nothing are all alike
-        done = arrived | (failed & ~lost & hopeless) | (c.launch & ~finite & ~lost)
-        go_on = (launch_now | better) & ~done & ~failed
-        load = -r
-        if method.moved:
-            load = load - jax.lax.cond(launch_now, lambda: ds * along(trial, s), lambda: jnp.zeros_like(r))
-        load = jnp.where(go_on, load, jnp.zeros_like(r))
-        aim = jnp.linalg.norm(load)
-        renew = launch_now | (go_on & (c.remake | (size > options.contraction * c.aim)))
-        near = (~launch_now, c.tangent)
-        K = jax.lax.cond(renew, lambda: method.tangent(trial, s, by, near), lambda: c.tangent)
-        # No direction is solved for beyond what it can remove (Eisenstat and Walker 1996), nor beyond the goal.
-        ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
-        reach = 0.3 * jnp.where(renew, ratio**2, ratio)
-        goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
-        forcing = jnp.where(launch_now, loosest, jnp.maximum(reach, jnp.maximum(goal, 1e-12)))
-        dq, linear = jax.lax.cond(
-            go_on,
-            lambda: method.solve(K, load, jnp.minimum(forcing, loosest), options.max_linear_iterations),
-            lambda: (jnp.zeros_like(r), jnp.zeros((), jnp.int32)),
-        )
-        accepted = better | launch_now
-        return _Point(
-            q=jnp.where(accepted, trial, c.q),
-            size=jnp.where(accepted, size, c.size),
-            aim=jnp.where(go_on, aim, c.aim),
-            tangent=K,
-            stale=jnp.where(go_on, ~renew, c.stale),
-            remake=remake,
-            dq=jnp.where(go_on, dq, c.dq),
-            t=jnp.where(go_on, 1.0, 0.5 * c.t),
-            s=jnp.where(launch_now, s + ds, s),
-            q_begin=jnp.where(lost, start, jnp.where(launch_now, trial, c.q_begin)),
-            guessing=c.guessing & ~lost & ~(converged & ~arrived),
-            s_begin=jnp.where(launch_now, s, c.s_begin),
-            ds=ds,
-            launch=failed | lost,
-            first=launch_now,
-            iterations=jnp.where(launch_now, 1, c.iterations + better),
-            halvings=halvings,
-            total=c.total + (go_on & ~arrived),
-            linear=c.linear + linear,
-            cuts=cuts,
-            relative=jnp.where(accepted | ~finite, relative, c.relative),
-            done=done,
-        )
+            return _one_iteration(method, start, kept, options)
+        return _follow(method, start, guess, kept, options)
 
-    zero, no = jnp.zeros((), jnp.int32), jnp.array(False)
-    made = jax.eval_shape(lambda q: method.tangent(q, 0 * one, residual(q, 0 * one)[2], None), start)
+    # Two rules: how the root was found has no derivative, and the root's own is by the tangent there.
+    q, aux = jax.lax.custom_root(at_end, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
+    statistics, kept = jax.lax.stop_gradient(aux)
+    q = jax.lax.stop_gradient(q)
+
+    def tangent_solve(linear, y):
+        K = method.tangent(q, one, jax.lax.stop_gradient(method.residual(q, one)[2]), None)
+        product = None if method.product is None else method.product(K)
+        limits = (options.adjoint_tolerance, options.max_linear_iterations)
+        return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric, product)
+
+    root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)
+    counts = (n.astype(jnp.int32) for n in statistics[:4])
+    return root, StepStatistics(*counts, statistics.residual), kept
+
+
+def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
+    """One linear solve from the step's beginning and no more, whatever comes out."""
+    zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
+    r, _, by = method.residual(start, zero)
+    load = -r - _along(method, start, zero) if method.moved else -r
+    dq, linear, kept = _direction(
+        method, options, kept, (start, zero, by), load, options.one_step_tolerance, True, True
+    )
+    q = start + dq
+    r, force, _ = method.residual(q, one)
+    relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
+    code = jnp.where(jnp.isfinite(relative), status.CONVERGED, status.NOT_FINITE)
+    counts = (code, one, linear, zero)
+    return q, (StepStatistics(*(jnp.asarray(n, start.dtype) for n in counts), relative), kept)
+
+
+def _follow(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
+    begin = _first_point(start, guess, kept)
+    end = jax.lax.while_loop(lambda c: ~c.done, partial(_iterate, method, options, start), begin)
+    failure = jnp.where(jnp.isfinite(end.relative), status.STALLED, status.NOT_FINITE)
+    code = jnp.where((end.s >= 1) & (end.relative <= options.tolerance), status.CONVERGED, failure)
+    counts = (code, end.total, end.linear, end.cuts)
+    return end.q, (StepStatistics(*(n.astype(start.dtype) for n in counts), end.relative), end.kept)
+
+
+def _first_point(start: jax.Array, guess: Any, kept: Kept) -> _Point:
+    zero, none, one, no = jnp.zeros((), start.dtype), jnp.zeros((), jnp.int32), jnp.ones((), start.dtype), False
     first = start if guess is None else guess
-    begin = _Point(
+    return _Point(
         q=first,
-        size=jnp.full((), jnp.inf, dtype),
-        aim=0 * one,
-        tangent=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made),
-        stale=no,
-        remake=no,
+        size=one * jnp.inf,
+        aim=zero,
+        kept=kept,
+        stale=jnp.array(no),
+        remake=jnp.array(no),
         dq=jnp.zeros_like(start),
         t=one,
-        s=0 * one,
+        s=zero,
         q_begin=first,
         guessing=jnp.array(guess is not None),
-        s_begin=0 * one,
+        s_begin=zero,
         ds=one,
         launch=jnp.array(True),
-        first=no,
-        iterations=zero,
-        halvings=zero,
-        total=zero,
-        linear=zero,
-        cuts=zero,
+        first=jnp.array(no),
+        iterations=none,
+        halvings=none,
+        total=none,
+        linear=none,
+        cuts=none,
         relative=one,
-        done=no,
+        done=jnp.array(no),
     )
-    end = jax.lax.while_loop(lambda c: ~c.done, step, begin)
-    good = (end.s >= 1) & ((end.relative <= options.tolerance) | (options.max_iterations == 1))
-    failure = jnp.where(jnp.isfinite(end.relative), status.STALLED, status.NOT_FINITE)
-    code = jnp.where(good & jnp.isfinite(end.relative), status.CONVERGED, failure)
-    counts = (code, end.total, end.linear, end.cuts)
-    return end.q, StepStatistics(*(n.astype(dtype) for n in counts), end.relative)
+
+
+class _Verdict(NamedTuple):
+    """What the residual at a trial point means."""
+
+    accepted: jax.Array  # the point is the best of its part so far, or the beginning of one
+    better: jax.Array
+    converged: jax.Array  # at the end of a part
+    arrived: jax.Array  # at the end of the last
+    remake: jax.Array
+    failed: jax.Array
+    lost: jax.Array  # a guess that leads nowhere: it costs no cut, the last equilibrium is next
+    launch_now: jax.Array  # a new part begins at this very point
+    go_on: jax.Array  # a direction is wanted
+    halvings: jax.Array
+    cuts: jax.Array
+    done: jax.Array
+
+
+def _judge(c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, method: Method, options: StepOptions):
+    finite = jnp.isfinite(size) & jnp.isfinite(relative)
+    # The first point of a part need not be better, if its direction was that of a tangent made there.
+    free = c.first & (~c.stale | (size < c.aim))
+    better = finite & ((size < c.size) | free | c.remake) & ~c.launch
+    converged = better & (relative <= options.tolerance)
+    arrived = converged & (s >= 1)
+    # A direction of an earlier tangent that leads nowhere is not halved: the tangent is made anew first.
+    remake = ~better & ~c.launch & c.stale
+    halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
+    spent = (c.iterations >= options.max_iterations) | (halvings > options.max_halvings)
+    failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))
+    lost = c.guessing & (failed | (c.launch & ~finite))
+    cuts = c.cuts + (failed & ~lost)
+    launch_now = (c.launch & ~lost) | (converged & ~arrived)
+    hopeless = jnp.array(not method.moved) | (cuts > options.max_cuts)  # parts of nothing are all alike
+    done = arrived | (failed & ~lost & hopeless) | (c.launch & ~finite & ~lost)
+    return _Verdict(
+        accepted=better | launch_now,
+        better=better,
+        converged=converged,
+        arrived=arrived,
+        remake=remake,
+        failed=failed,
+        lost=lost,
+        launch_now=launch_now,
+        go_on=(launch_now | better) & ~done & ~failed,
+        halvings=halvings,
+        cuts=cuts,
+        done=done,
+    )
+
+
+def _iterate(method: Method, options: StepOptions, start: jax.Array, c: _Point) -> _Point:
+    """One evaluation of the residual, and a direction where one is wanted."""
+    trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
+    s = jnp.where(c.launch, c.s_begin, c.s)
+    r, force, by = method.residual(trial, s)
+    size = jnp.linalg.norm(r)
+    relative = size / jnp.where(force > 0, force, 1.0)
+    v = _judge(c, s, size, relative, method, options)
+    longer = jnp.minimum(2 * c.ds, 1 - s)
+    longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
+    ds = jnp.where(v.converged, longer, jnp.where(v.failed & ~v.lost, 0.5 * c.ds, c.ds))
+    load = -r
+    if method.moved:
+        load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(method, trial, s), lambda: jnp.zeros_like(r))
+    slow = c.remake | (size > options.contraction * c.aim)
+    renew = (v.launch_now & (method.moved | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
+    # No direction is solved for beyond what it can remove (Eisenstat and Walker 1996), nor beyond the goal.
+    ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
+    reach = 0.3 * jnp.where(renew, ratio**2, ratio)
+    goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
+    forcing = jnp.where(v.launch_now, options.linear_tolerance, jnp.maximum(reach, jnp.maximum(goal, 1e-12)))
+    forcing = jnp.minimum(forcing, options.linear_tolerance)
+    dq, linear, kept = _direction(method, options, c.kept, (trial, s, by), load, forcing, renew, v.go_on)
+    return _Point(
+        q=jnp.where(v.accepted, trial, c.q),
+        size=jnp.where(v.accepted, size, c.size),
+        aim=jnp.where(v.go_on, jnp.linalg.norm(load), c.aim),
+        kept=kept,
+        stale=jnp.where(v.go_on, ~renew, c.stale),
+        remake=v.remake,
+        dq=jnp.where(v.go_on, dq, c.dq),
+        t=jnp.where(v.go_on, 1.0, 0.5 * c.t),
+        s=jnp.where(v.launch_now, s + ds, s),
+        q_begin=jnp.where(v.lost, start, jnp.where(v.launch_now, trial, c.q_begin)),
+        guessing=c.guessing & ~v.lost & ~(v.converged & ~v.arrived),
+        s_begin=jnp.where(v.launch_now, s, c.s_begin),
+        ds=ds,
+        launch=v.failed | v.lost,
+        first=v.launch_now,
+        iterations=jnp.where(v.launch_now, 1, c.iterations + v.better),
+        halvings=v.halvings,
+        total=c.total + (v.go_on & ~v.arrived),
+        linear=c.linear + linear,
+        cuts=v.cuts,
+        relative=jnp.where(v.accepted | ~jnp.isfinite(relative), relative, c.relative),
+        done=v.done,
+    )
+
+
+def _along(method: Method, q: jax.Array, s: jax.Array) -> jax.Array:
+    """dr/ds: how prescribed motion and loads change the residual."""
+    return jax.jvp(lambda s: method.residual(q, s)[0], (s,), (jnp.ones_like(s),))[1]
+
+
+def _direction(
+    method: Method, options: StepOptions, kept: Kept, at: Any, load: jax.Array, forcing: Any, renew: Any, wanted: Any
+) -> tuple[jax.Array, jax.Array, Kept]:
+    """Solution of dr/dq dq = load to `forcing`, the linear iterations for it, and the tangent it is of."""
+    near = (kept.made & ~kept.worn, kept.tangent)
+    K = jax.lax.cond(renew, lambda: method.tangent(*at, near), lambda: kept.tangent)
+    dq, linear = jax.lax.cond(
+        wanted,
+        lambda: method.solve(K, load, forcing, options.max_linear_iterations),
+        lambda: (jnp.zeros_like(load), jnp.zeros((), jnp.int32)),
+    )
+    pace = linear / -jnp.log10(forcing)
+    first = jnp.where(renew & ~near[0], pace, kept.pace)
+    return dq, linear, Kept(K, kept.made | renew, first, jnp.where(wanted, pace > options.wear * first, kept.worn))

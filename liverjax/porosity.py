@@ -206,9 +206,8 @@ def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
 def with_flow(mesh: TetMesh, flow: Flow, A: assembly.BlockMatrix, both: jax.Array) -> jax.Array:
     """Forces (V, 3) of a motion that moves the fluid too, from `both` (V, 4) = A (dx, 0) of the `coupled` matrix A."""
     dP = nearly_solved(mesh, flow, both[:, 3])
-    near = dP[A.nodes]
-    pull = [jnp.sum(A.rows[r][3] * near, axis=0) + A.diagonal[r][3] * dP for r in range(3)]
-    return both[:, :3] + jnp.stack(pull, axis=-1)
+    last = [tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal)]
+    return both[:, :3] + assembly.product(assembly.BlockMatrix(*last, A.nodes), dP[:, None])
 
 
 def undrained_diagonal(A: assembly.BlockMatrix, flow: Flow) -> assembly.Block:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax import boundary, continuation, mjed, porosity, status, tangent, terms, viscosity
-from liverjax.continuation import StepOptions, StepStatistics
+from liverjax.continuation import Kept, StepOptions, StepStatistics
 from liverjax.errors import InputError
 from liverjax.kinematics import add_matrices, deformation_gradient, determinant
 from liverjax.scene import Scene, check_choices
@@ -81,121 +81,146 @@ def unit_strain_force(scene: Scene) -> jax.Array:
     return jax.lax.stop_gradient(jnp.linalg.norm(force))
 
 
-def step(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> tuple[State, jax.Array, StepStatistics]:
-    """Step k = 1 … steps: the next state, the reactions (V, 3) [N] and what the solve took.
+class Equations(NamedTuple):
+    """The equations of one step and what is constant during it; parts that the scene lacks are None."""
 
-    `stiff` is `unit_strain_force(scene)`, the same for every step.
-    """
+    scene: Scene
+    state: State
+    k: Any  # number of the step, from 1
+    mask: jax.Array  # (V, 3) 1 where free
+    loads: jax.Array  # (V, 3) [N] dead
+    noise: Any  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
+    mass: jax.Array | None  # (V,) [kg]
+    memory: viscosity.Recall | None
+    flow: porosity.Flow | None  # where a fluid's pressure depends on where the step ends
+    pressure: jax.Array | None  # (V,) [Pa] where it does not: solved for once
+
+
+def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> Equations:
+    """The equations of step k = 1 … steps from `state`; `stiff` is `unit_strain_force(scene)`, the same for all."""
     stiff = unit_strain_force(scene) if stiff is None else stiff
-    mesh, sponge, solve = scene.mesh, scene.porosity, scene.solve
-    law = porosity.law_in_force(sponge, scene.law)
-    dtype = mesh.points.dtype
-    dt = solve.dt
-    mask = boundary.free_degrees(mesh, scene.fixed, scene.displaced)
-    loads = _loads(scene)
-    memory = None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt)
-    mass = scene.body.density * boundary.nodal_volumes(mesh) if state.velocity is not None else None
-    moving, follows = len(scene.displaced) > 0, boundary.follows(scene.traction)
-    ramped = dt is None
-    # Below this, forces are roundoff: an unloaded equilibrium has converged.
-    noise = 20 * float(np.finfo(np.float64).eps) / solve.tolerance * stiff
-    flow = None
+    mesh, sponge, dt = scene.mesh, scene.porosity, scene.solve.dt
+    flow = pressure = None
     if sponge is not None:
-        F_begin = deformation_gradient(mesh, state.x)
-        flow = porosity.flow(sponge, mesh, state.fluid, F_begin, dt, 1e-2 * solve.tolerance)
+        F = deformation_gradient(mesh, state.x)
+        flow = porosity.flow(sponge, mesh, state.fluid, F, dt, 1e-2 * scene.solve.tolerance)
+        if sponge.scheme != "implicit":
+            pressure, flow = porosity.pressure(sponge, mesh, state.fluid, flow, determinant(F)), None
+    return Equations(
+        scene=scene,
+        state=state,
+        k=k,
+        mask=boundary.free_degrees(mesh, scene.fixed, scene.displaced),
+        loads=_loads(scene),
+        noise=20 * float(np.finfo(np.float64).eps) / scene.solve.tolerance * stiff,
+        mass=None if state.velocity is None else scene.body.density * boundary.nodal_volumes(mesh),
+        memory=None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt),
+        flow=flow,
+        pressure=pressure,
+    )
 
-    def fluid_pressure(F):
-        return porosity.pressure(sponge, mesh, state.fluid, flow, determinant(F))
 
-    # The chapter's pressure does not depend on where the step ends: solved for once.
-    known = None if sponge is None or sponge.scheme == "implicit" else fluid_pressure(F_begin)
+def _acting(e: Equations, s: Any) -> Any:
+    """Part of the loads that acts: they grow with the load steps, or quasi-statically within the first step."""
+    if e.scene.solve.dt is None:
+        return (e.k - 1 + s) / e.scene.solve.steps
+    dtype = e.loads.dtype
+    return jnp.ones((), dtype) if e.mass is not None else jnp.where(e.k == 1, s, 1.0).astype(dtype)
 
-    def acting(s):
-        """Part of the loads that acts: they grow with the load steps, or quasi-statically within the first step."""
-        if ramped:
-            return (k - 1 + s) / solve.steps
-        return jnp.ones((), dtype) if mass is not None else jnp.where(k == 1, s, 1.0).astype(dtype)
 
-    def conditions(s):
-        """Positions of held degrees of freedom (V, 3), 0 elsewhere, and dead loads at part s of the step."""
-        held = mesh.points
-        if moving:
-            # Straight from beginning to end: a history may bend within the step, and only its end counts.
-            before, after = (
-                boundary.prescribed(mesh, scene.displaced, 0.0 if dt is None else dt * n, n / solve.steps)
-                for n in (k - 1, k)
+def _positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
+    """Positions (V, 3) of unknowns q (3 V,) and of what is held at part s of the step."""
+    held, solve = e.scene.mesh.points, e.scene.solve
+    if e.scene.displaced:
+        # Straight from beginning to end: a history may bend within the step, and only its end counts.
+        before, after = (
+            boundary.prescribed(
+                e.scene.mesh, e.scene.displaced, 0.0 if solve.dt is None else solve.dt * n, n / solve.steps
             )
-            held = held + before + s * (after - before)
-        return (1 - mask) * held, acting(s) * loads
+            for n in (e.k - 1, e.k)
+        )
+        held = held + before + s * (after - before)
+    return e.mask * q.reshape(-1, 3) + (1 - e.mask) * held
 
-    def positions(q, s):
-        return mask * q.reshape(-1, 3) + conditions(s)[0]
 
-    def forces(q, s):
-        """Internal, inertial and outer forces (V, 3), and the fluid's pressure."""
-        x = positions(q, s)
-        F = deformation_gradient(mesh, x)
-        P = terms.first_piola(law, F) if memory is None else viscosity.first_piola(scene.viscosity, memory, law, F)
-        fluid = None
-        if sponge is not None:
-            fluid = fluid_pressure(F) if known is None else known
-            P = add_matrices(P, porosity.first_piola(sponge, mesh, fluid, F))
-        internal = mjed.nodal_force(mesh, P)
-        inertial = None if mass is None else mass[:, None] * _motion(solve.integrator, state, x, dt, mask)[1]
-        outer = conditions(s)[1]
-        if follows:
-            outer = outer + acting(s) * boundary.follower_forces(scene.traction, x)
-        return internal, inertial, outer, fluid
+def _forces(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array | None, jax.Array, jax.Array | None]:
+    """Internal, inertial and outer forces (V, 3), and the fluid's pressure."""
+    scene = e.scene
+    law = porosity.law_in_force(scene.porosity, scene.law)
+    x = _positions(e, q, s)
+    F = deformation_gradient(scene.mesh, x)
+    P = terms.first_piola(law, F) if e.memory is None else viscosity.first_piola(scene.viscosity, e.memory, law, F)
+    fluid = e.pressure
+    if scene.porosity is not None:
+        if e.flow is not None:
+            fluid = porosity.pressure(scene.porosity, scene.mesh, e.state.fluid, e.flow, determinant(F))
+        P = add_matrices(P, porosity.first_piola(scene.porosity, scene.mesh, fluid, F))
+    outer = _acting(e, s) * e.loads
+    if boundary.follows(scene.traction):
+        outer = outer + _acting(e, s) * boundary.follower_forces(scene.traction, x)
+    inertial = None if e.mass is None else e.mass[:, None] * _motion(e, x)[1]
+    return mjed.nodal_force(scene.mesh, P), inertial, outer, fluid
 
-    def residual(q, s):
-        internal, inertial, load, fluid = forces(q, s)
-        total = internal - load if inertial is None else internal + inertial - load
-        at_work = noise + jnp.linalg.norm(internal) + jnp.linalg.norm(load)
-        if inertial is not None:
-            at_work = at_work + jnp.linalg.norm(inertial)
-        return (mask * total).ravel(), jax.lax.stop_gradient(at_work), fluid
 
-    inertia = None if mass is None else {"euler": 1.0, "newmark": 4.0}[solve.integrator] / dt**2 * mass
+def _residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, Any]:
+    """Out of balance forces (3 V,), the size of the forces at work, and the fluid's pressure."""
+    internal, inertial, outer, fluid = _forces(e, q, s)
+    at_work = e.noise + jnp.linalg.norm(internal) + jnp.linalg.norm(outer)
+    if inertial is not None:
+        at_work = at_work + jnp.linalg.norm(inertial)
+    total = internal - outer if inertial is None else internal + inertial - outer
+    return (e.mask * total).ravel(), jax.lax.stop_gradient(at_work), fluid
 
-    setting = tangent.Setting(scene, memory, flow if known is None else None, inertia, mask)
-    method = continuation.Method(
-        residual=residual,
-        tangent=lambda q, s, fluid, near: tangent.tangent(setting, fluid, positions(q, s), acting(s), near),
+
+def _method(e: Equations) -> continuation.Method:
+    solve, follows = e.scene.solve, boundary.follows(e.scene.traction)
+    inertia = None if e.mass is None else {"euler": 1.0, "newmark": 4.0}[solve.integrator] / solve.dt**2 * e.mass
+    setting = tangent.Setting(e.scene, e.memory, e.flow, inertia, e.mask)
+    return continuation.Method(
+        residual=partial(_residual, e),
+        tangent=lambda q, s, fluid, near: tangent.tangent(setting, fluid, _positions(e, q, s), _acting(e, s), near),
         solve=partial(tangent.solve, setting),
         preconditioner=partial(tangent.preconditioner, setting),
+        product=None if follows or e.flow is not None else partial(tangent.product, setting),
         symmetric=not follows,
-        moved=moving or mass is None,
+        moved=len(e.scene.displaced) > 0 or e.mass is None,
     )
+
+
+def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
+    """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step."""
+    scene, state, solve = e.scene, e.state, e.scene.solve
     options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
     guess = None
-    if mass is not None and not moving and solve.newton_iterations > 1:
-        guess = (mask * (state.x + dt * state.velocity)).ravel()  # straight on; one iteration starts at x, as printed
-    q, statistics = continuation.solve(method, (mask * state.x).ravel(), options, guess)
-    one = jnp.ones((), dtype)
-    x = positions(q, one)
-    internal, inertial, load, pressed = forces(q, one)
-    reactions = (1 - mask) * (internal - load if inertial is None else internal + inertial - load)
-    velocity, acceleration = (None, None) if mass is None else _motion(solve.integrator, state, x, dt, mask)
+    if e.mass is not None and not scene.displaced and solve.newton_iterations > 1:
+        # Straight on; one iteration starts at x, as printed.
+        guess = (e.mask * (state.x + solve.dt * state.velocity)).ravel()
+    q, statistics, kept = continuation.solve(_method(e), (e.mask * state.x).ravel(), options, guess, kept)
+    one = jnp.ones((), state.x.dtype)
+    x = _positions(e, q, one)
+    internal, inertial, outer, fluid = _forces(e, q, one)
+    reactions = (1 - e.mask) * (internal - outer if inertial is None else internal + inertial - outer)
+    velocity, acceleration = (None, None) if e.mass is None else _motion(e, x)
     if state.acceleration is None:
         acceleration = None
-    history, fluid = None, None
-    if memory is not None or sponge is not None:
-        F = deformation_gradient(mesh, x)
-    if memory is not None:
-        history = viscosity.advance(scene.viscosity, state.history, law, F, dt)
-    if sponge is not None:
-        fluid = porosity.advance(sponge, state.fluid, pressed, F)
-    return State(x, velocity, acceleration, history, fluid), reactions, statistics
+    history, F = None, deformation_gradient(scene.mesh, x)
+    if e.memory is not None:
+        law = porosity.law_in_force(scene.porosity, scene.law)
+        history = viscosity.advance(scene.viscosity, state.history, law, F, solve.dt)
+    if scene.porosity is not None:
+        fluid = porosity.advance(scene.porosity, state.fluid, fluid, F)
+    return State(x, velocity, acceleration, history, fluid), reactions, statistics, kept
 
 
-def _motion(integrator: str, state: State, x: jax.Array, dt: Any, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _motion(e: Equations, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Velocity and acceleration at the end of the step: implicit Euler, or Newmark's average acceleration."""
+    state, dt = e.state, e.scene.solve.dt
     velocity = (x - state.x) / dt
     acceleration = (velocity - state.velocity) / dt
-    if integrator == "newmark":
+    if e.scene.solve.integrator == "newmark":
         # Free degrees only: where motion is prescribed the average acceleration would swing without end.
         average = 4 * acceleration - state.acceleration
-        free = mask > 0
+        free = e.mask > 0
         velocity = jnp.where(free, state.velocity + 0.5 * dt * (state.acceleration + average), velocity)
         acceleration = jnp.where(free, average, acceleration)
     return velocity, acceleration
@@ -206,8 +231,9 @@ def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
     steps = scene.solve.steps
     dtype = scene.mesh.points.dtype
 
-    def advance(state, k):
-        new, reactions, statistics = step(scene, state, k, stiff)
+    def advance(carry, k):
+        state, kept = carry
+        new, reactions, statistics, kept = step(equations(scene, state, k, stiff), kept)
         # A state that is not finite spoils nothing further: the run stays where it last was.
         finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
         good = finite & (statistics.status != status.NOT_FINITE)
@@ -216,10 +242,12 @@ def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
         P = None if new.fluid is None else new.fluid.pressure
         if report is not None:
             jax.debug.callback(report, k)
-        return new, (new.x, jnp.where(good, reactions, 0.0), P, statistics)
+        return (new, kept._replace(made=kept.made & good)), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
     numbers, stiff = jnp.arange(1, steps + 1, dtype=dtype), unit_strain_force(scene)
-    _, (x, reactions, P, statistics) = jax.lax.scan(advance, initial_state(scene), numbers)
+    start = initial_state(scene)
+    kept = continuation.nothing_kept(_method(equations(scene, start, numbers[0], stiff)), start.x.ravel())
+    _, (x, reactions, P, statistics) = jax.lax.scan(advance, (start, kept), numbers)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status
     return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)

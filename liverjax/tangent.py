@@ -100,13 +100,11 @@ def preconditioner(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Ar
     return corrected(setting.scene.mesh, K.slow, mask, fine)
 
 
-def solve(
-    setting: Setting, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
-) -> tuple[jax.Array, jax.Array]:
-    """Solution of K dq = b and the iterations it took, flat vectors (3 V,)."""
+def product(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
+    """K as a function of flat vectors (3 V,); where pressure depends on motion, that of a nearly solved pressure."""
     A, mask, loads = K.matrix, setting.mask, setting.scene.traction
 
-    def matvec(v):
+    def apply(v):
         dx = mask * v.reshape(-1, 3)
         force = assembly.product(A, dx)
         if setting.flow is not None:
@@ -115,6 +113,13 @@ def solve(
             force = force - jax.jvp(lambda x: K.at * boundary.follower_forces(loads, x), (K.x,), (dx,))[1]
         return (mask * force).ravel()
 
+    return apply
+
+
+def solve(
+    setting: Setting, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
+) -> tuple[jax.Array, jax.Array]:
+    """Solution of K dq = b and the iterations it took, flat vectors (3 V,)."""
     method = conjugate_gradients if K.x is None else stabilised_biconjugate_gradients
-    dq, s = method(matvec, b, preconditioner(setting, K), tolerance, max_iterations)
+    dq, s = method(product(setting, K), b, preconditioner(setting, K), tolerance, max_iterations)
     return dq, s.iterations

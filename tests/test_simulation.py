@@ -11,7 +11,7 @@ import liverjax as lj
 from liverjax import boundary, continuation, mjed, status
 from liverjax.continuation import StepOptions
 from liverjax.linear import conjugate_gradients
-from liverjax.simulation import initial_state, step
+from liverjax.simulation import equations, initial_state, step
 from liverjax.struct import replace
 
 TABLE_2 = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
@@ -62,7 +62,7 @@ def test_patch_test_is_exact():
 
     method = continuation.Method(residual, lambda q, s, *_: q, solved, lambda _: lambda r: r)
     options = StepOptions(tolerance=1e-13)
-    q, statistics = jax.jit(lambda q: continuation.solve(method, q, options))((mask * start).ravel())
+    q, statistics, _ = jax.jit(lambda q: continuation.solve(method, q, options))((mask * start).ravel())
     assert int(statistics.status) == status.CONVERGED
     assert np.abs(np.asarray(q).reshape(-1, 3)[inner] - x[inner]).max() < 1e-11 * 0.1
 
@@ -132,7 +132,7 @@ def march(scene: lj.Scene, runs: tuple[int, ...], duration: float) -> list:
 
     @jax.jit
     def advance(state, k, dt):
-        state, reactions, statistics = step(replace(scene, solve=replace(scene.solve, dt=dt)), state, k)
+        state, reactions, statistics, _ = step(equations(replace(scene, solve=replace(scene.solve, dt=dt)), state, k))
         return state, reactions, statistics.status
 
     results = []
@@ -172,7 +172,7 @@ def test_implicit_euler_only_dissipates():
         solve=lj.Solve(kind="dynamic", steps=1, dt=0.01),
     )
     mass = 1060.0 * np.asarray(boundary.nodal_volumes(mesh))
-    advance = jax.jit(lambda state, k: step(scene, state, k)[0])
+    advance = jax.jit(lambda state, k: step(equations(scene, state, k))[0])
 
     def energy(state):
         kinetic = 0.5 * np.sum(mass[:, None] * np.asarray(state.velocity) ** 2)
