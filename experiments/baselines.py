@@ -25,12 +25,15 @@ def critical_step(scene: lj.Scene) -> jax.Array:
     A = tangent.stiffness(scene, None, None, None, scene.mesh.points)
     mask = boundary.free_degrees(scene.mesh, scene.fixed, ())
 
+    def stiffness(v):
+        return jnp.stack(assembly.product(A, v.T), axis=-1)
+
     def iterate(_, v):
-        w = mask * assembly.product(A, mask * v) / mass
+        w = mask * stiffness(mask * v) / mass
         return w / jnp.linalg.norm(w)
 
     v = jax.lax.fori_loop(0, 200, iterate, mask * jax.random.normal(jax.random.key(0), mask.shape))
-    return 2 / jnp.sqrt(jnp.vdot(v, mask * assembly.product(A, v) / mass))
+    return 2 / jnp.sqrt(jnp.vdot(v, mask * stiffness(v) / mass))
 
 
 def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
@@ -98,14 +101,14 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
         inverse = assembly.inverse_blocks(A.diagonal, mask)
 
         def precondition(r):
-            return assembly.applied(inverse, r.reshape(-1, 3)).ravel()
+            return jnp.concatenate(assembly.applied(inverse, assembly.columns(r)))
 
         def matvec(u):
-            return (mask * assembly.product(A, mask * u.reshape(-1, 3))).ravel()
+            return mask.T.ravel() * jnp.concatenate(assembly.product(A, assembly.columns(mask.T.ravel() * u)))
 
         b = mask * (weight - force + mass * v / dt)
-        dx, _ = conjugate_gradients(matvec, b.ravel(), precondition, 1e-4, 2000)
-        dx = dx.reshape(-1, 3)
+        dx, _ = conjugate_gradients(matvec, assembly.flat(b), precondition, 1e-4, 2000)
+        dx = jnp.stack(assembly.columns(dx), axis=-1)
         return (x + dx, dx / dt), x + dx
 
     return jax.lax.scan(advance, (mesh.points, jnp.zeros_like(mesh.points)), length=steps)[1]

@@ -4,6 +4,7 @@ Only the blocks of edges are scattered, each once: a matrix of forces that do no
 diagonal blocks as minus the sum of its rows, and what else stands there is given.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -93,24 +94,31 @@ def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
     )
 
 
-def applied(blocks: Block, v: jax.Array) -> jax.Array:
-    """A block a node, m x m of (V,), times its part of v (V, m)."""
-    columns = [v[:, c] for c in range(v.shape[1])]
-    return jnp.stack([_row(row, columns) for row in blocks], axis=-1)
+def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """A block a node, m x k of (V,), times its part of the vector with these k columns (V,)."""
+    return tuple(_row(row, columns) for row in blocks)
 
 
-def _row(entries: Any, columns: list[jax.Array]) -> jax.Array:
-    return sum(entry * column for entry, column in zip(entries, columns, strict=False))
-
-
-def product(A: BlockMatrix, v: jax.Array) -> jax.Array:
-    """A v for v (V, k): the first k columns of its blocks, all of its rows."""
-    columns = [v[:, c] for c in range(v.shape[1])]
-    start = tuple(_row(row, columns) for row in A.diagonal)
+def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """A v as columns (V,), for the k columns (V,) of v: the first k columns of the blocks, all of their rows."""
 
     def add(slot, total):
         near = [column[A.nodes[slot]] for column in columns]
         return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
 
     # One neighbour after the other, in a loop: what is gathered stays in cache.
-    return jnp.stack(jax.lax.fori_loop(0, A.nodes.shape[0], add, start), axis=-1)
+    return jax.lax.fori_loop(0, A.nodes.shape[0], add, applied(A.diagonal, columns))
+
+
+def _row(entries: Any, columns: Sequence[jax.Array]) -> jax.Array:
+    return sum(entry * column for entry, column in zip(entries, columns, strict=False))
+
+
+def columns(vector: jax.Array) -> tuple[jax.Array, ...]:
+    """x, y and z (V,) of a flat vector (3 V,), in which all x come first."""
+    return tuple(vector.reshape(3, -1))
+
+
+def flat(field: jax.Array) -> jax.Array:
+    """The flat vector (3 V,) of a field (V, 3)."""
+    return field.T.ravel()

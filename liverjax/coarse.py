@@ -4,7 +4,7 @@ Block-Jacobi removes short waves; the motions that vary slowly over the body are
 added, are a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +12,9 @@ import jax.numpy as jnp
 
 from liverjax.assembly import BlockMatrix
 from liverjax.mesh import TetMesh
+
+#: A vector, one array (V,) a component.
+Columns = Sequence[jax.Array]
 
 
 class Coarse(NamedTuple):
@@ -54,32 +57,32 @@ def worthwhile(A: BlockMatrix, inertia: Any) -> Any:
     return jnp.sum(inertia) < total / 30
 
 
-def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    """Z (Z^T A Z)^-1 Z^T as a function of (V, m), Z the coarse motions."""
-    f, patch = mesh.pattern.patch_functions, mesh.pattern.patches
-    m, number = mask.shape[1], mesh.pattern.number_of_patches
+def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Columns], Columns]:
+    """Z (Z^T A Z)^-1 Z^T, Z the coarse motions, as a function of a vector's m columns (V,); `mask` is (V, m)."""
+    f, patch = mesh.pattern.patch_functions.T, mesh.pattern.patches
+    masks, number = mask.T, mesh.pattern.number_of_patches
+    m = len(masks)
 
-    def apply(r):
-        weighted = (f[:, :, None] * (mask * r)[:, None, :]).reshape(-1, 4 * m)
-        sums = jnp.zeros((number, 4 * m), r.dtype).at[patch].add(weighted)
+    def apply(columns):
+        weighted = jnp.stack([fk * free * r for fk in f for free, r in zip(masks, columns, strict=True)], axis=-1)
+        sums = jnp.zeros((number, 4 * m), weighted.dtype).at[patch].add(weighted)
         motion = (coarse.inverse @ sums.ravel()).reshape(number, 4, m)
         # Written out: a sum over an axis of four costs XLA:CPU more than all the rest.
-        columns = [sum(f[:, k] * motion[:, k, i][patch] for k in range(4)) for i in range(m)]
-        return mask * jnp.stack(columns, axis=-1)
+        return tuple(masks[i] * sum(f[k] * motion[:, k, i][patch] for k in range(4)) for i in range(m))
 
     return apply
 
 
 def corrected(
-    mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[jax.Array], jax.Array]
-) -> Callable[[jax.Array], jax.Array]:
-    """The preconditioner `fine` of flat vectors (3 V,) with the coarse solution added where it is used."""
+    mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[Columns], Columns]
+) -> Callable[[Columns], Columns]:
+    """The preconditioner `fine` of columns with the coarse solution added where it is used."""
     apply = correction(mesh, coarse, mask)
 
-    def add(r):
-        return apply(r.reshape(-1, 3)).ravel()
+    def both(columns):
+        return tuple(a + b for a, b in zip(fine(columns), apply(columns), strict=True))
 
-    return lambda r: fine(r) + jax.lax.cond(coarse.used, add, jnp.zeros_like, r)
+    return lambda columns: jax.lax.cond(coarse.used, both, fine, columns)
 
 
 def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:

@@ -35,7 +35,7 @@ class StepOptions(NamedTuple):
     one_step_tolerance: float = 1e-4  # of the one direction where there is but one iteration
     contraction: float = 0.15  # of |r| in an iteration; a tangent that does worse is made anew
     wear: float = 1.2  # of the preconditioner: iterations a digit over those when it was new
-    adjoint_tolerance: float = 1e-11
+    adjoint: float = 1e-2  # tolerance of the solves that carry derivatives, over `tolerance`
     max_linear_iterations: int = 3000
     max_halvings: int = 6
     max_cuts: int = 12
@@ -136,7 +136,7 @@ def solve(
     def tangent_solve(linear, y):
         K = method.tangent(q, one, jax.lax.stop_gradient(method.residual(q, one)[2]), None)
         product = None if method.product is None else method.product(K)
-        limits = (options.adjoint_tolerance, options.max_linear_iterations)
+        limits = (max(options.adjoint * options.tolerance, 1e-13), options.max_linear_iterations)
         return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric, product)
 
     root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)

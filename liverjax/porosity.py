@@ -165,14 +165,14 @@ def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end:
 
     def apply(p):
         # A unit row where drained: adjoint loads need not vanish there.
-        Ap = assembly.product(flow.matrix, (flow.mask * p)[:, None])[:, 0]
+        (Ap,) = assembly.product(flow.matrix, (flow.mask * p,))
         return flow.mask * Ap + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
     slow = coarse.correction(mesh, flow.slow, flow.mask[:, None])
 
     def precondition(r):
-        return r / diagonal + slow(r[:, None])[:, 0]
+        return r / diagonal + slow((r,))[0]
 
     return differentiable_solve(apply, rhs, precondition, flow.tolerance, 2000)
 
@@ -192,10 +192,10 @@ def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     exact = coarse.correction(mesh, flow.slow, flow.mask[:, None])
 
     def apply(p):
-        return flow.mask * assembly.product(A, p[:, None])[:, 0]
+        return flow.mask * assembly.product(A, (p,))[0]
 
     def slow(r):
-        return exact(r[:, None])[:, 0]
+        return exact((r,))[0]
 
     b = flow.mask * b
     at_once = slow(b)
@@ -203,11 +203,13 @@ def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     return at_once + p - slow(apply(p))
 
 
-def with_flow(mesh: TetMesh, flow: Flow, A: assembly.BlockMatrix, both: jax.Array) -> jax.Array:
-    """Forces (V, 3) of a motion that moves the fluid too, from `both` (V, 4) = A (dx, 0) of the `coupled` matrix A."""
-    dP = nearly_solved(mesh, flow, both[:, 3])
+def with_flow(mesh: TetMesh, flow: Flow, A: assembly.BlockMatrix, both: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of a motion that moves the fluid too, from `both` = A (dx, 0) of the `coupled` matrix A."""
+    *forces, balance = both
+    dP = nearly_solved(mesh, flow, balance)
     last = [tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal)]
-    return both[:, :3] + assembly.product(assembly.BlockMatrix(*last, A.nodes), dP[:, None])
+    pull = assembly.product(assembly.BlockMatrix(*last, A.nodes), (dP,))
+    return tuple(f + p for f, p in zip(forces, pull, strict=True))
 
 
 def undrained_diagonal(A: assembly.BlockMatrix, flow: Flow) -> assembly.Block:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax import boundary, continuation, mjed, porosity, status, tangent, terms, viscosity
+from liverjax.assembly import columns, flat
 from liverjax.continuation import Kept, StepOptions, StepStatistics
 from liverjax.errors import InputError
 from liverjax.kinematics import add_matrices, deformation_gradient, determinant
@@ -140,7 +141,7 @@ def _positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
             for n in (e.k - 1, e.k)
         )
         held = held + before + s * (after - before)
-    return e.mask * q.reshape(-1, 3) + (1 - e.mask) * held
+    return e.mask * jnp.stack(columns(q), axis=-1) + (1 - e.mask) * held
 
 
 def _forces(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array | None, jax.Array, jax.Array | None]:
@@ -169,7 +170,7 @@ def _residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array,
     if inertial is not None:
         at_work = at_work + jnp.linalg.norm(inertial)
     total = internal - outer if inertial is None else internal + inertial - outer
-    return (e.mask * total).ravel(), jax.lax.stop_gradient(at_work), fluid
+    return flat(e.mask * total), jax.lax.stop_gradient(at_work), fluid
 
 
 def _method(e: Equations) -> continuation.Method:
@@ -194,8 +195,8 @@ def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, Step
     guess = None
     if e.mass is not None and not scene.displaced and solve.newton_iterations > 1:
         # Straight on; one iteration starts at x, as printed.
-        guess = (e.mask * (state.x + solve.dt * state.velocity)).ravel()
-    q, statistics, kept = continuation.solve(_method(e), (e.mask * state.x).ravel(), options, guess, kept)
+        guess = flat(e.mask * (state.x + solve.dt * state.velocity))
+    q, statistics, kept = continuation.solve(_method(e), flat(e.mask * state.x), options, guess, kept)
     one = jnp.ones((), state.x.dtype)
     x = _positions(e, q, one)
     internal, inertial, outer, fluid = _forces(e, q, one)
@@ -246,7 +247,7 @@ def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
 
     numbers, stiff = jnp.arange(1, steps + 1, dtype=dtype), unit_strain_force(scene)
     start = initial_state(scene)
-    kept = continuation.nothing_kept(_method(equations(scene, start, numbers[0], stiff)), start.x.ravel())
+    kept = continuation.nothing_kept(_method(equations(scene, start, numbers[0], stiff)), flat(start.x))
     _, (x, reactions, P, statistics) = jax.lax.scan(advance, (start, kept), numbers)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status

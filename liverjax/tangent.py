@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from liverjax import assembly, boundary, mjed, porosity, terms, viscosity
 from liverjax.assembly import BlockMatrix
@@ -92,26 +93,31 @@ def tangent(setting: Setting, pressure: Any, x: jax.Array, at: Any, near: tuple[
 
 def preconditioner(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
     """Inverse diagonal blocks, with the coarse solution added, as a function of flat vectors (3 V,)."""
-    mask, inverse = setting.mask, K.inverse
+    free = setting.mask.T
 
-    def fine(r):
-        return (mask * assembly.applied(inverse, mask * r.reshape(-1, 3))).ravel()
+    def fine(columns):
+        return assembly.applied(K.inverse, [m * r for m, r in zip(free, columns, strict=True)])
 
-    return corrected(setting.scene.mesh, K.slow, mask, fine)
+    both = corrected(setting.scene.mesh, K.slow, setting.mask, fine)
+    return lambda r: free.ravel() * jnp.concatenate(both(assembly.columns(r)))
 
 
 def product(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
     """K as a function of flat vectors (3 V,); where pressure depends on motion, that of a nearly solved pressure."""
-    A, mask, loads = K.matrix, setting.mask, setting.scene.traction
+    A, free, loads = K.matrix, setting.mask.T, setting.scene.traction
 
     def apply(v):
-        dx = mask * v.reshape(-1, 3)
-        force = assembly.product(A, dx)
+        motion = [m * c for m, c in zip(free, assembly.columns(v), strict=True)]
+        force = assembly.product(A, motion)
         if setting.flow is not None:
             force = porosity.with_flow(setting.scene.mesh, setting.flow, A, force)
+        force = jnp.concatenate(force)
         if K.x is not None:
-            force = force - jax.jvp(lambda x: K.at * boundary.follower_forces(loads, x), (K.x,), (dx,))[1]
-        return (mask * force).ravel()
+            dx = jnp.stack(motion, axis=-1)
+            force = force - assembly.flat(
+                jax.jvp(lambda x: K.at * boundary.follower_forces(loads, x), (K.x,), (dx,))[1]
+            )
+        return free.ravel() * force
 
     return apply
 

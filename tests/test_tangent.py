@@ -36,7 +36,7 @@ def test_assembled_stiffness_is_the_sparse_one():
     A = jax.jit(lambda x: tangent.stiffness(scene, None, None, None, x))(X)
     K = mjed.stiffness_matrix(MESH, LAW, X)
     expected = (K @ np.asarray(V).ravel()).reshape(-1, 3)
-    assert np.abs(np.asarray(assembly.product(A, V)) - expected).max() < 1e-13 * abs(K).max() * 10
+    assert np.abs(np.stack(assembly.product(A, V.T), axis=-1) - expected).max() < 1e-13 * abs(K).max() * 10
 
 
 @pytest.mark.parametrize("part", ["all", "isochoric"])
@@ -61,7 +61,7 @@ def test_viscous_and_porous_tangent_against_autodiff(part):
 
     expected = jax.jit(lambda: jax.jvp(forces, (X,), (V,))[1])()
     A = jax.jit(lambda: tangent.stiffness(scene, memory, P, None, X))()
-    error = np.asarray(assembly.product(A, V) - expected)
+    error = np.stack(assembly.product(A, V.T), axis=-1) - np.asarray(expected)
     assert np.abs(error).max() < 1e-12 * np.abs(np.asarray(expected)).max()
 
 
@@ -81,11 +81,11 @@ def test_coupled_matrix_against_autodiff():
             F = deformation_gradient(MESH, x)
             stress = add_matrices(terms.first_piola(law, F), porosity.first_piola(SPONGE, MESH, P, F))
             volume = porosity._scatter(MESH, MESH.volumes * determinant(F) / 4)
-            flux = assembly.product(flow.matrix, P[:, None])
+            flux = jnp.stack(assembly.product(flow.matrix, (P,)), axis=-1)
             return jnp.concatenate([mjed.nodal_force(MESH, stress), -flux - volume[:, None]], axis=1)
 
         exact = jax.jvp(equations, (X, P), (V, dP))[1]
-        return assembly.product(A, jnp.concatenate([V, dP[:, None]], axis=1)), exact
+        return jnp.stack(assembly.product(A, (*V.T, dP)), axis=-1), exact
 
     ours, exact = map(np.asarray, both())
     for column in (slice(0, 3), slice(3, 4)):  # forces and volumes: each to its own size
@@ -96,7 +96,7 @@ def test_darcys_laplacian_and_its_polynomial():
     fluid = porosity.initial_fluid(SPONGE, MESH)
     flow = jax.jit(lambda: porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, X), 0.05, 1e-10))()
     n = MESH.number_of_nodes
-    A = np.asarray(jax.vmap(lambda e: assembly.product(flow.matrix, e[:, None])[:, 0])(jnp.eye(n)))
+    A = np.asarray(jax.vmap(lambda e: assembly.product(flow.matrix, (e,))[0])(jnp.eye(n)))
     assert np.allclose(A, A.T, rtol=0, atol=1e-15 * A.max())
     assert np.allclose(A.sum(axis=1), np.asarray(flow.store), rtol=1e-9)  # a uniform pressure does not flow
     lowest = np.linalg.eigvals(A / np.diag(A)[:, None]).real.min()
