@@ -16,6 +16,7 @@ if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
 from liverjax import boundary, laws, mjed, reference, shapes, viscosity
+from liverjax.batch import Batch, simulate_batch
 from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
@@ -29,6 +30,7 @@ from liverjax.viscosity import Prony
 __version__ = "0.1.0"
 
 __all__ = [
+    "Batch",
     "Body",
     "Displaced",
     "Fixed",
@@ -52,6 +54,7 @@ __all__ = [
     "reference",
     "shapes",
     "simulate",
+    "simulate_batch",
     "static",
     "struct",
     "tet_mesh",

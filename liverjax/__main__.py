@@ -1,4 +1,4 @@
-"""``python -m liverjax simulate | check | plot | laws``."""
+"""``python -m liverjax simulate | sweep | design | check | plot | laws``."""
 
 import argparse
 import dataclasses
@@ -115,6 +115,63 @@ def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
     return 1 if np.any(codes != status.CONVERGED) else 0
 
 
+def run_sweep(options: argparse.Namespace) -> int:
+    """Run a scene for every row of a table; 1 if a row failed or the disk is full, with what was computed kept."""
+    import jax
+    from tqdm import tqdm
+
+    if options.devices:
+        jax.config.update("jax_num_cpu_devices", options.devices)
+    process = (0, 1)
+    if options.distributed is not None:
+        # Host:port, number of processes and this one's number; without them what the cluster says.
+        address, count, number = (*options.distributed, None, None, None)[:3]
+        jax.distributed.initialize(address, count and int(count), None if number is None else int(number))
+        process = (jax.process_index(), jax.process_count())
+
+    from liverjax import status, sweep
+
+    table = sweep.read_sweep(
+        options.scene,
+        options.parameters,
+        tuple(options.store),
+        tuple(options.probe),
+        options.chunk,
+        tuple(options.rows),
+    )
+    out = options.out or options.parameters.with_suffix(".h5")
+    bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # on a terminal only
+    try:
+        done = sweep.run(table, out, options.resume, process, bar.update)
+    except OSError as error:
+        print(
+            f"error: {out}: {error.strerror or error}: finished chunks are kept, go on with --resume", file=sys.stderr
+        )
+        return 1
+    finally:
+        bar.close()
+    if done.file is None:
+        print(f"process {process[0]} of {process[1]}: {done.computed} rows; others have rows to do yet")
+        return 0
+    print(f"{len(table.rows)} rows, {done.computed} computed now, {len(done.failed)} failed\nwritten: {done.file}")
+    for row, code in list(done.failed.items())[:20]:
+        print(f"failed: row {row}: {status.advice(code)}", file=sys.stderr)
+    if done.failed:
+        print(f"again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
+    return 1 if done.failed else 0
+
+
+def write_design(options: argparse.Namespace) -> int:
+    """Write a table of parameters for a sweep."""
+    from liverjax import design
+
+    ranges = design.read_ranges(options.range)
+    rows = design.design(ranges, options.rows, options.kind, options.seed)
+    design.write_table(options.table, list(ranges), rows, f"{options.kind}, seed {options.seed}")
+    print(f"{len(rows)} rows\nwritten: {options.table}")
+    return 0
+
+
 def _label(name: str) -> str:
     return name.rpartition(":")[2]
 
@@ -123,6 +180,10 @@ def _target(out: Path, name: str) -> Path:
     """File `name` in folder `out`, which is made and tried before anything is computed."""
     writable(out, (name,))
     return out / name
+
+
+_SWEEP = "Run a scene for every row of a table. A kill at any moment costs one chunk: --resume goes on."
+OUTPUTS = ("final_positions", "positions", "largest_displacement", "final_reactions", "largest_pressure")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -136,6 +197,26 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("scene", type=Path, metavar="SCENE.toml")
     simulate.add_argument("--vtu", action="store_true", help="write a ParaView series as well")
     simulate.add_argument("--png", action="store_true", help="draw the last state as well")
+    sweep = commands.add_parser("sweep", help="run a scene for every row of a table", description=_SWEEP)
+    sweep.add_argument("scene", type=Path, metavar="SCENE.toml")
+    sweep.add_argument(
+        "parameters", type=Path, metavar="PARAMETERS.csv", help="a header of dotted names, one row a run"
+    )
+    sweep.add_argument("--out", type=Path, metavar="FILE.h5", help="the results (PARAMETERS.h5)")
+    sweep.add_argument("--resume", action="store_true", help="go on where a run was stopped")
+    sweep.add_argument("--store", nargs="+", default=["final_positions"], metavar="WHAT", help="|".join(OUTPUTS))
+    sweep.add_argument("--probe", nargs="+", type=int, default=[], metavar="NODE", help="nodes to keep over time")
+    sweep.add_argument("--rows", nargs="+", type=int, default=[], metavar="N", help="these rows alone, from 1")
+    sweep.add_argument("--chunk", type=int, default=16, metavar="N", help="rows between two writes (16)")
+    sweep.add_argument("--devices", type=int, metavar="N", help="spread the rows over N CPU devices (1)")
+    where = "one of several processes; without HOST:PORT N I as the cluster (SLURM) says"
+    sweep.add_argument("--distributed", nargs="*", metavar="HOST:PORT N I", help=where)
+    design = commands.add_parser("design", help="write a table of parameters", description="Write a table for a sweep.")
+    design.add_argument("table", type=Path, metavar="PARAMETERS.csv")
+    design.add_argument("range", nargs="+", metavar="NAME=LOW:HIGH", help="e.g. law.mu=500:1000")
+    design.add_argument("--kind", default="sobol", metavar="KIND", help="grid | latin | sobol (sobol)")
+    design.add_argument("--rows", type=int, default=64, metavar="N", help="how many (64)")
+    design.add_argument("--seed", type=int, default=0, metavar="N", help="of the random ones (0)")
     commands.add_parser("laws", help="the laws, their parameters, units and bounds")
     law = "name of a shipped law (typical parameters), or FILE.py:LAW, a law object or class of your own"
     check = commands.add_parser("check", help="gradient-check a material law", description="Gradient-check a law.")
@@ -156,6 +237,10 @@ def main(arguments: list[str] | None = None) -> int:
             return check_law(options.law, options.out)
         if options.command == "simulate":
             return run_scene(options.scene, options.out, options.vtu, options.png)
+        if options.command == "sweep":
+            return run_sweep(options)
+        if options.command == "design":
+            return write_design(options)
         if options.command == "plot":
             return plot_laws(options.law, options.out, list(options.stretch))
         list_laws()

@@ -99,16 +99,25 @@ def first_piola(law: Any, F: Matrix) -> Matrix:
     return total
 
 
-def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple, regularised: bool = False) -> list[Matrix]:
+def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, Any]]:
+    """D_i (x) D_j and D_i . D_j of every pair: of what L and U are made where their A and B are constant."""
+    return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
+
+
+def blocks(
+    law: Any, F: Matrix, D: list[Vector], pairs: tuple, regularised: bool = False, constant: list | None = None
+) -> list[Matrix]:
     """d2W/dx_i dx_j per reference volume: G + H + I + Lambda + M + R of every k, and phi'' of a function of the sum.
 
-    `regularised` changes the G of every product (not phi'').
+    `regularised` changes the G of every product (not phi''). `constant` is `constant_matrices(D, pairs)`, stored in
+    advance as the chapter proposes; without it they are computed here, which is faster (experiments/fig4_assembly.py).
     """
     s = _at(law, F)
-    return [_block(s, D[i], D[j], regularised) for i, j in pairs]
+    constant = constant_matrices(D, pairs) if constant is None else constant
+    return [_block(s, D[i], D[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
 
 
-def _block(s: _At, Di: Vector, Dj: Vector, regularised: bool) -> Matrix:
+def _block(s: _At, Di: Vector, Dj: Vector, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
     ji, jj = matvec(s.cof, Di), matvec(s.cof, Dj)
     K = scale_matrix(0.0, IDENTITY)
     for terms, phi1, phi2 in s.groups:
@@ -123,7 +132,7 @@ def _block(s: _At, Di: Vector, Dj: Vector, regularised: bool) -> Matrix:
             I_ = scale_matrix(t.h1, outer(ji, FSDj))
             Lambda = scale_matrix(t.h1, outer(FSDi, jj))
             M = scale_matrix(t.h * dot(Di, matvec(S, Dj)), IDENTITY)
-            R = scale_matrix(t.h, matmul(matmul(s.F, _linear_matrices(t, s, Di, Dj)), transpose(s.F)))
+            R = scale_matrix(t.h, matmul(matmul(s.F, _linear_matrices(t, s, Di, Dj, constant)), transpose(s.F)))
             for part in (G, H, I_, Lambda, M, R):
                 K = add_matrices(K, scale_matrix(phi1, part))
         if phi2 is not None:
@@ -138,12 +147,13 @@ def _second_derivative_of_J(F: Matrix, Di: Vector, Dj: Vector) -> Matrix:
     return ((0.0, n2, -n1), (-n2, 0.0, n0), (n1, -n0, 0.0))
 
 
-def _linear_matrices(t: _Term, s: _At, Di: Vector, Dj: Vector) -> Matrix:
+def _linear_matrices(t: _Term, s: _At, Di: Vector, Dj: Vector, constant: tuple[Matrix, Any]) -> Matrix:
     """L + U of dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C."""
     BDi, BDj = matvec(s.B, Di), matvec(s.B, Dj)
+    DiDj, product = constant
     beta = -2 * t.g2
-    L = add_matrices(scale_matrix(beta, outer(Dj, Di)), scale_matrix(beta * dot(Di, Dj), IDENTITY))
-    U = scale_matrix(4 * (t.g11 + t.g2), outer(Di, Dj))
+    L = add_matrices(scale_matrix(beta, transpose(DiDj)), scale_matrix(beta * product, IDENTITY))
+    U = scale_matrix(4 * (t.g11 + t.g2), DiDj)
     for weight, a, b in ((t.g12, Di, BDj), (t.g12, BDi, Dj), (t.g22, BDi, BDj)):
         U = add_matrices(U, scale_matrix(4 * weight, outer(a, b)))
     return add_matrices(L, U)

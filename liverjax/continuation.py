@@ -88,8 +88,8 @@ class Method(NamedTuple):
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
-    #: tangent -> dr/dq as a function, where that is exact and symmetric: derivatives are then solved for with it.
-    product: Callable[[Any], Callable[[jax.Array], jax.Array]] | None = None
+    #: Whether `solve` is of a dr/dq that is exact and symmetric: derivatives are then solved for with it.
+    exact: bool = False
     #: Whether dr/dq is.
     symmetric: bool = True
     #: Whether r depends on s.
@@ -135,9 +135,9 @@ def solve(
 
     def tangent_solve(linear, y):
         K = method.tangent(q, one, jax.lax.stop_gradient(method.residual(q, one)[2]), None)
-        product = None if method.product is None else method.product(K)
-        limits = (max(options.adjoint * options.tolerance, 1e-13), options.max_linear_iterations)
-        return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric, product)
+        limits = (jnp.maximum(options.adjoint * options.tolerance, 1e-13), options.max_linear_iterations)
+        solver = (lambda b: method.solve(K, b, *limits)[0]) if method.exact else None
+        return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric, solver)
 
     root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)
     counts = (n.astype(jnp.int32) for n in statistics[:4])

@@ -126,11 +126,11 @@ def differentiable_solve(
     tolerance: Any,
     max_iterations: int,
     symmetric: bool = True,
-    product: Callable[[jax.Array], jax.Array] | None = None,
+    solver: Callable[[jax.Array], jax.Array] | None = None,
 ) -> jax.Array:
     """A solve as a linear map of `b`: its derivatives are further solves, not those of iterations.
 
-    `product` is a faster `matvec` of equal value, a symmetric one without derivatives.
+    `solver` solves the same by itself, for a symmetric A.
 
     Conjugate gradients for a symmetric A, positive definite as theirs; otherwise BiCGSTAB. NaN where the true residual
     stays above a thousandth of |b| (and the tolerance): no wrong solution passes for one.
@@ -138,7 +138,12 @@ def differentiable_solve(
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients
 
     def solve(matvec, b):
-        x, s = method(product or matvec, b, precondition, tolerance, max_iterations)
-        return jnp.where(s.residual <= jnp.maximum(1e-3, 10 * tolerance), x, jnp.nan)
+        if solver is None:
+            x, s = method(matvec, b, precondition, tolerance, max_iterations)
+            residual = s.residual
+        else:
+            x = solver(b)
+            residual = _true_residual(matvec, b, x)
+        return jnp.where(residual <= jnp.maximum(1e-3, 10 * tolerance), x, jnp.nan)
 
     return jax.lax.custom_linear_solve(matvec, b, solve=solve, transpose_solve=solve, symmetric=symmetric)

@@ -1,5 +1,6 @@
 """A scene: a mesh, a law, the physics it has and no other, and what holds, moves and loads it. Read from TOML."""
 
+import copy
 import dataclasses
 import difflib
 import tomllib
@@ -30,15 +31,16 @@ class Body:
 
 @struct
 class Solve:
-    """How the scene is solved; all but the time step is static."""
+    """How the scene is solved; all but the time step and the tolerance is static."""
 
     dt: Any = param("s", "time step; None: load steps without time", default=None)
     kind: str = static("static", "static: no inertia; dynamic")
     steps: int = static(1, "load steps, or time steps of dt")
-    tolerance: float = static(1e-8, "of the residual, relative to the forces at work")
+    tolerance: Any = param("1", "of the residual, relative to the forces at work", default=1e-8)
     newton_iterations: int = static(25, "of a step; 1 is the chapter's linearly implicit scheme (not for derivatives)")
     integrator: str = static("euler", "dynamic: euler (first order) or newmark (average acceleration, second order)")
     precision: str = static("float64", "float64 or float32")
+    linear_solver: str = static("cg", "cg, or direct: a factorisation on the host, for what is too stiff to iterate on")
 
 
 @struct
@@ -277,6 +279,7 @@ _CHOICES = {
     "kind": ("static", "dynamic"),
     "integrator": ("euler", "newmark"),
     "precision": ("float64", "float32"),
+    "linear_solver": ("cg", "direct"),
 }
 
 
@@ -301,12 +304,14 @@ def check_choices(scene: Scene) -> None:
     """Refuse choices that mean nothing; looks at no numbers, so that a traced scene passes as well.
 
     Raises:
-        InputError: unknown kind, integrator or precision; a load or motion given twice, not at all, of wrong shape.
+        InputError: unknown choices; a load or motion given twice, not at all, of wrong shape.
     """
     for key, allowed in _CHOICES.items():
         value = getattr(scene.solve, key)
         if value not in allowed:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
+    if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
+        raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
     for k, load in enumerate(scene.traction):
         if (load.value is None) == (load.pressure is None):
             raise InputError(f"traction.{k} needs either value (3,) or pressure, in Pa: give one of them")
@@ -350,6 +355,35 @@ def check_scene(scene: Scene) -> None:
     _no_contradiction(scene)
     if solve.kind == "static":
         _held(scene)
+
+
+def changed_content(content: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """The content of a scene file with values at dotted names."""
+    content = copy.deepcopy(content)
+    for name, value in values.items():
+        *path, last = [int(key) if key.isdigit() else key for key in name.split(".")]
+        table = content
+        for key in path:
+            table = table[key] if isinstance(key, int) else table.setdefault(key, {})
+        table[last] = value
+    return content
+
+
+def check_numbers(content: dict[str, Any]) -> None:
+    """Refuse numbers of a scene's content that are out of bounds; looks at no mesh.
+
+    Raises:
+        InputError: a parameter of law, viscosity, porosity, body or solve that cannot be used.
+    """
+    law = _law(content["law"])
+    prony = _section(content, "viscosity", _prony)
+    if prony is not None:
+        viscosity.check(prony, law)
+    if "porosity" in content:
+        sponge = {k: v for k, v in content["porosity"].items() if k != "drained"}
+        porosity.check(_porosity(None, sponge))
+    _section(content, "body", _body)
+    _solve(_table("solve", content.get("solve", {})))
 
 
 def _no_contradiction(scene: Scene) -> None:

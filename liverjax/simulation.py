@@ -104,7 +104,7 @@ def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> E
     flow = pressure = None
     if sponge is not None:
         F = deformation_gradient(mesh, state.x)
-        flow = porosity.flow(sponge, mesh, state.fluid, F, dt, 1e-2 * scene.solve.tolerance)
+        flow = porosity.flow(sponge, mesh, state.fluid, F, dt, 1e-2 * jax.lax.stop_gradient(scene.solve.tolerance))
         if sponge.scheme != "implicit":
             pressure, flow = porosity.pressure(sponge, mesh, state.fluid, flow, determinant(F)), None
     return Equations(
@@ -113,7 +113,7 @@ def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> E
         k=k,
         mask=boundary.free_degrees(mesh, scene.fixed, scene.displaced),
         loads=_loads(scene),
-        noise=20 * float(np.finfo(np.float64).eps) / scene.solve.tolerance * stiff,
+        noise=20 * float(np.finfo(np.float64).eps) / jax.lax.stop_gradient(scene.solve.tolerance) * stiff,
         mass=None if state.velocity is None else scene.body.density * boundary.nodal_volumes(mesh),
         memory=None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt),
         flow=flow,
@@ -182,7 +182,7 @@ def _method(e: Equations) -> continuation.Method:
         tangent=lambda q, s, fluid, near: tangent.tangent(setting, fluid, _positions(e, q, s), _acting(e, s), near),
         solve=partial(tangent.solve, setting),
         preconditioner=partial(tangent.preconditioner, setting),
-        product=None if follows or e.flow is not None else partial(tangent.product, setting),
+        exact=tangent.exact(setting),
         symmetric=not follows,
         moved=len(e.scene.displaced) > 0 or e.mass is None,
     )
@@ -191,7 +191,7 @@ def _method(e: Equations) -> continuation.Method:
 def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
     """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step."""
     scene, state, solve = e.scene, e.state, e.scene.solve
-    options = StepOptions(tolerance=solve.tolerance, max_iterations=solve.newton_iterations)
+    options = StepOptions(tolerance=jax.lax.stop_gradient(solve.tolerance), max_iterations=solve.newton_iterations)
     guess = None
     if e.mass is not None and not scene.displaced and solve.newton_iterations > 1:
         # Straight on; one iteration starts at x, as printed.

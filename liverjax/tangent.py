@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from liverjax import assembly, boundary, mjed, porosity, terms, viscosity
+from liverjax import assembly, boundary, direct, mjed, porosity, terms, viscosity
 from liverjax.assembly import BlockMatrix
 from liverjax.coarse import Coarse, coarse, corrected, worthwhile
 from liverjax.kinematics import Matrix, add_matrices, deformation_gradient, scale_matrix
@@ -84,7 +84,8 @@ def tangent(setting: Setting, pressure: Any, x: jax.Array, at: Any, near: tuple[
     inverse = assembly.inverse_blocks(diagonal, mask)
 
     def new():
-        return coarse(scene.mesh, A, mask, worthwhile(A, setting.inertia))
+        used = False if scene.solve.linear_solver == "direct" else worthwhile(A, setting.inertia)
+        return coarse(scene.mesh, A, mask, used)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     following = boundary.follows(scene.traction)
@@ -125,7 +126,24 @@ def product(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
 def solve(
     setting: Setting, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Solution of K dq = b and the iterations it took, flat vectors (3 V,)."""
+    """Solution of K dq = b and the iterations it took, 0 of a factorisation; flat vectors (3 V,)."""
+    if setting.scene.solve.linear_solver == "direct":
+        return _factorised(setting, K, b), jnp.zeros((), jnp.int32)
     method = conjugate_gradients if K.x is None else stabilised_biconjugate_gradients
     dq, s = method(product(setting, K), b, preconditioner(setting, K), tolerance, max_iterations)
     return dq, s.iterations
+
+
+def _factorised(setting: Setting, K: Tangent, b: jax.Array) -> jax.Array:
+    """The same by a factorisation, of the coupled matrix where pressure depends on motion."""
+    free, load = setting.mask.T, b.reshape(3, -1)
+    if setting.flow is not None:
+        free = jnp.concatenate([free, setting.flow.mask[None]])
+        load = jnp.concatenate([load, jnp.zeros_like(load[:1])])
+    return direct.solve(K.matrix, free, load)[:3].ravel()
+
+
+def exact(setting: Setting) -> bool:
+    """Whether `solve` is that of the symmetric derivative of the forces, and not of something near it."""
+    whole = setting.flow is None or setting.scene.solve.linear_solver == "direct"
+    return whole and not boundary.follows(setting.scene.traction)

@@ -1,0 +1,137 @@
+"""The chapter's Fig. 4: force and stiffness of a cube of 20,250 tetrahedra, every law, every way.
+
+``python experiments/fig4_assembly.py`` (8 minutes) writes results/fig4_assembly.json and .png: medians of interleaved
+rounds of each way, its error against the vmapped Hessian, its compile time, and the floor: the 45 rows written and
+nothing else, and the time to copy as many bytes as the chapter's full matrices have.
+"""
+
+import argparse
+import statistics
+import time
+
+import assembly_rivals
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import plain_ticks, plt, save
+
+import liverjax as lj
+from liverjax import laws, mjed, tangent
+from liverjax.colours import BLUE, COLOURS, GREY
+from liverjax.errors import InputError
+
+WAYS = {
+    "contracted": assembly_rivals.contracted,
+    "chapter, on the fly": assembly_rivals.chapter,
+    "chapter, L and U stored": assembly_rivals.chapter,
+    "standard FEM": assembly_rivals.standard,
+    "autodiff 9 x 9": assembly_rivals.autodiff,
+    "vmapped Hessian": assembly_rivals.vmapped,
+}
+COLOUR = dict(zip(WAYS, COLOURS, strict=False))
+COPIED = 23_000_000  # bytes: about 20,250 full matrices of 144 numbers
+
+
+def programs(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array, stored: list) -> tuple[dict, dict]:
+    """Compiled ways with their arguments, and how long each took to compile; laws that a way cannot do are left out."""
+    made, compiling = {}, {}
+    every = WAYS | {"force only": mjed.internal_force, "into the solver's rows": into_rows}
+    for name, function in every.items():
+        arguments = (mesh, law, x, stored) if "stored" in name else (mesh, law, x)
+        begin = time.perf_counter()
+        try:
+            made[name] = jax.jit(function).lower(*arguments).compile(), arguments
+        except InputError:
+            continue
+        compiling[name] = time.perf_counter() - begin
+    return made, compiling
+
+
+def into_rows(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array) -> tuple:
+    """Force, and the stiffness assembled into the padded rows that the solver multiplies with."""
+    scene = lj.Scene(mesh=mesh, law=law)
+    return mjed.internal_force(mesh, law, x), tangent.stiffness(scene, None, None, None, x)
+
+
+def medians(made: dict, rounds: int) -> dict[str, float]:
+    """Seconds of each program: medians over rounds that take all of them in turn."""
+    seconds = {name: [] for name in made}
+    for _ in range(rounds + 1):
+        for name, (program, arguments) in made.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(program(*arguments))
+            seconds[name].append(time.perf_counter() - begin)
+    return {name: statistics.median(values[1:]) for name, values in seconds.items()}
+
+
+def errors(made: dict) -> dict[str, float | None]:
+    """Largest difference of the 45 entries from those of the vmapped Hessian, over the largest entry; None: not finite.
+
+    Where the Hessian itself is not finite, from the contracted ones.
+    """
+
+    def entries(name):
+        program, arguments = made[name]
+        K = program(*arguments)[1]
+        K = assembly_rivals.entries_of(K) if name == "vmapped Hessian" else K
+        return np.stack([np.broadcast_to(k, arguments[0].volumes.shape) for k in K])
+
+    every = {n: entries(n) for n in made if n in WAYS}
+    exact = every["vmapped Hessian"]
+    exact = exact if np.isfinite(exact).all() else every["contracted"]
+    found = {n: float(abs(K - exact).max() / abs(exact).max()) for n, K in every.items()}
+    return {n: e if np.isfinite(e) else None for n, e in found.items()}
+
+
+def main() -> None:
+    """All laws, the table and the figure."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--laws", nargs="*", default=list(laws.LAWS))
+    options = parser.parse_args()
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (15, 15, 15))
+    x = mesh.points + 0.01 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
+    stored = jax.jit(assembly_rivals.stored_matrices)(mesh)
+    block = jnp.zeros(COPIED // 8)
+    rows = {}
+    for name in options.laws:
+        made, compiling = programs(mesh, laws.typical(name), x, stored)
+        made["floor"] = jax.jit(assembly_rivals.floor), (mesh, laws.typical(name), x)
+        made["copy"] = jax.jit(lambda a: a + 1.0), (block,)
+        rows[name] = {"seconds": medians(made, options.rounds), "compile_s": compiling, "errors": errors(made)}
+        ms = {key: round(1e3 * s, 2) for key, s in rows[name]["seconds"].items()}
+        print(f"{name:26s} {ms} {rows[name]['errors']}", flush=True)
+        jax.clear_caches()
+    neo = rows.get("neo_hookean", next(iter(rows.values())))["seconds"]["contracted"]
+    for row in rows.values():
+        s = row["seconds"]
+        row["times_faster"] = {way: s[way] / s["contracted"] for way in WAYS if way in s}
+        row["over_neo_hookean"] = s["contracted"] / neo
+    save("fig4_assembly", {"elements": mesh.number_of_elements, "rounds": options.rounds, "laws": rows}, draw(rows))
+
+
+def draw(rows: dict):
+    """Time of every way on the left, how often contracted terms fit into it on the right."""
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 6.5), sharey=True, layout="constrained")
+    at = np.arange(len(rows))
+    for k, way in enumerate(WAYS):
+        for j, row in enumerate(rows.values()):
+            if way in row["seconds"]:
+                y, label = at[j] + 0.12 * (k - 2.5), way if j == 0 else None
+                left.plot(1e3 * row["seconds"][way], y, "o", ms=5, color=COLOUR[way], label=label)
+                right.plot(row["times_faster"][way], y, "o", ms=5, color=COLOUR[way])
+    floor = 1e3 * statistics.median(r["seconds"]["floor"] for r in rows.values())
+    left.axvline(floor, color=GREY, ls=":", label="45 rows written, nothing else")
+    worst = max(e for r in rows.values() for e in r["errors"].values() if e is not None)
+    left.set(yticks=at, yticklabels=[n.replace("_", " ") for n in rows], xscale="log", xlabel="20,250 tetrahedra [ms]")
+    left.set_title(f"force and stiffness; all agree to {worst:.0e}")
+    right.set(xscale="log", xlabel="time over that of contracted terms [1]")
+    right.axvline(1.0, color=BLUE)
+    left.invert_yaxis()
+    plain_ticks(left.xaxis, right.xaxis)
+    fig.legend(loc="outside lower center", ncols=4, fontsize=8)
+    return fig
+
+
+if __name__ == "__main__":
+    main()

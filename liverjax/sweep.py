@@ -1,0 +1,316 @@
+"""Sweeps: one scene, many rows of parameters, results that a kill at any moment cannot spoil.
+
+Rows are run chunk by chunk. A finished chunk is a file of its own in FILE.h5.parts, written beside and renamed; when
+all are there they become FILE.h5. So whatever stops a run, finished chunks stay, and `--resume` computes the others.
+Several processes may work on one sweep: each takes every n-th chunk, and the last to finish joins the parts.
+"""
+
+import csv
+import fcntl
+import hashlib
+import json
+import os
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax import status
+from liverjax.batch import simulate_batch
+from liverjax.errors import InputError
+from liverjax.scene import Scene, changed_content, check_numbers, load_scene, with_parameters
+from liverjax.versions import versions
+
+#: What may be stored of every row, from its result and the reference positions.
+OUTPUTS: dict[str, Callable] = {
+    "final_positions": lambda result, scene: result.positions[-1],
+    "positions": lambda result, scene: result.positions,
+    "largest_displacement": lambda result, scene: jnp.max(
+        jnp.linalg.norm(result.positions - scene.mesh.points, axis=-1)
+    ),
+    "final_reactions": lambda result, scene: result.reactions[-1],
+    "largest_pressure": lambda result, scene: jnp.max(result.pressure),
+}
+_UNITS = {"final_reactions": "N", "largest_pressure": "Pa"}
+
+
+class Sweep(NamedTuple):
+    """What is to be run; everything that decides the results is in `identity`."""
+
+    scene: Scene
+    names: tuple[str, ...]
+    rows: np.ndarray  # (N, P) numbers
+    numbers: np.ndarray  # (N,) of the rows in the file, from 1
+    outputs: tuple[str, ...]
+    probes: tuple[int, ...]  # nodes whose positions are kept over time
+    chunk: int
+    identity: dict[str, Any]
+
+
+class Done(NamedTuple):
+    """How a sweep ended."""
+
+    file: Path | None  # None: other processes still have chunks to do
+    failed: dict[int, int]  # number of the row -> code
+    computed: int  # rows, by this process now
+
+
+def read_sweep(
+    scene_file: Path,
+    parameters: Path,
+    outputs: tuple[str, ...] = ("final_positions",),
+    probes: tuple[int, ...] = (),
+    chunk: int = 16,
+    only: tuple[int, ...] = (),
+) -> Sweep:
+    """A sweep from a scene file and a table with a header of dotted names, every row checked before any compile.
+
+    Raises:
+        InputError: an unusable scene or table, a name that the scene does not have, a value out of its bounds.
+    """
+    scene = load_scene(scene_file)
+    names, rows = read_table(parameters)
+    content = tomllib.loads(scene_file.read_text(encoding="utf-8"))
+    with_parameters(scene, dict(zip(names, rows[0], strict=True)))
+    for k, row in enumerate(rows):
+        values = dict(zip(names, row, strict=True))
+        try:
+            check_numbers(changed_content(content, values))
+        except InputError as error:
+            raise InputError(f"{parameters}: row {k + 1}: {error}") from None
+    for name in outputs:
+        if name not in OUTPUTS:
+            raise InputError(f"--store {name} is not known: use {', '.join(OUTPUTS)}")
+        if name == "largest_pressure" and scene.porosity is None:
+            raise InputError("--store largest_pressure needs [porosity] in the scene: leave it out")
+    for node in probes:
+        if not 0 <= node < scene.mesh.number_of_nodes:
+            raise InputError(f"--probe {node} is no node of the mesh: give 0 to {scene.mesh.number_of_nodes - 1}")
+    if chunk < 1:
+        raise InputError(f"--chunk {chunk} must be above 0: give e.g. 16")
+    numbers = np.arange(1, len(rows) + 1)
+    for row in only:
+        if not 1 <= row <= len(rows):
+            raise InputError(f"--rows {row} is not in {parameters}: give 1 to {len(rows)}")
+    if only:
+        numbers = np.array(sorted(set(only)))
+    chunk = min(chunk, len(numbers))
+    identity = {
+        "scene": scene_file.read_text(encoding="utf-8"),
+        "mesh": _digest(scene.mesh.points, scene.mesh.tetrahedra),
+        "parameters": _digest(rows) + " " + " ".join(names),
+        "rows": _digest(numbers),
+        "outputs": [*outputs, *(f"probe {p}" for p in probes)],
+        "chunk": chunk,
+        "versions": versions(),
+    }
+    return Sweep(scene, names, rows[numbers - 1], numbers, outputs, probes, chunk, identity)
+
+
+def _digest(*arrays: Any) -> str:
+    digest = hashlib.sha256()
+    for a in arrays:
+        digest.update(np.ascontiguousarray(a).tobytes())
+    return digest.hexdigest()
+
+
+def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """Header and numbers (N, P) of a CSV file; # begins a comment.
+
+    Raises:
+        InputError: unreadable or empty, a name twice, a row of another length, a value that is no finite number.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
+    if len(table) < 2:
+        raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row a run")
+    names = tuple(table[0])
+    if len(set(names)) < len(names):
+        raise InputError(f"{file} names {max(names, key=names.count)} twice: leave one column out")
+    rows = []
+    for k, row in enumerate(table[1:]):
+        if len(row) != len(names):
+            raise InputError(f"{file}: row {k + 1} has {len(row)} values for {len(names)} names: complete it")
+        for name, cell in zip(names, row, strict=True):
+            try:
+                finite = np.isfinite(float(cell))
+            except ValueError:
+                finite = False
+            if not finite:
+                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is no finite number: mend it")
+        rows.append([float(cell) for cell in row])
+    return names, np.array(rows)
+
+
+# -- running ----------------------------------------------------------------------------------------------------------
+
+
+def run(
+    sweep: Sweep,
+    out: Path,
+    resume: bool = False,
+    process: tuple[int, int] = (0, 1),
+    report: Callable[[int], None] = lambda rows: None,
+) -> Done:
+    """Run what is not done yet of a sweep into `out`.
+
+    Args:
+        sweep: `Sweep`.
+        out: file for the results; its parts stand beside it until all are done.
+        resume: go on with what is there.
+        process: number of this process and of all that share the work.
+        report: called with the number of rows finished.
+
+    Raises:
+        InputError: results that are there already, of another sweep, or in use by another process.
+        OSError: the disk is full; finished chunks are kept.
+    """
+    parts = out.with_name(out.name + ".parts")
+    if out.exists():
+        return _already(sweep, out, resume)
+    if parts.exists() and not resume and process[1] == 1:
+        raise InputError(f"{parts} holds an unfinished sweep: go on with --resume, or remove it")
+    _folder(parts)
+    with _locked(parts / f"lock_{process[0]}"):
+        _same(sweep, parts / "sweep.json")
+        program, computed = jax.jit(partial(_rows, sweep.outputs, sweep.probes)), 0
+        for k in list(_chunks(sweep))[process[0] :: process[1]]:
+            file = parts / f"part_{k:06d}.h5"
+            if not file.exists():
+                _write_part(file, sweep, k, program)
+                computed += len(_of(sweep, k))
+            report(len(_of(sweep, k)))
+    return _joined(sweep, out, parts, computed)
+
+
+def _chunks(sweep: Sweep) -> range:
+    return range(-(-len(sweep.rows) // sweep.chunk))
+
+
+def _of(sweep: Sweep, k: int) -> np.ndarray:
+    return np.arange(k * sweep.chunk, min((k + 1) * sweep.chunk, len(sweep.rows)))
+
+
+def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    result = simulate_batch(scene, values).result
+    return {name: jax.vmap(lambda r, name=name: OUTPUTS[name](r, scene))(result) for name in outputs} | {
+        "probes": result.positions[:, :, np.array(probes, dtype=int)],
+        "status": result.status,
+        "residual": result.statistics.residual,
+    }
+
+
+def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
+    chosen = _of(sweep, k)
+    # The last chunk is filled up with its last row: one program for all.
+    filled = np.concatenate([chosen, np.repeat(chosen[-1:], sweep.chunk - len(chosen))])
+    values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
+    result = program(sweep.scene, values)
+    temporary = file.with_suffix(f".{os.getpid()}")
+    with h5py.File(temporary, "w") as part:
+        for name, value in result.items():
+            part[name] = np.asarray(value)[: len(chosen)]
+    with temporary.open("rb") as written:
+        os.fsync(written.fileno())
+    temporary.replace(file)
+
+
+def _folder(parts: Path) -> None:
+    try:
+        parts.mkdir(parents=True, exist_ok=True)
+        (parts / "probe").write_text("")
+        (parts / "probe").unlink()
+    except OSError as error:
+        raise InputError(f"{parts}: {error.strerror}: name an --out that can be written") from None
+
+
+@contextmanager
+def _locked(file: Path) -> Iterator[None]:
+    with file.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(
+                f"{file.parent} is in use by another process: wait for it, or name another --out"
+            ) from None
+        yield
+
+
+def _same(sweep: Sweep, file: Path) -> None:
+    """Record what the sweep is, or refuse to go on with another."""
+    identity = json.loads(json.dumps(sweep.identity))
+    if not file.exists():
+        temporary = file.with_suffix(f".{os.getpid()}")
+        temporary.write_text(json.dumps(identity))
+        temporary.replace(file)
+        return
+    for key, value in json.loads(file.read_text()).items():
+        if identity[key] != value:
+            raise InputError(f"{file.parent} is of another sweep (its {key} differ): name another --out, or remove it")
+
+
+def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
+    if not resume:
+        raise InputError(f"{out} is there already: name another --out, or remove it")
+    try:
+        with h5py.File(out) as file:
+            identity, codes = json.loads(file.attrs["sweep"]), file["status"][:]
+    except (OSError, KeyError):
+        raise InputError(f"{out} holds no sweep: name another --out, or remove it") from None
+    if identity != json.loads(json.dumps(sweep.identity)):
+        raise InputError(f"{out} is of another sweep: name another --out, or remove it")
+    return Done(out, _failures(sweep, codes), 0)
+
+
+def _joined(sweep: Sweep, out: Path, parts: Path, computed: int) -> Done:
+    """All parts as one file, by whichever process comes last."""
+    files = [parts / f"part_{k:06d}.h5" for k in _chunks(sweep)]
+    try:
+        with _locked(parts / "lock_join"):
+            if out.exists() or not all(f.exists() for f in files):
+                return Done(out if out.exists() else None, {}, computed)
+            codes = _join(sweep, out, files)
+    except (InputError, FileNotFoundError):  # another process joins them at this moment
+        return Done(None, {}, computed)
+    for file in parts.iterdir():
+        file.unlink(missing_ok=True)
+    parts.rmdir()
+    return Done(out, _failures(sweep, codes), computed)
+
+
+def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
+    temporary, n = out.with_suffix(".joining"), len(sweep.rows)
+    with h5py.File(temporary, "w") as whole:
+        for k, file in enumerate(files):
+            with h5py.File(file) as part:
+                for name, value in part.items():
+                    if name not in whole:
+                        whole.create_dataset(name, (n, *value.shape[1:]), value.dtype)
+                        whole[name].attrs["unit"] = _UNITS.get(name, "1" if name in ("status", "residual") else "m")
+                    whole[name][_of(sweep, k)] = value[:]
+        whole["row"], whole["parameters"] = sweep.numbers, sweep.rows
+        whole["parameters"].attrs["names"] = list(sweep.names)
+        whole["probe_nodes"] = np.array(sweep.probes, dtype=int)
+        whole["reference"] = np.asarray(sweep.scene.mesh.points)
+        whole["tetrahedra"] = np.asarray(sweep.scene.mesh.tetrahedra)
+        whole.attrs["sweep"] = json.dumps(sweep.identity)
+        codes = whole["status"][:]
+    temporary.replace(out)
+    return codes
+
+
+def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
+    worst = np.where(codes != status.CONVERGED, codes, 0).max(axis=1)
+    return {int(sweep.numbers[k]): int(worst[k]) for k in np.flatnonzero(worst != status.CONVERGED)}

@@ -1,0 +1,106 @@
+"""Factorisation on the host, numbers that change without a new program, and tangents that go from step to step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import boundary, direct, simulation, status, tangent
+from liverjax.struct import replace
+
+LAW = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
+MESH = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
+HELD = (lj.Fixed(nodes=MESH.node_sets["z_min"]),)
+BODY = lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -9.81]))
+PULLED = lj.Scene(
+    mesh=MESH,
+    law=LAW,
+    fixed=HELD,
+    displaced=(lj.Displaced(nodes=MESH.node_sets["z_max"], by=jnp.array([0.01, 0.0, 0.02])),),
+    solve=lj.Solve(tolerance=1e-10),
+)
+POROUS = lj.Scene(
+    mesh=MESH,
+    law=LAW,
+    viscosity=lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.1])),
+    porosity=lj.Porosity(
+        bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5, drained=MESH.node_sets["z_max"]
+    ),
+    body=BODY,
+    fixed=HELD,
+    solve=lj.Solve(kind="dynamic", dt=0.05, steps=3, tolerance=1e-10),
+)
+
+
+def directly(scene: lj.Scene) -> lj.Scene:
+    """The scene with a factorisation."""
+    return replace(scene, solve=replace(scene.solve, linear_solver="direct"))
+
+
+@pytest.mark.parametrize("scene", [PULLED, POROUS], ids=["pulled", "porous"])
+def test_a_factorisation_finds_the_same(scene):
+    one, other = lj.simulate(scene).check(), lj.simulate(directly(scene)).check()
+    assert np.abs(np.asarray(one.positions - other.positions)).max() < 1e-9 * 0.1
+    assert int(one.statistics.linear_iterations.sum()) > 0 == int(other.statistics.linear_iterations.sum())
+
+
+def test_its_gradient_is_the_same():
+    def force(scene, mu):
+        return jnp.sum(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).reactions[-1, MESH.node_sets["z_max"], 2])
+
+    one, other = (jax.jit(jax.grad(lambda mu, s=s: force(s, mu)))(770.0) for s in (PULLED, directly(PULLED)))
+    assert np.isclose(one, other, rtol=1e-9)
+
+
+def test_a_matrix_without_an_inverse_is_told():
+    loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # nothing holds it
+    A = jax.jit(lambda: tangent.stiffness(loose, None, None, None, MESH.points))()
+    A = A._replace(rows=jax.tree.map(jnp.zeros_like, A.rows), diagonal=jax.tree.map(jnp.zeros_like, A.diagonal))
+    free = jnp.ones((3, MESH.number_of_nodes))
+    assert np.isnan(direct.solve(A, free, free)).all()
+    result = lj.simulate(directly(loose))
+    assert int(result.status[0]) != status.CONVERGED and np.isfinite(np.asarray(result.positions)).all()
+
+
+def test_loads_that_follow_are_refused():
+    load = lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(MESH, MESH.node_sets["z_max"])), pressure=4.0)
+    with pytest.raises(lj.InputError, match=r"linear_solver = 'direct' is for symmetric forces: use cg"):
+        lj.simulate(directly(lj.Scene(mesh=MESH, law=LAW, fixed=HELD, traction=(load,))))
+
+
+def test_a_number_that_changes_costs_no_compilation():
+    lj.simulate(POROUS)
+    before = simulation._run._cache_size()
+    for path, value in {
+        "law.mu": 800.0,
+        "law.bulk": 3000.0,
+        "viscosity.ratios": (0.2,),
+        "porosity.permeability": 1e-5,
+        "body.density": 1000.0,
+        "solve.dt": 0.03,
+        "solve.tolerance": 1e-6,
+    }.items():
+        lj.simulate(lj.with_parameters(POROUS, {path: value})).check()
+    assert simulation._run._cache_size() == before
+
+
+def test_a_tangent_goes_from_step_to_step():
+    """Later steps ask for no new tangent where the old one still converges fast."""
+    made = []
+    original = tangent.stiffness
+
+    def counted(*arguments):
+        A = original(*arguments)
+        jax.debug.callback(lambda: made.append(1))
+        return A
+
+    scene = replace(POROUS, porosity=None, solve=replace(POROUS.solve, dt=0.002, steps=10, tolerance=1e-8))
+    tangent.stiffness = counted
+    try:
+        result = simulation._run.__wrapped__(scene, None)
+    finally:
+        tangent.stiffness = original
+    result.check()
+    jax.effects_barrier()
+    assert 1 <= len(made) < 5 < int(result.statistics.iterations.sum())
