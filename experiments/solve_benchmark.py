@@ -38,6 +38,11 @@ def medians(programs: dict, rounds: int = ROUNDS) -> tuple[dict, dict]:
     return results, {n: statistics.median(s) for n, s in seconds.items()}
 
 
+def finite(x: float) -> float | None:
+    """The number, or None, for JSON."""
+    return float(x) if np.isfinite(x) else None
+
+
 def cube(cells: int = 15, bulk: float = 10000.0, **solve: Any) -> lj.Scene:
     """Both ends held, the upper one moved by 20 %."""
     mesh = lj.shapes.box((SIZE, SIZE, SIZE), (cells, cells, cells))
@@ -83,7 +88,7 @@ def liver_steps() -> list[dict]:
     """Steps a second of the hyperelastic liver: one Newton iteration and Newton to 1e-8, mild and full gravity."""
     base = models()["hyperelastic"]
     programs, scenes = {}, {}
-    for load, part in (("mild", 0.3), ("full", 1.0)):
+    for load, part in (("mild", 0.2), ("full", 1.0)):
         gravity = part * 9.81 / jnp.linalg.norm(base.body.gravity) * base.body.gravity
         heavy = replace(base, body=replace(base.body, gravity=gravity))
         for dt, steps in ((0.01, 60), (0.05, 40), (0.3, 20)):
@@ -96,6 +101,7 @@ def liver_steps() -> list[dict]:
     for (load, dt, iterations), result in results.items():
         x, exact = (np.asarray(results[load, dt, n].positions) for n in (iterations, 25))
         s, steps = result.statistics, len(result.times)
+        converged = np.asarray(result.status) == status.CONVERGED
         rows.append(
             {
                 "gravity": load,
@@ -104,12 +110,12 @@ def liver_steps() -> list[dict]:
                 "steps_per_s": steps / seconds[load, dt, iterations],
                 "linear_per_step": float(s.linear_iterations.sum()) / steps,
                 "newton_per_step": float(s.iterations.sum()) / steps,
-                "largest_residual": float(np.max(np.asarray(s.residual))),
+                "largest_residual": finite(np.max(np.asarray(s.residual))),
                 "error_of_positions": float(abs(x - exact).max() / abs(exact - rest).max()),
-                "converged": bool((np.asarray(result.status) == status.CONVERGED).all()),
+                "failed_steps": int(np.sum(~converged)),
             }
         )
-        print({k: v if isinstance(v, str) else round(v, 6) for k, v in rows[-1].items()}, flush=True)
+        print({k: round(v, 6) if isinstance(v, float) else v for k, v in rows[-1].items()}, flush=True)
     return rows
 
 
@@ -171,6 +177,7 @@ def draw(steps: list[dict], ways: list[dict]):
             )
             for r in rows:
                 text = f"{100 * r['error_of_positions']:.1g} %" if newton == "one" else f"{r['largest_residual']:.0e}"
+                text = f"{r['failed_steps']} steps failed" if r["failed_steps"] else text
                 left.annotate(text, (r["dt"], r["steps_per_s"]), fontsize=6, xytext=(4, 4), textcoords="offset points")
     left.plot([0.01, 0.05, 0.3], [100, 20, 1 / 0.3], ":", color=GREY, label="real time")
     left.set(xscale="log", yscale="log", xlabel="time step [s]", ylabel="steps a second")

@@ -1,8 +1,9 @@
 """Newton's method along a load: the solution is followed from the last equilibrium, in parts where it fails in one go.
 
-The residual r(q, s) has the loads and prescribed motion of a step's end at s = 1, of its beginning at s = 0. Every
-part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted through the tangent, never
-jumped to. A part that fails is halved. Only the root at s = 1 counts, and derivatives are those of the root.
+The residual r(q, s) has the loads and prescribed motion of a step's end at s = 1, of its beginning at s = 0. What is
+out of balance at the beginning (inertia, a fluid) goes in proportion: r - (1 - s) r(start, 0) is 0 where a step begins.
+Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted through the tangent,
+never jumped to. A part that fails is halved. Only the root at s = 1 counts, and derivatives are those of the root.
 """
 
 from collections.abc import Callable
@@ -62,6 +63,7 @@ class _Point(NamedTuple):
     s: jax.Array
     q_begin: jax.Array  # where the current part began
     guessing: jax.Array  # it began at the guess
+    unbalanced: jax.Array  # r at the step's beginning, 0 while guessing
     s_begin: jax.Array
     ds: jax.Array
     launch: jax.Array  # the next evaluation is at the beginning of a part
@@ -184,6 +186,7 @@ def _first_point(start: jax.Array, guess: Any, kept: Kept) -> _Point:
         s=zero,
         q_begin=first,
         guessing=jnp.array(guess is not None),
+        unbalanced=jnp.zeros_like(start),
         s_begin=zero,
         ds=one,
         launch=jnp.array(True),
@@ -215,7 +218,7 @@ class _Verdict(NamedTuple):
     done: jax.Array
 
 
-def _judge(c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, method: Method, options: StepOptions):
+def _judge(c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, options: StepOptions) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
     # The first point of a part need not be better, if its direction was that of a tangent made there.
     free = c.first & (~c.stale | (size < c.aim))
@@ -230,7 +233,7 @@ def _judge(c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, method
     lost = c.guessing & (failed | (c.launch & ~finite))
     cuts = c.cuts + (failed & ~lost)
     launch_now = (c.launch & ~lost) | (converged & ~arrived)
-    hopeless = jnp.array(not method.moved) | (cuts > options.max_cuts)  # parts of nothing are all alike
+    hopeless = cuts > options.max_cuts
     done = arrived | (failed & ~lost & hopeless) | (c.launch & ~finite & ~lost)
     return _Verdict(
         accepted=better | launch_now,
@@ -253,17 +256,19 @@ def _iterate(method: Method, options: StepOptions, start: jax.Array, c: _Point) 
     trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
     s = jnp.where(c.launch, c.s_begin, c.s)
     r, force, by = method.residual(trial, s)
+    unbalanced = jnp.where(c.launch & ~c.guessing & (c.s_begin == 0), r, c.unbalanced)
+    r = r - (1 - s) * unbalanced
     size = jnp.linalg.norm(r)
     relative = size / jnp.where(force > 0, force, 1.0)
-    v = _judge(c, s, size, relative, method, options)
+    v = _judge(c, s, size, relative, options)
     longer = jnp.minimum(2 * c.ds, 1 - s)
     longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
     ds = jnp.where(v.converged, longer, jnp.where(v.failed & ~v.lost, 0.5 * c.ds, c.ds))
-    load = -r
+    load = -r - jnp.where(v.launch_now, ds, 0.0) * unbalanced
     if method.moved:
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(method, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > options.contraction * c.aim)
-    renew = (v.launch_now & (method.moved | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
+    renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
     # No direction is solved for beyond what it can remove (Eisenstat and Walker 1996), nor beyond the goal.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
@@ -282,6 +287,7 @@ def _iterate(method: Method, options: StepOptions, start: jax.Array, c: _Point) 
         t=jnp.where(v.go_on, 1.0, 0.5 * c.t),
         s=jnp.where(v.launch_now, s + ds, s),
         q_begin=jnp.where(v.lost, start, jnp.where(v.launch_now, trial, c.q_begin)),
+        unbalanced=unbalanced,
         guessing=c.guessing & ~v.lost & ~(v.converged & ~v.arrived),
         s_begin=jnp.where(v.launch_now, s, c.s_begin),
         ds=ds,

@@ -13,7 +13,7 @@ import os
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ OUTPUTS: dict[str, Callable] = {
     "final_positions": lambda result, scene: result.positions[-1],
     "positions": lambda result, scene: result.positions,
     "largest_displacement": lambda result, scene: jnp.max(
-        jnp.linalg.norm(result.positions - scene.mesh.points, axis=-1)
+        jnp.linalg.norm(result.positions - scene.mesh.points[None], axis=-1)
     ),
     "final_reactions": lambda result, scene: result.reactions[-1],
     "largest_pressure": lambda result, scene: jnp.max(result.pressure),
@@ -79,7 +79,7 @@ def read_sweep(
     names, rows = read_table(parameters)
     content = tomllib.loads(scene_file.read_text(encoding="utf-8"))
     with_parameters(scene, dict(zip(names, rows[0], strict=True)))
-    for k, row in enumerate(rows):
+    for k, row in enumerate(rows.tolist()):
         values = dict(zip(names, row, strict=True))
         try:
             check_numbers(changed_content(content, values))
@@ -185,7 +185,7 @@ def run(
     _folder(parts)
     with _locked(parts / f"lock_{process[0]}"):
         _same(sweep, parts / "sweep.json")
-        program, computed = jax.jit(partial(_rows, sweep.outputs, sweep.probes)), 0
+        program, computed = _program(sweep.outputs, sweep.probes), 0
         for k in list(_chunks(sweep))[process[0] :: process[1]]:
             file = parts / f"part_{k:06d}.h5"
             if not file.exists():
@@ -201,6 +201,11 @@ def _chunks(sweep: Sweep) -> range:
 
 def _of(sweep: Sweep, k: int) -> np.ndarray:
     return np.arange(k * sweep.chunk, min((k + 1) * sweep.chunk, len(sweep.rows)))
+
+
+@cache
+def _program(outputs: tuple, probes: tuple) -> Callable:
+    return jax.jit(partial(_rows, outputs, probes))
 
 
 def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Array]) -> dict[str, jax.Array]:

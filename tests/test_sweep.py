@@ -1,0 +1,260 @@
+"""Batches and sweeps: the numbers of single runs, whatever strategy, devices, kills and resumes."""
+
+import subprocess
+import sys
+import time
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import design, status, sweep
+from liverjax.__main__ import OUTPUTS, main
+from liverjax.batch import strategy_for
+
+SCENE = """
+[mesh]
+shape = "box"
+size = [0.1, 0.1, 0.1]
+cells = [2, 2, 2]
+[law]
+name = "neo_hookean"
+mu = 770.0
+bulk = 2200.0
+[body]
+density = 1060.0
+gravity = [0.0, 0.0, -9.81]
+[[fixed]]
+where = {z_min = 0.1}
+[solve]
+steps = 2
+"""
+ROWS = 7
+TABLE = "# made for a test\nlaw.mu, body.density\n" + "".join(f"{700 + 20 * k}, {1000 + 10 * k}\n" for k in range(ROWS))
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A scene file and a table."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "rows.csv").write_text(TABLE)
+    return tmp_path
+
+
+def command(files, *more: str) -> list[str]:
+    """Arguments of a sweep of these files."""
+    return ["sweep", str(files / "scene.toml"), str(files / "rows.csv"), "--chunk", "2", *more]
+
+
+def content(file) -> dict[str, bytes]:
+    """Every dataset's bytes."""
+    with h5py.File(file) as out:
+        return {name: value[()].tobytes() for name, value in out.items()}
+
+
+@pytest.mark.parametrize("strategy", ["map", "vmap"])
+def test_a_batch_is_the_loop_and_a_lane_that_fails_spoils_no_other(files, strategy):
+    scene = lj.load_scene(files / "scene.toml")
+    density = jnp.array([1000.0, 1e12, 1100.0])  # the second falls further than any law holds
+    batch = lj.simulate_batch(scene, {"body.density": density}, strategy)
+    assert batch.strategy == strategy and batch.devices == 1
+    codes = np.asarray(batch.result.status)
+    assert (codes[[0, 2]] == status.CONVERGED).all() and (codes[1] != status.CONVERGED).any()
+    for k in (0, 2):
+        alone = lj.simulate(lj.with_parameters(scene, {"body.density": density[k]})).positions
+        assert np.abs(np.asarray(batch.result.positions[k] - alone)).max() < 1e-12
+
+
+def test_lanes_go_one_after_another_on_a_cpu_only():
+    assert strategy_for("cpu") == "map" and strategy_for("cuda") == "vmap"
+
+
+def test_gradient_of_a_batch_mean(files):
+    scene = lj.with_parameters(lj.load_scene(files / "scene.toml"), {"solve.tolerance": 1e-11})
+
+    @jax.jit
+    @jax.value_and_grad
+    def mean(scale):
+        values = {"law.mu": scale * jnp.array([700.0, 800.0]), "body.density": jnp.array([1000.0, 1100.0])}
+        return jnp.mean(lj.simulate_batch(scene, values).result.positions[:, -1, :, 2])
+
+    h = 1e-4
+    difference = (mean(1 + h)[0] - mean(1 - h)[0]) / (2 * h)
+    assert np.isclose(difference, mean(1.0)[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "values, sentence",
+    [
+        ({}, "needs parameters"),
+        ({"law.mu": 700.0}, "law.mu has no lanes"),
+        ({"law.mu": [1.0, 2.0], "law.bulk": [1.0]}, "law.bulk has 1 lanes and law.mu has 2: give as many"),
+        ({"law.nu": [1.0]}, "did you mean mu"),
+    ],
+)
+def test_unusable_batches_are_refused(files, values, sentence):
+    with pytest.raises(lj.InputError, match=sentence):
+        lj.simulate_batch(lj.load_scene(files / "scene.toml"), values)
+
+
+def test_a_sweep_holds_the_rows_of_single_runs(files):
+    more = ("--store", "final_positions", "largest_displacement", "final_reactions", "--probe", "0", "3")
+    assert main(command(files, *more)) == 0
+    scene = lj.load_scene(files / "scene.toml")
+    with h5py.File(files / "rows.h5") as out:
+        assert out["parameters"].attrs["names"].tolist() == ["law.mu", "body.density"]
+        for k in (0, ROWS - 1):
+            values = dict(zip(("law.mu", "body.density"), out["parameters"][k], strict=True))
+            result = lj.simulate(lj.with_parameters(scene, values))
+            moved = np.linalg.norm(np.asarray(result.positions) - np.asarray(scene.mesh.points), axis=-1).max()
+            assert np.abs(out["final_positions"][k] - np.asarray(result.positions[-1])).max() < 1e-12
+            assert np.abs(out["probes"][k] - np.asarray(result.positions[:, [0, 3]])).max() < 1e-12
+            assert np.isclose(out["largest_displacement"][k], moved, rtol=1e-9)
+        assert out["status"].shape == (ROWS, 2) and not out["status"][:].any()
+        assert not (files / "rows.h5.parts").exists()
+
+
+def test_resumed_results_have_the_same_bytes(files):
+    assert main(command(files, "--out", str(files / "whole.h5"))) == 0
+    table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(_):
+        raise Stopped
+
+    out = files / "stopped.h5"
+    with pytest.raises(Stopped):
+        sweep.run(table, out, report=stop)  # after the first chunk
+    assert not out.exists()
+    assert main(command(files, "--out", str(out))) == 2  # unfinished: asks for --resume
+    (files / "stopped.h5.parts" / "part_000001.123").write_bytes(b"half a chunk")
+    assert main(command(files, "--out", str(out), "--resume")) == 0
+    assert content(out) == content(files / "whole.h5")
+    assert sweep.run(table, out, resume=True).computed == 0  # all there
+
+
+def test_killed_and_resumed(files):
+    """Signal 9 at some moment of the run, twice."""
+    whole, out = files / "whole.h5", files / "killed.h5"
+    assert main(command(files, "--out", str(whole))) == 0
+    call = [sys.executable, "-m", "liverjax", *command(files, "--out", str(out), "--resume")]
+    for chunks in (1, 2):
+        run = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while len(list(files.glob("killed.h5.parts/part_*.h5"))) < chunks and run.poll() is None:
+            time.sleep(0.001)
+        run.kill()
+        run.wait()
+    assert main(command(files, "--out", str(out), "--resume")) == 0
+    assert content(out) == content(whole)
+
+
+def test_two_devices_find_the_same(files):
+    """In a process of its own: the number of devices is fixed at the start."""
+    assert main(command(files, "--out", str(files / "one.h5"))) == 0
+    call = [sys.executable, "-m", "liverjax", *command(files, "--out", str(files / "two.h5"), "--devices", "2")]
+    subprocess.run(call, check=True, capture_output=True, timeout=300)
+    with h5py.File(files / "one.h5") as one, h5py.File(files / "two.h5") as two:
+        assert np.abs(one["final_positions"][:] - two["final_positions"][:]).max() < 1e-12
+
+
+def test_several_processes_share_a_sweep(files):
+    assert main(command(files, "--out", str(files / "whole.h5"))) == 0
+    table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
+    out = files / "shared.h5"
+    first = sweep.run(table, out, process=(0, 2))
+    assert first.file is None and first.computed == 4 and not out.exists()
+    second = sweep.run(table, out, process=(1, 2))
+    assert second.file == out and second.computed == 3
+    assert content(out) == content(files / "whole.h5")
+
+
+def test_failed_rows_are_listed_and_run_again_alone(files, capsys):
+    (files / "rows.csv").write_text("law.mu,body.density\n700,1000\n700,1e12\n720,1000\n")
+    assert main(command(files)) == 1
+    said = capsys.readouterr()
+    assert "1 failed" in said.out and "failed: row 2: " in said.err and "again: --rows 2 --out" in said.err
+    assert main(command(files, "--rows", "3", "--out", str(files / "again.h5"))) == 0
+    with h5py.File(files / "rows.h5") as all_rows, h5py.File(files / "again.h5") as again:
+        assert again["row"][:].tolist() == [3] and np.allclose(again["parameters"][0], all_rows["parameters"][2])
+        assert np.abs(again["final_positions"][0] - all_rows["final_positions"][2]).max() < 1e-12
+
+
+def test_what_cannot_be_resumed_is_refused(files, capsys):
+    table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
+    out = files / "rows.h5"
+    sweep.run(table, out, process=(0, 2))
+    with sweep._locked(out.with_name("rows.h5.parts") / "lock_0"):
+        assert main(command(files, "--resume")) == 2
+    assert "in use by another process" in capsys.readouterr().err
+    (files / "rows.csv").write_text(TABLE.replace("700", "701"))
+    assert main(command(files, "--resume")) == 2
+    assert "another sweep (its parameters differ)" in capsys.readouterr().err
+    (files / "rows.csv").write_text(TABLE)
+    (files / "scene.toml").write_text(SCENE.replace("2200", "2300"))
+    assert main(command(files, "--resume")) == 2
+    assert "another sweep (its scene differ)" in capsys.readouterr().err
+    (files / "scene.toml").write_text(SCENE)
+    assert main(command(files, "--resume")) == 0  # and nothing was lost
+    assert main(command(files)) == 2
+    assert "is there already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "table, sentence",
+    [
+        ("law.mu\n", "has no rows"),
+        ("law.mu,law.mu\n1,2\n", "names law.mu twice"),
+        ("law.mu\n1,2\n", "row 1 has 2 values for 1 names"),
+        ("law.mu\n1\nx\n", "row 2, law.mu = 'x' is no finite number"),
+        ("law.mu\nnan\n", "row 1, law.mu = 'nan' is no finite number"),
+        ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
+        ("law.nu\n700\n", "did you mean mu"),
+        ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
+    ],
+)
+def test_unusable_tables_are_refused(files, table, sentence):
+    (files / "rows.csv").write_text(table)
+    with pytest.raises(lj.InputError, match=sentence):
+        sweep.read_sweep(files / "scene.toml", files / "rows.csv")
+
+
+def test_a_full_disk_keeps_what_was_computed(files, monkeypatch, capsys):
+    original = sweep._write_part
+
+    def full(file, table, k, program):
+        if k == 1:
+            raise OSError(28, "No space left on device")
+        original(file, table, k, program)
+
+    monkeypatch.setattr(sweep, "_write_part", full)
+    assert main(command(files)) == 1
+    assert "No space left on device: finished chunks are kept, go on with --resume" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert main(command(files, "--resume")) == 0
+
+
+@pytest.mark.parametrize("kind, rows", [("grid", 9), ("latin", 10), ("sobol", 8)])
+def test_designs(files, kind, rows):
+    table = files / "design.csv"
+    ranges = ["law.mu=500:1000", "body.density=1000:1100"]
+    assert main(["design", str(table), *ranges, "--kind", kind, "--rows", str(rows), "--seed", "3"]) == 0
+    names, found = sweep.read_table(table)
+    assert names == ("law.mu", "body.density") and found.shape == (rows, 2)
+    assert (found.min(axis=0) >= [500, 1000]).all() and (found.max(axis=0) <= [1000, 1100]).all()
+    again = design.design(design.read_ranges(ranges), rows, kind, 3)
+    assert np.array_equal(found, again)
+
+
+def test_unusable_designs_are_refused(files, capsys):
+    for given, sentence in ((["law.mu=5"], "no range"), (["law.mu=5:1"], "does not rise"), (["a=1:2", "a=1:2"], "two")):
+        assert main(["design", str(files / "d.csv"), *given]) == 2
+        assert sentence in capsys.readouterr().err
+
+
+def test_the_help_names_every_output():
+    assert tuple(sweep.OUTPUTS) == OUTPUTS
