@@ -53,7 +53,9 @@ def main() -> None:
             "run_s": took["run_s"],
         }
         print(name, rows[name]["converged_to_m_s2"], moved[:reached][-1:], J[:reached][-1:], took["run_s"], flush=True)
-        left.plot(g[:reached], 100 * moved[:reached], "o-", ms=3, color=colour, label=name)
+        residual = rows[name]["residual"]
+        label = f"{name}: {took['run_s']:.1f} s, residuals to {residual:.0e}"
+        left.plot(g[:reached], 100 * moved[:reached], "o-", ms=3, color=colour, label=label)
         right.plot(g[:reached], J[:reached], "o-", ms=3, color=colour)
     left.set(xlabel="gravity [m/s$^2$]", ylabel="largest displacement [cm]", title="liver phantom, static load path")
     right.set(

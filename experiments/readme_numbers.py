@@ -145,11 +145,12 @@ def speed() -> str:
         rows.append(f"| `{name}` | {time} | {error} | " + " | ".join(slower) + " |")
     neo, cube = fig4["laws"]["neo_hookean"]["seconds"], solve["static_cube"]
     over_floor, over_copy = neo["contracted"] / neo["floor"], neo["force only"] / neo["copy"]
+    into_rows, pulled = 1e3 * neo["into the solver's rows"], cube["tetrahedra"]
     rows += [
         "",
         f"For the neo-Hookean law that is {over_floor:.2g} times the time to write the 45 different entries and",
-        f"nothing else; {1e3 * neo[INTO]:.2g} ms with assembly into the solver's rows; the force alone takes",
-        f"{over_copy:.2g} times as long as copying 23 MB. A cube of {cube['tetrahedra']:,} tetrahedra is pulled by 20 % in one",
+        f"nothing else; {into_rows:.2g} ms with assembly into the solver's rows; the force alone takes",
+        f"{over_copy:.2g} times as long as copying 23 MB. A cube of {pulled:,} tetrahedra is pulled by 20 % in one",
         f"load step in {cube['seconds']:.2g} s, residual {cube['residual']:.0e}; with the gradient by mu that takes",
         f"{cube['gradient_over_forward']:.3g} times as long, error {cube['gradient_error']:.0e}.",
         "",
@@ -160,7 +161,7 @@ def speed() -> str:
     ]
     for r in solve["liver"]:
         off = f"{100 * r['error_of_positions']:.2g} %" if r["newton"] == "one" else "as it is solved"
-        off = f"{r['failed_steps']} steps failed" if r["failed_steps"] else off
+        off = f"failed steps: {r['failed_steps']}" if r["failed_steps"] else off
         residual = "" if r["largest_residual"] is None else f"{r['largest_residual']:.0e}"
         cells = (r["gravity"], f"{r['dt']:g} s", r["newton"], f"{r['steps_per_s']:.3g}", off, residual)
         rows.append("| " + " | ".join(cells) + " |")
@@ -176,7 +177,6 @@ def speed() -> str:
     return "\n".join(rows)
 
 
-INTO = "into the solver's rows"
 PARTS = {"numbers": numbers, "laws": laws, "simulations": simulations, "speed": speed}
 
 

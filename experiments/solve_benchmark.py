@@ -171,13 +171,13 @@ def draw(steps: list[dict], ways: list[dict]):
     for load, marker in (("mild", "o"), ("full", "s")):
         for newton, colour in (("one", ORANGE), ("to 1e-8", BLUE)):
             rows = [r for r in steps if r["gravity"] == load and r["newton"] == newton]
-            label = f"{newton} iteration{'s' * (newton != 'one')}, {load} gravity"
+            label = f"{'one iteration' if newton == 'one' else 'Newton to 1e-8'}, {load} gravity"
             left.plot(
                 [r["dt"] for r in rows], [r["steps_per_s"] for r in rows], marker + "-", color=colour, label=label
             )
             for r in rows:
-                text = f"{100 * r['error_of_positions']:.1g} %" if newton == "one" else f"{r['largest_residual']:.0e}"
-                text = f"{r['failed_steps']} steps failed" if r["failed_steps"] else text
+                text = f"{100 * r['error_of_positions']:.2g} %" if newton == "one" else f"{r['largest_residual']:.0e}"
+                text = f"failed steps: {r['failed_steps']}" if r["failed_steps"] else text
                 left.annotate(text, (r["dt"], r["steps_per_s"]), fontsize=6, xytext=(4, 4), textcoords="offset points")
     left.plot([0.01, 0.05, 0.3], [100, 20, 1 / 0.3], ":", color=GREY, label="real time")
     left.set(xscale="log", yscale="log", xlabel="time step [s]", ylabel="steps a second")

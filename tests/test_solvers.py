@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import newton, status
+from liverjax import continuation, newton, status
 from liverjax.linear import conjugate_gradients, differentiable_solve
 
 RNG = np.random.default_rng(0)
@@ -91,3 +91,21 @@ def test_lanes_do_not_disturb_each_other():
     x, s = jax.vmap(_solve)(p)
     assert s.status.tolist() == [status.CONVERGED, status.NOT_FINITE, status.CONVERGED]
     assert np.allclose(x[0], _solve(0.1)[0]) and np.allclose(x[2], _solve(20.0)[0])
+
+
+def test_a_step_that_fails_in_one_go_is_followed_in_parts():
+    """log q + 5 = 0 from q = 1: full steps leave the domain until the part is an eighth."""
+    method = continuation.Method(
+        residual=lambda q, s: (jnp.log(q) + 5, jnp.ones(()), None),
+        tangent=lambda q, s, by, near: 1 / q,
+        solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32)),
+        preconditioner=lambda K: lambda r: r / K,
+        moved=False,
+    )
+    options = continuation.StepOptions(max_halvings=0)
+    for guess in (None, jnp.array([-1.0])):  # a guess that is out of the domain costs no cut
+        q, s, kept = jax.jit(lambda q, g=guess: continuation.solve(method, q, options, g))(jnp.ones(1))
+        assert s.status == status.CONVERGED and s.cuts == 3 and bool(kept.made)
+        assert np.allclose(q, np.exp(-5), rtol=1e-7)
+    q, s, _ = jax.jit(lambda q: continuation.solve(method, q, options._replace(max_cuts=2)))(jnp.ones(1))
+    assert s.status != status.CONVERGED and np.isfinite(q)
