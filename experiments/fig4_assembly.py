@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--laws", nargs="*", default=list(laws.LAWS))
     options = parser.parse_args()
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (15, 15, 15))
-    x = mesh.points + 0.004 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
+    x = mesh.points + 0.01 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
     stored = jax.jit(assembly_rivals.stored_matrices)(mesh)
     block = jnp.zeros(COPIED // 8)
     rows = {}

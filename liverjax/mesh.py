@@ -44,26 +44,32 @@ def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = No
     """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`).
 
     The positions may be traced, the node numbers may not.
-    The shape vectors are the rows of the inverse edge matrix, written as cross products over six times the volume.
     """
     if isinstance(tetrahedra, jax.core.Tracer):
         raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
     points = jnp.asarray(points, dtype=float)
     neighbours = pattern(tetrahedra, points)
     tetrahedra = jnp.asarray(tetrahedra, dtype=jnp.int32)
-    corner = points[tetrahedra]
-    e = corner[:, 1:] - corner[:, :1]
-    normals = jnp.stack([jnp.cross(e[:, 1], e[:, 2]), jnp.cross(e[:, 2], e[:, 0]), jnp.cross(e[:, 0], e[:, 1])])
-    six_volumes = (e[:, 0] * normals[0]).sum(-1)
+    shape_vectors, volumes = _geometry(points, tetrahedra)
     sets = {k: jnp.asarray(v, dtype=jnp.int32) for k, v in (node_sets or {}).items()}
     return TetMesh(
         points=points,
         tetrahedra=tetrahedra,
-        shape_vectors=jnp.transpose(normals / six_volumes[None, :, None], (0, 2, 1)),
-        volumes=six_volumes / 6,
+        shape_vectors=shape_vectors,
+        volumes=volumes,
         node_sets=sets,
         pattern=neighbours,
     )
+
+
+@jax.jit
+def _geometry(points: jax.Array, tetrahedra: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Shape vectors, the rows of the inverse edge matrix as cross products over six times the volume, and volumes."""
+    corner = points[tetrahedra]
+    e = corner[:, 1:] - corner[:, :1]
+    normals = jnp.stack([jnp.cross(e[:, 1], e[:, 2]), jnp.cross(e[:, 2], e[:, 0]), jnp.cross(e[:, 0], e[:, 1])])
+    six_volumes = (e[:, 0] * normals[0]).sum(-1)
+    return jnp.transpose(normals / six_volumes[None, :, None], (0, 2, 1)), six_volumes / 6
 
 
 def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:

@@ -87,10 +87,11 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    count = int(patch.max(initial=0)) + 1
-    low = jnp.full((count, 3), jnp.inf, points.dtype).at[patch].min(points)
-    high = jnp.full((count, 3), -jnp.inf, points.dtype).at[patch].max(points)
-    widest = jnp.max(high - low, axis=1)
-    half = jnp.where(widest > 0, widest / 2, 1.0)
+    # On the host where positions are known: small programs of their own would take a second to compile.
+    xp, points = (jnp, points) if isinstance(points, jax.core.Tracer) else (np, np.asarray(points))
+    members = [points[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
+    low, high = (xp.stack([f(m, axis=0) if len(m) else xp.zeros(3) for m in members]) for f in (xp.min, xp.max))
+    widest = xp.max(high - low, axis=1)
+    half = xp.where(widest > 0, widest / 2, 1.0)
     place = (points - (low + high)[patch] / 2) / half[patch][:, None]
-    return jnp.concatenate([jnp.ones_like(place[:, :1]), place], axis=1), jnp.mean(widest)
+    return jnp.asarray(xp.concatenate([xp.ones_like(place[:, :1]), place], axis=1)), jnp.asarray(xp.mean(widest))

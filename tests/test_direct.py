@@ -38,19 +38,22 @@ def directly(scene: lj.Scene) -> lj.Scene:
     return replace(scene, solve=replace(scene.solve, linear_solver="direct"))
 
 
-@pytest.mark.parametrize("scene", [PULLED, POROUS], ids=["pulled", "porous"])
-def test_a_factorisation_finds_the_same(scene):
-    one, other = lj.simulate(scene).check(), lj.simulate(directly(scene)).check()
+def test_a_factorisation_finds_the_same():
+    one, other = lj.simulate(POROUS).check(), lj.simulate(directly(POROUS)).check()
     assert np.abs(np.asarray(one.positions - other.positions)).max() < 1e-9 * 0.1
     assert int(one.statistics.linear_iterations.sum()) > 0 == int(other.statistics.linear_iterations.sum())
 
 
-def test_its_gradient_is_the_same():
-    def force(scene, mu):
-        return jnp.sum(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).reactions[-1, MESH.node_sets["z_max"], 2])
+def test_its_gradient_against_differences():
+    @jax.jit
+    @jax.value_and_grad
+    def force(mu):
+        result = lj.simulate(lj.with_parameters(directly(PULLED), {"law.mu": mu}))
+        return jnp.sum(result.reactions[-1, MESH.node_sets["z_max"], 2])
 
-    one, other = (jax.jit(jax.grad(lambda mu, s=s: force(s, mu)))(770.0) for s in (PULLED, directly(PULLED)))
-    assert np.isclose(one, other, rtol=1e-9)
+    h = 0.1
+    difference = (force(770 + h)[0] - force(770 - h)[0]) / (2 * h)
+    assert np.isclose(difference, force(770.0)[1], rtol=1e-7)
 
 
 def test_a_matrix_without_an_inverse_is_told():

@@ -73,17 +73,16 @@ def test_terzaghis_consolidation():
     assert errors[0] / errors[1] > 1.6  # first order in the step, which is halved with the layers
 
 
-@pytest.mark.parametrize("duration", [1e-3, 1.0, 1e4])
-def test_the_implicit_scheme_is_stable_at_any_step(duration):
+def test_the_implicit_scheme_is_stable_at_any_step():
     # Ten steps of 1e-4 to 1e3 diffusion times.
-    result = lj.simulate(column(8, 10, duration)).check()
-    top = float(jnp.max(result.positions[-1, :, 2])) - HEIGHT
     at_once, at_last = LOAD / (MODULUS + 2200) * HEIGHT, LOAD / MODULUS * HEIGHT
-    assert np.isfinite(np.asarray(result.pressure)).all()
-    # From the undrained settlement (to the order of the load) to the drained one.
-    assert top / at_once > 0.99 and top / at_last < 1.01
-    if duration > 1:
-        assert np.isclose(top, at_last, rtol=1e-2)
+    for duration in (1e-3, 1.0, 1e4):
+        result = lj.simulate(column(8, 10, duration)).check()
+        top = float(jnp.max(result.positions[-1, :, 2])) - HEIGHT
+        assert np.isfinite(np.asarray(result.pressure)).all()
+        # From the undrained settlement (to the order of the load) to the drained one.
+        assert top / at_once > 0.99 and top / at_last < 1.01
+    assert np.isclose(top, at_last, rtol=1e-2)
 
 
 def test_the_chapters_scheme_is_not():

@@ -103,9 +103,12 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
         moved=False,
     )
     options = continuation.StepOptions(max_halvings=0)
+    cuts = []
     for guess in (None, jnp.array([-1.0])):  # a guess that is out of the domain costs no cut
         q, s, kept = jax.jit(lambda q, g=guess: continuation.solve(method, q, options, g))(jnp.ones(1))
-        assert s.status == status.CONVERGED and s.cuts == 3 and bool(kept.made)
+        assert s.status == status.CONVERGED and bool(kept.made)
         assert np.allclose(q, np.exp(-5), rtol=1e-7)
+        cuts.append(int(s.cuts))
+    assert cuts[0] == cuts[1] >= 3
     q, s, _ = jax.jit(lambda q: continuation.solve(method, q, options._replace(max_cuts=2)))(jnp.ones(1))
     assert s.status != status.CONVERGED and np.isfinite(q)
