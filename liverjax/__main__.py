@@ -120,13 +120,18 @@ def run_sweep(options: argparse.Namespace) -> int:
     import jax
     from tqdm import tqdm
 
-    if options.devices:
+    if options.devices is not None:
+        if options.devices < 1:
+            raise InputError(f"--devices {options.devices} must be above 0: give e.g. 2")
         jax.config.update("jax_num_cpu_devices", options.devices)
     process = (0, 1)
     if options.distributed is not None:
-        # Host:port, number of processes and this one's number; without them what the cluster says.
-        address, count, number = (*options.distributed, None, None, None)[:3]
-        jax.distributed.initialize(address, count and int(count), None if number is None else int(number))
+        given = options.distributed
+        if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
+            raise InputError(
+                f"--distributed {' '.join(given)}: give HOST:PORT, number of processes and this one's, or nothing"
+            )
+        jax.distributed.initialize(*given[:1], *map(int, given[1:]))  # nothing: what the cluster says
         process = (jax.process_index(), jax.process_count())
 
     from liverjax import status, sweep

@@ -28,7 +28,7 @@ class StepStatistics(NamedTuple):
 
 
 class StepOptions(NamedTuple):
-    """How hard to try; all static."""
+    """How hard to try; all but the tolerance is static."""
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
     max_iterations: int = 25  # a part; 1: one step of Newton, no convergence asked for, derivatives not those of it
@@ -319,6 +319,6 @@ def _direction(
         lambda: method.solve(K, load, forcing, options.max_linear_iterations),
         lambda: (jnp.zeros_like(load), jnp.zeros((), jnp.int32)),
     )
-    pace = linear / -jnp.log10(forcing)
+    pace = (linear / -jnp.log10(forcing)).astype(load.dtype)
     first = jnp.where(renew & ~near[0], pace, kept.pace)
     return dq, linear, Kept(K, kept.made | renew, first, jnp.where(wanted, pace > options.wear * first, kept.worn))

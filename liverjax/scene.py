@@ -362,10 +362,17 @@ def changed_content(content: dict[str, Any], values: dict[str, Any]) -> dict[str
     content = copy.deepcopy(content)
     for name, value in values.items():
         *path, last = [int(key) if key.isdigit() else key for key in name.split(".")]
-        table = content
-        for key in path:
-            table = table[key] if isinstance(key, int) else table.setdefault(key, {})
-        table[last] = value
+        table = content if path[:1] != ["mesh"] else None  # the mesh is one for all
+        try:
+            for k, key in enumerate(path):
+                if k == 1 and isinstance(key, int) and isinstance(table, dict):
+                    continue  # [traction] for [[traction]]: one table stands for a list of one
+                table = table[key] if isinstance(key, int) else table.setdefault(key, {})
+            if path == ["law"] and isinstance(table, list) and len(table) == 1:
+                table = table[0]
+            table[last] = value
+        except (KeyError, IndexError, TypeError, AttributeError):
+            raise InputError(f"parameter {name!r} is no number of the scene file: name one that stands there") from None
     return content
 
 

@@ -393,6 +393,8 @@ def test_single_precision_says_so():
     double = lj.simulate(replace(scene, solve=lj.Solve()))
     assert single.positions.dtype == jnp.float32
     assert np.abs(np.asarray(single.positions) - np.asarray(double.positions)).max() < 1e-4 * 0.01
+    once = replace(scene, solve=replace(scene.solve, newton_iterations=1))
+    assert jax.eval_shape(lj.simulate, once).positions.dtype == jnp.float32
 
 
 def test_cooks_membrane():

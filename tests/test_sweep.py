@@ -14,6 +14,7 @@ import liverjax as lj
 from liverjax import design, status, sweep
 from liverjax.__main__ import OUTPUTS, main
 from liverjax.batch import strategy_for
+from liverjax.scene import changed_content
 
 SCENE = """
 [mesh]
@@ -212,6 +213,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu\nnan\n", "row 1, law.mu = 'nan' is no finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
         ("law.nu\n700\n", "did you mean mu"),
+        ("mesh.points.0\n700\n", "'mesh.points.0' is no number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
     ],
 )
@@ -252,6 +254,21 @@ def test_unusable_designs_are_refused(files, capsys):
     for given, sentence in ((["law.mu=5"], "no range"), (["law.mu=5:1"], "does not rise"), (["a=1:2", "a=1:2"], "two")):
         assert main(["design", str(files / "d.csv"), *given]) == 2
         assert sentence in capsys.readouterr().err
+
+
+def test_unusable_options_are_refused(files, capsys):
+    for given, sentence in (
+        (("--devices", "0"), "--devices 0 must be"),
+        (("--distributed", "x", "two"), "give HOST:PORT"),
+    ):
+        assert main(command(files, *given)) == 2
+        assert sentence in capsys.readouterr().err
+
+
+def test_one_table_stands_for_a_list_of_one():
+    content = {"traction": {"pressure": 4.0}, "law": [{"name": "neo_hookean", "mu": 1.0}]}
+    changed = changed_content(content, {"traction.0.pressure": 5.0, "law.mu": 2.0})
+    assert changed["traction"]["pressure"] == 5.0 and changed["law"][0]["mu"] == 2.0
 
 
 def test_the_help_names_every_output():
