@@ -115,6 +115,29 @@ def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
     return 1 if np.any(codes != status.CONVERGED) else 0
 
 
+def _share(given: list[str]) -> tuple[int, int]:
+    """Number of this process and of all, from JAX's distributed runtime: HOST:PORT N I, or nothing on a cluster."""
+    import jax
+
+    if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
+        raise InputError(
+            f"--distributed {' '.join(given)}: give HOST:PORT, number of processes and this one's, or nothing"
+        )
+    if given and int(given[2]) >= int(given[1]):
+        raise InputError(f"--distributed {' '.join(given)}: processes are numbered from 0 to {int(given[1]) - 1}")
+    try:
+        jax.distributed.initialize(*given[:1], *map(int, given[1:]))
+        process = (jax.process_index(), jax.process_count())
+        # Rows need no communication: left at once, so that a process that dies stops no other.
+        jax.distributed.shutdown()
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"--distributed: the processes did not find each other ({reason}): give HOST:PORT N I"
+        ) from None
+    return process
+
+
 def run_sweep(options: argparse.Namespace) -> int:
     """Run a scene for every row of a table; 1 if a row failed or the disk is full, with what was computed kept."""
     import jax
@@ -124,15 +147,7 @@ def run_sweep(options: argparse.Namespace) -> int:
         if options.devices < 1:
             raise InputError(f"--devices {options.devices} must be above 0: give e.g. 2")
         jax.config.update("jax_num_cpu_devices", options.devices)
-    process = (0, 1)
-    if options.distributed is not None:
-        given = options.distributed
-        if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
-            raise InputError(
-                f"--distributed {' '.join(given)}: give HOST:PORT, number of processes and this one's, or nothing"
-            )
-        jax.distributed.initialize(*given[:1], *map(int, given[1:]))  # nothing: what the cluster says
-        process = (jax.process_index(), jax.process_count())
+    process = (0, 1) if options.distributed is None else _share(options.distributed)
 
     from liverjax import status, sweep
 

@@ -235,8 +235,9 @@ def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
 def _folder(parts: Path) -> None:
     try:
         parts.mkdir(parents=True, exist_ok=True)
-        (parts / "probe").write_text("")
-        (parts / "probe").unlink()
+        probe = parts / f"probe.{os.getpid()}"
+        probe.write_text("")
+        probe.unlink()
     except OSError as error:
         raise InputError(f"{parts}: {error.strerror}: name an --out that can be written") from None
 

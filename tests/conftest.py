@@ -1,6 +1,8 @@
 """Strict numerics for every test: 64 bit, no silent rank promotion; data of other programs where it is present."""
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -18,17 +20,34 @@ ROOT = Path(__file__).parent.parent
 SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
 
 
-@pytest.fixture(autouse=True)
-def _strict():
-    assert jax.config.jax_enable_x64
+def pytest_configure(config):
+    """Programs compiled once are found again by the other worker and by commands that tests start."""
+    config.addinivalue_line("markers", "quick_to_compile: few optimisations, where compiling takes longer than running")
+    if not hasattr(config, "workerinput"):
+        config.compiled = tempfile.mkdtemp()
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = config.compiled
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+
+
+def pytest_unconfigure(config):
+    """Leave nothing behind."""
+    if hasattr(config, "compiled"):
+        shutil.rmtree(config.compiled, ignore_errors=True)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _forget_compiled_programs():
+def _compilation(request):
+    quick = any(mark.name == "quick_to_compile" for mark in request.node.iter_markers())
+    jax.config.update("jax_disable_most_optimizations", quick)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # of commands that tests start
     # Hundreds of programs in one process: with jax 0.10.1 a stiffness and a force came out wrong there, never in a
     # process that held few.
-    yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    assert jax.config.jax_enable_x64
 
 
 @pytest.fixture

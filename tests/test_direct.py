@@ -9,6 +9,8 @@ import liverjax as lj
 from liverjax import boundary, direct, simulation, status, tangent
 from liverjax.struct import replace
 
+pytestmark = pytest.mark.quick_to_compile
+
 LAW = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
 MESH = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
 HELD = (lj.Fixed(nodes=MESH.node_sets["z_min"]),)

@@ -11,6 +11,8 @@ from liverjax.scene import scene_from
 from liverjax.simulation import initial_state
 from liverjax.struct import replace
 
+pytestmark = pytest.mark.quick_to_compile
+
 #: Table 2 with the permeability read in mm^2/(Pa s).
 SPONGE = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
 SHEAR, HEIGHT, LOAD = 300.0, 0.1, -0.4

@@ -16,6 +16,8 @@ from liverjax.__main__ import main
 from liverjax.scene import scene_from
 from liverjax.struct import replace
 
+pytestmark = pytest.mark.quick_to_compile
+
 SCENE = """
 [mesh]
 shape = "box"

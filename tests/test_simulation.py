@@ -14,6 +14,8 @@ from liverjax.linear import conjugate_gradients
 from liverjax.simulation import equations, initial_state, step
 from liverjax.struct import replace
 
+pytestmark = pytest.mark.quick_to_compile
+
 TABLE_2 = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
 LAW = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
 

@@ -16,6 +16,8 @@ from liverjax.__main__ import OUTPUTS, main
 from liverjax.batch import strategy_for
 from liverjax.scene import changed_content
 
+pytestmark = pytest.mark.quick_to_compile
+
 SCENE = """
 [mesh]
 shape = "box"

@@ -12,6 +12,8 @@ from liverjax import assembly, boundary, mjed, porosity, tangent, terms, viscosi
 from liverjax.kinematics import add_matrices, deformation_gradient, determinant
 from liverjax.linear import chebyshev, stabilised_biconjugate_gradients
 
+pytestmark = pytest.mark.quick_to_compile
+
 rng = np.random.default_rng(5)
 LAW = lj.laws.MooneyRivlin(c10=300.0, c01=85.0, bulk=2200.0)
 PRONY = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
