@@ -199,8 +199,8 @@ def _chunks(sweep: Sweep) -> range:
     return range(-(-len(sweep.rows) // sweep.chunk))
 
 
-def _of(sweep: Sweep, k: int) -> np.ndarray:
-    return np.arange(k * sweep.chunk, min((k + 1) * sweep.chunk, len(sweep.rows)))
+def _of(sweep: Sweep, k: int) -> range:
+    return range(k * sweep.chunk, min((k + 1) * sweep.chunk, len(sweep.rows)))
 
 
 @cache
@@ -210,17 +210,16 @@ def _program(outputs: tuple, probes: tuple) -> Callable:
 
 def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Array]) -> dict[str, jax.Array]:
     result = simulate_batch(scene, values).result
-    return {name: jax.vmap(lambda r, name=name: OUTPUTS[name](r, scene))(result) for name in outputs} | {
-        "probes": result.positions[:, :, np.array(probes, dtype=int)],
-        "status": result.status,
-        "residual": result.statistics.residual,
-    }
+    stored = {name: jax.vmap(lambda r, name=name: OUTPUTS[name](r, scene))(result) for name in outputs}
+    if probes:
+        stored["probes"] = result.positions[:, :, np.array(probes, dtype=int)]
+    return stored | {"status": result.status, "residual": result.statistics.residual}
 
 
 def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
     chosen = _of(sweep, k)
     # The last chunk is filled up with its last row: one program for all.
-    filled = np.concatenate([chosen, np.repeat(chosen[-1:], sweep.chunk - len(chosen))])
+    filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
     values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
     result = program(sweep.scene, values)
     temporary = file.with_suffix(f".{os.getpid()}")
@@ -305,10 +304,11 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
                     if name not in whole:
                         whole.create_dataset(name, (n, *value.shape[1:]), value.dtype)
                         whole[name].attrs["unit"] = _UNITS.get(name, "1" if name in ("status", "residual") else "m")
-                    whole[name][_of(sweep, k)] = value[:]
+                    whole[name][_of(sweep, k).start : _of(sweep, k).stop] = value[:]
         whole["row"], whole["parameters"] = sweep.numbers, sweep.rows
         whole["parameters"].attrs["names"] = list(sweep.names)
-        whole["probe_nodes"] = np.array(sweep.probes, dtype=int)
+        if sweep.probes:
+            whole["probe_nodes"] = np.array(sweep.probes, dtype=int)
         whole["reference"] = np.asarray(sweep.scene.mesh.points)
         whole["tetrahedra"] = np.asarray(sweep.scene.mesh.tetrahedra)
         whole.attrs["sweep"] = json.dumps(sweep.identity)
