@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def _figure(content: dict) -> plt.Figure:
-    figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.2), layout="constrained")
     t, mm = content["times_s"], 1e3
     low, high = mm * np.array(content["interval_m"])
     left.fill_between(t, low, high, alpha=0.3, label="95 % of the draws")
@@ -128,7 +128,8 @@ def _figure(content: dict) -> plt.Figure:
         right.plot(t, content["total_order"][name], marker=marker, markersize=3, label=LABELS[name])
         right.fill_between(t, *np.array(content["total_order_interval"][name]).T, alpha=0.15)
     right.set(xlabel="time [s]", ylabel="total Sobol index [1]", title="Which parameter the spread comes from")
-    right.legend(ncols=2)
+    right.set_ylim(0, 1)
+    right.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     return figure
 
 

@@ -55,12 +55,12 @@ def swept(folder: Path, rows: int, devices: int) -> tuple[float, Path]:
 def looped(folder: Path, rows: int) -> float:
     """Seconds a row of a compiled function called row after row."""
     scene = lj.load_scene(folder / "scene.toml")
-    program = jax.jit(lambda v: lj.simulate(lj.with_parameters(scene, v)).positions[-1])
+    program = jax.jit(lambda scene, v: lj.simulate(lj.with_parameters(scene, v)).positions[-1])
     values = np.loadtxt(folder / f"rows_{rows}.csv", delimiter=",", skiprows=2)
-    program({"law.mu": 700.0, "law.bulk": 2000.0})
+    program(scene, {"law.mu": 700.0, "law.bulk": 2000.0})
     begin = time.perf_counter()
     for mu, bulk in values:
-        jax.block_until_ready(program({"law.mu": mu, "law.bulk": bulk}))
+        jax.block_until_ready(program(scene, {"law.mu": mu, "law.bulk": bulk}))
     return (time.perf_counter() - begin) / rows
 
 

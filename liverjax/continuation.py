@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from liverjax import status
 from liverjax.linear import differentiable_solve
+from liverjax.minimisation import minimise, untangled
 
 
 class StepStatistics(NamedTuple):
@@ -40,6 +41,8 @@ class StepOptions(NamedTuple):
     max_linear_iterations: int = 3000
     max_halvings: int = 6
     max_cuts: int = 12
+    max_minimisation: int = 100  # iterations on the energy
+    max_shortenings: int = 30  # of one of them
 
 
 class Kept(NamedTuple):
@@ -56,6 +59,7 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| there
     aim: jax.Array  # |r| that the last direction was to remove
     kept: Kept
+    indefinite: jax.Array  # the last tangent solved with was not positive
     stale: jax.Array  # dq is of a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
@@ -86,8 +90,8 @@ class Method(NamedTuple):
     #: (q, s, by, near) -> any pytree that stands for dr/dq, used again while iterations converge fast with it; near
     #: is None, or whether an earlier one is near enough to take parts from, and that one.
     tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
-    #: (tangent, b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations).
-    solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]]
+    #: (tangent, b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations, whether dr/dq seems positive).
+    solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: Whether `solve` is of a dr/dq that is exact and symmetric: derivatives are then solved for with it.
@@ -96,6 +100,14 @@ class Method(NamedTuple):
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
+    #: q -> energy of which r(q, 1) is the gradient; with it a step that cannot be followed is minimised.
+    energy: Callable[[jax.Array], jax.Array] | None = None
+    #: As `tangent`, of a matrix without negative eigenvalues.
+    definite: Callable[[jax.Array, jax.Array, Any, Any], Any] | None = None
+    #: (q, s) -> whether elements are inverted.
+    tangled: Callable[[jax.Array, Any], jax.Array] | None = None
+    #: The same of a body whose energy is finite where elements are inverted; None where it is already.
+    surrogate: Any = None
 
 
 def nothing_kept(method: Method, start: jax.Array) -> Kept:
@@ -128,6 +140,8 @@ def solve(
     def follow(_, start):
         if options.max_iterations == 1:
             return _one_iteration(method, start, kept, options)
+        if method.energy is not None:
+            return _robust(method, start, guess, kept, options)
         return _follow(method, start, guess, kept, options)
 
     # Two rules: how the root was found has no derivative, and the root's own is by the tangent there.
@@ -151,9 +165,8 @@ def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOp
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
     r, _, by = method.residual(start, zero)
     load = -r - _along(method, start, zero) if method.moved else -r
-    dq, linear, kept = _direction(
-        method, options, kept, (start, zero, by), load, options.one_step_tolerance, True, True
-    )
+    at, wanted = (start, zero, by), options.one_step_tolerance
+    dq, linear, kept, _ = _direction(method, options, kept, at, load, wanted, True, True)
     q = start + dq
     r, force, _ = method.residual(q, one)
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
@@ -165,10 +178,34 @@ def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOp
 def _follow(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
     begin = _first_point(start, guess, kept)
     end = jax.lax.while_loop(lambda c: ~c.done, partial(_iterate, method, options, start), begin)
-    failure = jnp.where(jnp.isfinite(end.relative), status.STALLED, status.NOT_FINITE)
+    stopped = jnp.where(end.cuts > options.max_cuts, status.STEP_CUT, status.STALLED)
+    failure = jnp.where(end.indefinite, status.INDEFINITE, stopped)
+    failure = jnp.where(jnp.isfinite(end.relative), failure, status.NOT_FINITE)
     code = jnp.where((end.s >= 1) & (end.relative <= options.tolerance), status.CONVERGED, failure)
     counts = (code, end.total, end.linear, end.cuts)
     return end.q, (StepStatistics(*(n.astype(start.dtype) for n in counts), end.relative), end.kept)
+
+
+def _robust(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
+    """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least."""
+    zero = jnp.zeros((), start.dtype)
+    nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
+    begin = start if guess is None else jnp.where(method.tangled(guess, zero + 1), start, guess)
+    q, (taken, kept) = jax.lax.cond(
+        method.tangled(start, zero),
+        lambda: (start, (nothing, kept)),
+        lambda: _follow(method, start, guess, kept, options),
+    )
+
+    def again():
+        first, iterations, linear = untangled(method, begin, options)
+        least = minimise(method, first, options)
+        iterations, linear = iterations + least.iterations, linear + least.linear_iterations
+        more = (least.code, taken.iterations + iterations, taken.linear_iterations + linear)
+        taken_now = StepStatistics(*(jnp.asarray(n, start.dtype) for n in more), taken.cuts, least.relative)
+        return least.q, (taken_now, kept._replace(made=jnp.array(False)))
+
+    return jax.lax.cond(taken.status == status.CONVERGED, lambda: (q, (taken, kept)), again)
 
 
 def _first_point(start: jax.Array, guess: Any, kept: Kept) -> _Point:
@@ -179,6 +216,7 @@ def _first_point(start: jax.Array, guess: Any, kept: Kept) -> _Point:
         size=one * jnp.inf,
         aim=zero,
         kept=kept,
+        indefinite=jnp.array(no),
         stale=jnp.array(no),
         remake=jnp.array(no),
         dq=jnp.zeros_like(start),
@@ -275,12 +313,14 @@ def _iterate(method: Method, options: StepOptions, start: jax.Array, c: _Point) 
     goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
     forcing = jnp.where(v.launch_now, options.linear_tolerance, jnp.maximum(reach, jnp.maximum(goal, 1e-12)))
     forcing = jnp.minimum(forcing, options.linear_tolerance)
-    dq, linear, kept = _direction(method, options, c.kept, (trial, s, by), load, forcing, renew, v.go_on)
+    at = (trial, s, by)
+    dq, linear, kept, positive = _direction(method, options, c.kept, at, load, forcing, renew, v.go_on)
     return _Point(
         q=jnp.where(v.accepted, trial, c.q),
         size=jnp.where(v.accepted, size, c.size),
         aim=jnp.where(v.go_on, jnp.linalg.norm(load), c.aim),
         kept=kept,
+        indefinite=jnp.where(v.go_on, ~positive, c.indefinite),
         stale=jnp.where(v.go_on, ~renew, c.stale),
         remake=v.remake,
         dq=jnp.where(v.go_on, dq, c.dq),
@@ -310,15 +350,16 @@ def _along(method: Method, q: jax.Array, s: jax.Array) -> jax.Array:
 
 def _direction(
     method: Method, options: StepOptions, kept: Kept, at: Any, load: jax.Array, forcing: Any, renew: Any, wanted: Any
-) -> tuple[jax.Array, jax.Array, Kept]:
-    """Solution of dr/dq dq = load to `forcing`, the linear iterations for it, and the tangent it is of."""
+) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
+    """Solution of dr/dq dq = load to `forcing`, its iterations, the tangent it is of and whether that is positive."""
     near = (kept.made & ~kept.worn, kept.tangent)
     K = jax.lax.cond(renew, lambda: method.tangent(*at, near), lambda: kept.tangent)
-    dq, linear = jax.lax.cond(
+    dq, linear, positive = jax.lax.cond(
         wanted,
         lambda: method.solve(K, load, forcing, options.max_linear_iterations),
-        lambda: (jnp.zeros_like(load), jnp.zeros((), jnp.int32)),
+        lambda: (jnp.zeros_like(load), jnp.zeros((), jnp.int32), jnp.array(True)),
     )
     pace = (linear / -jnp.log10(forcing)).astype(load.dtype)
     first = jnp.where(renew & ~near[0], pace, kept.pace)
-    return dq, linear, Kept(K, kept.made | renew, first, jnp.where(wanted, pace > options.wear * first, kept.worn))
+    worn = jnp.where(wanted, pace > options.wear * first, kept.worn)
+    return dq, linear, Kept(K, kept.made | renew, first, worn), positive

@@ -12,6 +12,7 @@ class LinearStatistics(NamedTuple):
 
     iterations: jax.Array
     residual: jax.Array  # |b - A x| / |b|, recomputed at the end
+    positive: jax.Array  # False: a direction of no positive curvature was met
 
 
 def conjugate_gradients(
@@ -49,8 +50,8 @@ def conjugate_gradients(
 
     z = precondition(b)
     start = (jnp.zeros_like(b), b, z, jnp.vdot(b, z), jnp.zeros((), jnp.int32), jnp.array(True))
-    x, _, _, _, k, _ = jax.lax.while_loop(go_on, step, start)
-    return x, LinearStatistics(k, _true_residual(matvec, b, x))
+    x, _, _, rz, k, positive = jax.lax.while_loop(go_on, step, start)
+    return x, LinearStatistics(k, _true_residual(matvec, b, x), positive & (rz >= 0))
 
 
 def chebyshev(
@@ -111,7 +112,7 @@ def stabilised_biconjugate_gradients(
     zero = jnp.zeros_like(b)
     start = (zero, b, zero, zero, one, one, one, jnp.zeros((), jnp.int32))
     x, *_, k = jax.lax.while_loop(go_on, step, start)
-    return x, LinearStatistics(k, _true_residual(matvec, b, x))
+    return x, LinearStatistics(k, _true_residual(matvec, b, x), jnp.array(True))
 
 
 def _true_residual(matvec, b, x):

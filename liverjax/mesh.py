@@ -1,6 +1,7 @@
 """Meshes of linear tetrahedra: positions, constant shape vectors, node sets; read and written by meshio."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
     Raises:
         InputError: no elements, node numbers out of range, positions that are not finite, flat or inverted elements,
-            nodes of no element.
+            elements twice, nodes of no element.
     """
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     if tets.size == 0:
@@ -94,6 +95,13 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
         raise InputError(
             f"{name}: {len(bad)} of {len(tets)} tetrahedra are flat or inverted (first: {bad[0]}, volume "
             f"{volumes[bad[0]]:.3g} m^3); swap two of their nodes or remesh"
+        )
+    _, first, copies = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_counts=True)
+    if np.any(copies > 1):
+        again = int(first[copies > 1].min())
+        raise InputError(
+            f"{name}: {int((copies - 1).sum())} tetrahedra stand there twice (first: {again}, nodes "
+            f"{tets[again].tolist()}); remove the copies"
         )
     unused = np.setdiff1d(np.arange(len(points)), tets)
     if len(unused):
@@ -128,9 +136,33 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     if not tets:
         kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
         raise InputError(f"mesh file {path}: it holds {kinds} but no linear tetrahedra; export 4-node tetrahedra")
-    mesh = tet_mesh(np.asarray(data.points)[:, :3] * UNITS[unit], np.vstack(tets), _node_sets(data))
+    others = sorted({b.type for b in data.cells if b.type != "tetra" and not b.type.startswith(_FLAT_CELLS)})
+    if others:
+        raise InputError(
+            f"mesh file {path}: it holds {', '.join(others)} beside linear tetrahedra; remesh all of the body with "
+            "4-node tetrahedra"
+        )
+    points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(tets)
+    if points.shape[1] != 3:
+        raise InputError(f"mesh file {path}: its points have {points.shape[1]} coordinates; give three")
+    if tets.min(initial=0) < 0 or tets.max(initial=0) >= len(points):
+        raise InputError(
+            f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
+        )
+    mesh = tet_mesh(points, tets, _node_sets(data))
     check_mesh(mesh, f"mesh file {path}")
+    size = float(np.ptp(points, axis=0).max())
+    if size > _LARGE and unit == "m":
+        warnings.warn(
+            f"mesh file {path} is {size:.4g} m long: if its numbers are millimetres write unit = 'mm'", stacklevel=2
+        )
     return mesh
+
+
+#: Cells of surfaces and edges, which a volume mesh may carry beside its own.
+_FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
+#: A body longer than this [m] is likelier a mesh in millimetres.
+_LARGE = 10.0
 
 
 def _node_sets(data: Any) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import assembly, coarse, terms
+from liverjax import assembly, coarse
 from liverjax.coarse import Coarse
 from liverjax.errors import InputError
 from liverjax.kinematics import Matrix, Vector, cofactor, determinant, dot, matvec, scale
@@ -105,6 +105,15 @@ def volumetric_slope(porosity: Porosity, J: Any) -> Any:
     return jnp.where(J > J0, K0 / (1 + (jnp.maximum(J, J0) - 1) / r_w), K_lim)
 
 
+def volumetric_energy(porosity: Porosity, J: Any) -> Any:
+    """The integral of sigma_Heq from 1 to J [Pa]: K0 r_w^2 (u ln u - u + 1), u = (r_w + J - 1)/r_w, and a parabola."""
+    K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
+    J0 = 1 - r_w + r_w * K0 / K_lim
+    u = 1 + (jnp.maximum(J, J0) - 1) / r_w
+    below = jnp.minimum(J - J0, 0.0)
+    return K0 * r_w**2 * (u * jnp.log(u) - u + 1) + below * (volumetric_stress(porosity, J0) + 0.5 * K_lim * below)
+
+
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     """No pressure, reference volumes."""
     J = jnp.ones_like(mesh.volumes)
@@ -177,6 +186,12 @@ def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end:
     return differentiable_solve(apply, rhs, precondition, flow.tolerance, 2000)
 
 
+def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
+    """b . P / 2 [J] with P = A^-1 b the pressure at the end of a step that ends with volumes J_end (E,)."""
+    b = flow.store * fluid.pressure - _scatter(mesh, mesh.volumes * (J_end - fluid.J) / 4)
+    return 0.5 * jnp.vdot(flow.mask * b, pressure(porosity, mesh, fluid, flow, J_end))
+
+
 #: Error of the polynomial that stands for the inverse of the pressure's matrix in Newton's direction.
 _POLYNOMIAL_ERROR = 0.1
 
@@ -203,18 +218,23 @@ def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     return at_once + p - slow(apply(p))
 
 
-def with_flow(mesh: TetMesh, flow: Flow, A: assembly.BlockMatrix, both: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of a motion that moves the fluid too, from `both` = A (dx, 0) of the `coupled` matrix A."""
+def with_flow(
+    mesh: TetMesh, flow: Flow | None, A: assembly.BlockMatrix, both: tuple[jax.Array, ...]
+) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of a motion that changes pressures too, from `both` = A (dx, 0) of the `coupled` matrix A.
+
+    Without `flow` nothing flows: the matrix of the pressures is diagonal.
+    """
     *forces, balance = both
-    dP = nearly_solved(mesh, flow, balance)
+    dP = -balance / A.diagonal[3][3] if flow is None else nearly_solved(mesh, flow, balance)
     last = [tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal)]
     pull = assembly.product(assembly.BlockMatrix(*last, A.nodes), (dP,))
     return tuple(f + p for f, p in zip(forces, pull, strict=True))
 
 
-def undrained_diagonal(A: assembly.BlockMatrix, flow: Flow) -> assembly.Block:
+def undrained_diagonal(A: assembly.BlockMatrix, mask: Any) -> assembly.Block:
     """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the pressure's matrix: right where nothing flows."""
-    soft = flow.mask / flow.matrix.diagonal[0][0]
+    soft = -mask / A.diagonal[3][3]
     near = soft[A.nodes]
 
     def entry(r, c):
@@ -224,7 +244,7 @@ def undrained_diagonal(A: assembly.BlockMatrix, flow: Flow) -> assembly.Block:
     return tuple(tuple(entry(r, c) for c in range(3)) for r in range(3))
 
 
-class _Volume(NamedTuple):
+class Volume(NamedTuple):
     """The stress sigma_Heq - P as a law of J alone, for `terms.blocks`."""
 
     stress: Any
@@ -232,29 +252,28 @@ class _Volume(NamedTuple):
     invariants: tuple = ("J",)
 
     def measures(self, F: Matrix) -> Matrix:
+        """What `energy_derivatives` takes."""
         return F
 
     def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
+        """Stress and slope."""
         return {"J": self.stress}, {("J", "J"): self.slope}
 
 
-def blocks(
-    porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
-) -> list[Matrix]:
-    """Derivative of `first_piola` at a given pressure as `terms.blocks`, per volume."""
+def sponge(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Volume:
+    """The sponge at a given pressure, as a law."""
     J = determinant(F)
-    sponge = _Volume(volumetric_stress(porosity, J) - _mean(mesh, P), volumetric_slope(porosity, J))
-    return terms.blocks(terms.state(sponge, F), D, pairs)
+    return Volume(volumetric_stress(porosity, J) - element_pressure(mesh, P), volumetric_slope(porosity, J))
 
 
-def coupled(mesh: TetMesh, K: dict, inertia: Any, F: Matrix, flow: Flow) -> assembly.BlockMatrix:
+def coupled(mesh: TetMesh, K: dict, inertia: Any, F: Matrix, pressures: assembly.BlockMatrix) -> assembly.BlockMatrix:
     """Derivative of forces and minus the pressure equation by (x, P): symmetric, indefinite, 4 x 4 blocks.
 
     Args:
         K: blocks (E,) of the forces at given pressure, by pairs of nodes.
         inertia: (V,) what inertia adds to the diagonal, or None.
         F: deformation gradient at the end of the step.
-        flow: matrix of the pressure equation.
+        pressures: matrix of the pressure equation.
     """
     q = [scale(mesh.volumes / 4, g) for g in _gradients(mesh, F)]
     bordered = {}
@@ -262,12 +281,12 @@ def coupled(mesh: TetMesh, K: dict, inertia: Any, F: Matrix, flow: Flow) -> asse
         rows = [(*block[r], -q[a][r]) for r in range(3)]
         bordered[a, b] = (*rows, (*(-x for x in q[b]), None))
     rows = assembly.off_diagonal(mesh, bordered)
-    rows = (*rows[:3], (*rows[3][:3], -flow.matrix.rows[0][0]))
+    rows = (*rows[:3], (*rows[3][:3], -pressures.rows[0][0]))
     sums = assembly.row_sums(rows)
     # No force under translation: the columns of x add up to zero along a row.
     corner = [[-sums[r][c] + (inertia if inertia is not None and r == c else 0.0) for c in range(3)] for r in range(3)]
     border = [-sums[3][c] for c in range(3)]
-    diagonal = (*((*corner[r], border[r]) for r in range(3)), (*border, -flow.matrix.diagonal[0][0]))
+    diagonal = (*((*corner[r], border[r]) for r in range(3)), (*border, -pressures.diagonal[0][0]))
     return assembly.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)
 
 
@@ -278,13 +297,14 @@ def _scatter(mesh: TetMesh, share: jax.Array) -> jax.Array:
     return total
 
 
-def _mean(mesh: TetMesh, P: jax.Array) -> jax.Array:
+def element_pressure(mesh: TetMesh, P: jax.Array) -> jax.Array:
+    """Mean (E,) of the pressure (V,) of the nodes."""
     return sum(P[mesh.tetrahedra[:, a]] for a in range(4)) / 4
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:
     """(sigma_Heq(J) - P) cof F [Pa], P the mean over an element's nodes."""
-    sigma = volumetric_stress(porosity, determinant(F)) - _mean(mesh, P)
+    sigma = volumetric_stress(porosity, determinant(F)) - element_pressure(mesh, P)
     return tuple(tuple(sigma * c for c in row) for row in cofactor(F))
 
 

@@ -41,6 +41,8 @@ class Solve:
     integrator: str = static("euler", "dynamic: euler (first order) or newmark (average acceleration, second order)")
     precision: str = static("float64", "float64 or float32")
     linear_solver: str = static("cg", "cg, or direct: a factorisation on the host, for what is too stiff to iterate on")
+    volumetric: str = static("element", "element, or nodal: volume changes averaged at nodes, against locking")
+    robust: str = static("off", "projected or regularised: make the energy least where a step cannot be followed")
 
 
 @struct
@@ -56,6 +58,13 @@ class Scene:
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     solve: Solve = param("1", "how", default=Solve())
+
+
+def element_law(scene: Scene) -> Law:
+    """The law that acts element by element: without its volumetric energy where a sponge or the nodes have that."""
+    if scene.solve.volumetric == "nodal":
+        return laws.isochoric_part(scene.law)
+    return porosity.law_in_force(scene.porosity, scene.law)
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -185,7 +194,8 @@ def _law(value: Any) -> Law:
     for table in tables:
         if not isinstance(table, dict) or "name" not in table:
             raise InputError('[law] needs name = "…": python -m liverjax laws lists them')
-        made.append(laws.create(table["name"], **{k: v for k, v in table.items() if k != "name"}))
+        law = laws.create(table["name"], **{k: v for k, v in table.items() if k not in ("name", "continued_below")})
+        made.append(laws.continued(law, table["continued_below"]) if "continued_below" in table else law)
     return made[0] if len(made) == 1 else laws.Sum(laws=tuple(made))
 
 
@@ -280,6 +290,8 @@ _CHOICES = {
     "integrator": ("euler", "newmark"),
     "precision": ("float64", "float32"),
     "linear_solver": ("cg", "direct"),
+    "volumetric": ("element", "nodal"),
+    "robust": ("off", "projected", "regularised"),
 }
 
 
@@ -312,6 +324,10 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
+    if scene.solve.volumetric == "nodal":
+        _nodal(scene)
+    if scene.solve.robust != "off" and any(load.pressure is not None for load in scene.traction):
+        raise InputError("[solve] robust needs forces with an energy: leave it out where a pressure follows the body")
     for k, load in enumerate(scene.traction):
         if (load.value is None) == (load.pressure is None):
             raise InputError(f"traction.{k} needs either value (3,) or pressure, in Pa: give one of them")
@@ -321,6 +337,16 @@ def check_choices(scene: Scene) -> None:
     for k, motion in enumerate(scene.displaced):
         if (motion.by is None) == (motion.history is None):
             raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
+
+
+def _nodal(scene: Scene) -> None:
+    name = "[solve] volumetric = 'nodal'"
+    if scene.porosity is not None:
+        raise InputError(f"{name} averages a law's own volumetric energy, a sponge has another: use 'element'")
+    if laws.isochoric_part(scene.law) is None or laws.volumetric_part(scene.law) is None:
+        raise InputError(f"{name} needs a law with bulk apart from its shear, {type(scene.law).__name__} is none")
+    if scene.viscosity is not None and scene.viscosity.part != "isochoric":
+        raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
 
 
 def check_scene(scene: Scene) -> None:
@@ -459,6 +485,8 @@ def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
             return tuple(value)
         return jnp.asarray(value, float) if isinstance(thing, jax.Array) else value
     key, rest = path[0], path[1:]
+    if isinstance(thing, laws.Continued):
+        return replace(thing, law=_with(thing.law, path, value, name))
     if isinstance(thing, laws.Sum) and key.isdigit():
         return replace(thing, laws=_with(thing.laws, path, value, name))
     if isinstance(thing, tuple) and key.isdigit() and int(key) < len(thing):

@@ -8,13 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import boundary, continuation, mjed, porosity, status, tangent, terms, viscosity
+from liverjax import (
+    boundary,
+    continuation,
+    laws,
+    mjed,
+    nodal_volume,
+    porosity,
+    potential,
+    status,
+    tangent,
+    terms,
+    viscosity,
+)
 from liverjax.assembly import columns, flat
 from liverjax.continuation import Kept, StepOptions, StepStatistics
 from liverjax.errors import InputError
-from liverjax.kinematics import add_matrices, deformation_gradient, determinant
-from liverjax.scene import Scene, check_choices
-from liverjax.struct import param, struct
+from liverjax.kinematics import add_matrices, cofactor, deformation_gradient, determinant, scale_matrix
+from liverjax.scene import Scene, check_choices, element_law
+from liverjax.struct import param, replace, struct
 
 
 @struct
@@ -47,9 +59,9 @@ class State(NamedTuple):
     fluid: porosity.Fluid | None  # porosity
 
 
-def initial_state(scene: Scene) -> State:
-    """At rest in the reference positions."""
-    x = scene.mesh.points
+def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
+    """At rest in the reference positions, or at positions `start` (V, 3) [m]."""
+    x = scene.mesh.points if start is None else start
     dynamic = scene.solve.kind == "dynamic"
     acceleration = None
     if dynamic and scene.solve.integrator == "newmark":
@@ -147,7 +159,7 @@ def _positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
 def _forces(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array | None, jax.Array, jax.Array | None]:
     """Internal, inertial and outer forces (V, 3), and the fluid's pressure."""
     scene = e.scene
-    law = porosity.law_in_force(scene.porosity, scene.law)
+    law = element_law(scene)
     x = _positions(e, q, s)
     F = deformation_gradient(scene.mesh, x)
     P = terms.first_piola(law, F) if e.memory is None else viscosity.first_piola(scene.viscosity, e.memory, law, F)
@@ -156,6 +168,9 @@ def _forces(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array | 
         if e.flow is not None:
             fluid = porosity.pressure(scene.porosity, scene.mesh, e.state.fluid, e.flow, determinant(F))
         P = add_matrices(P, porosity.first_piola(scene.porosity, scene.mesh, fluid, F))
+    elif scene.solve.volumetric == "nodal":
+        fluid = nodal_volume.pressure(scene.mesh, scene.law, determinant(F))
+        P = add_matrices(P, scale_matrix(porosity.element_pressure(scene.mesh, fluid), cofactor(F)))
     outer = _acting(e, s) * e.loads
     if boundary.follows(scene.traction):
         outer = outer + _acting(e, s) * boundary.follower_forces(scene.traction, x)
@@ -177,15 +192,46 @@ def _method(e: Equations) -> continuation.Method:
     solve, follows = e.scene.solve, boundary.follows(e.scene.traction)
     inertia = None if e.mass is None else {"euler": 1.0, "newmark": 4.0}[solve.integrator] / solve.dt**2 * e.mass
     setting = tangent.Setting(e.scene, e.memory, e.flow, inertia, e.mask)
+
+    def made(kind, q, s, fluid, near):
+        return tangent.tangent(setting, fluid, _positions(e, q, s), _acting(e, s), near, kind)
+
+    robust = {}
+    if solve.robust != "off":
+        robust = {
+            "energy": partial(_energy, e),
+            "definite": partial(made, solve.robust),
+            "tangled": lambda q, s: jnp.any(determinant(deformation_gradient(e.scene.mesh, _positions(e, q, s))) <= 0),
+            "surrogate": None if isinstance(e.scene.law, laws.StableNeoHookean) else _method(_finite(e)),
+        }
     return continuation.Method(
         residual=partial(_residual, e),
-        tangent=lambda q, s, fluid, near: tangent.tangent(setting, fluid, _positions(e, q, s), _acting(e, s), near),
+        tangent=partial(made, "true"),
         solve=partial(tangent.solve, setting),
         preconditioner=partial(tangent.preconditioner, setting),
         exact=tangent.exact(setting),
         symmetric=not follows,
         moved=len(e.scene.displaced) > 0 or e.mass is None,
+        **robust,
     )
+
+
+def _finite(e: Equations) -> Equations:
+    """The same body of stable neo-Hookean material, neither viscous nor porous."""
+    scene, law = e.scene, e.scene.law
+    mu = law.shear_modulus()
+    bulk = law.bulk_modulus() if scene.porosity is None else scene.porosity.bulk
+    stable = laws.StableNeoHookean(mu=mu, lame_lambda=jnp.maximum(bulk - 2 / 3 * mu, mu))
+    plain = replace(scene, law=stable, viscosity=None, porosity=None, solve=replace(scene.solve, volumetric="element"))
+    return e._replace(scene=plain, memory=None, flow=None, pressure=None)
+
+
+def _energy(e: Equations, q: jax.Array) -> jax.Array:
+    """What a step makes least [J]."""
+    x = _positions(e, q, 1.0)
+    loaded = e._replace(loads=_acting(e, jnp.ones((), x.dtype)) * e.loads)
+    acceleration = None if e.mass is None else _motion(e, x)[1]
+    return potential.total(loaded, x, deformation_gradient(e.scene.mesh, x), acceleration)
 
 
 def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
@@ -206,10 +252,10 @@ def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, Step
         acceleration = None
     history, F = None, deformation_gradient(scene.mesh, x)
     if e.memory is not None:
-        law = porosity.law_in_force(scene.porosity, scene.law)
-        history = viscosity.advance(scene.viscosity, state.history, law, F, solve.dt)
-    if scene.porosity is not None:
-        fluid = porosity.advance(scene.porosity, state.fluid, fluid, F)
+        history = viscosity.advance(scene.viscosity, state.history, element_law(scene), F, solve.dt)
+    fluid = None if scene.porosity is None else porosity.advance(scene.porosity, state.fluid, fluid, F)
+    inverted = (statistics.status == status.CONVERGED) & jnp.any(determinant(F) <= 0)
+    statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))
     return State(x, velocity, acceleration, history, fluid), reactions, statistics, kept
 
 
@@ -228,7 +274,7 @@ def _motion(e: Equations, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @partial(jax.jit, static_argnames="report")
-def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
+def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None) -> Result:
     steps = scene.solve.steps
     dtype = scene.mesh.points.dtype
 
@@ -246,7 +292,7 @@ def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
         return (new, kept._replace(made=kept.made & good)), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
     numbers, stiff = jnp.arange(1, steps + 1, dtype=dtype), unit_strain_force(scene)
-    start = initial_state(scene)
+    start = initial_state(scene, begin)
     kept = continuation.nothing_kept(_method(equations(scene, start, numbers[0], stiff)), flat(start.x))
     _, (x, reactions, P, statistics) = jax.lax.scan(advance, (start, kept), numbers)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
@@ -254,11 +300,13 @@ def _run(scene: Scene, report: Callable[[int], None] | None) -> Result:
     return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
 
 
-def simulate(scene: Scene, report: Callable[[int], None] | None = None) -> Result:
+def simulate(scene: Scene, report: Callable[[int], None] | None = None, start: jax.Array | None = None) -> Result:
     """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
 
     Args:
         scene: `Scene`.
+        start: positions (V, 3) [m] to begin at, at rest; None: the reference positions. Inverted elements need
+            robust = "projected" and a law that is finite there.
         report: called on the host with the number of every finished step, for progress.
 
     Raises:
@@ -270,7 +318,11 @@ def simulate(scene: Scene, report: Callable[[int], None] | None = None) -> Resul
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif not jax.config.jax_enable_x64:
         raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
-    return _run(scene, report)
+    if start is not None:
+        start = jnp.asarray(start, scene.mesh.points.dtype)
+        if start.shape != scene.mesh.points.shape:
+            raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
+    return _run(scene, start, report)
 
 
 def _cast(value: Any, dtype: Any) -> Any:

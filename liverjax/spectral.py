@@ -36,7 +36,13 @@ def principal(F: Matrix) -> tuple[Vector, Matrix]:
     The stretches are |F n_m|: a small one keeps its relative accuracy beside large ones.
     """
     F = jax.lax.stop_gradient(F)
-    C = right_cauchy_green(F)
+    axes = symmetric_axes(right_cauchy_green(F))
+    stretched = [matvec(F, n) for n in transpose(axes)]
+    return tuple(0.5 * jnp.log(dot(f, f)) for f in stretched), axes
+
+
+def symmetric_axes(C: Matrix) -> Matrix:
+    """Eigenvectors of a symmetric matrix as the columns of a rotation."""
     shape, dtype = jnp.shape(C[0][0]), jnp.result_type(C[0][0])
     one, zero = jnp.ones(shape, dtype), jnp.zeros(shape, dtype)
     columns = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
@@ -49,8 +55,7 @@ def principal(F: Matrix) -> tuple[Vector, Matrix]:
         return entries, columns
 
     _, columns = jax.lax.fori_loop(0, SWEEPS, sweep, (entries, columns))
-    stretched = [matvec(F, n) for n in columns]
-    return tuple(0.5 * jnp.log(dot(f, f)) for f in stretched), transpose(columns)
+    return transpose(columns)
 
 
 def _rotate(entries: dict, columns: tuple, p: int, q: int) -> tuple[dict, tuple]:

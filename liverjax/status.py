@@ -3,11 +3,31 @@
 CONVERGED = 0
 STALLED = 1
 NOT_FINITE = 2
+INDEFINITE = 3
+INVERTED = 4
+STEP_CUT = 5
 
 ADVICE = {
     CONVERGED: "converged",
     STALLED: "the residual stopped falling above the tolerance: take smaller steps or a looser tolerance",
-    NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps",
+    NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
+    "continued_below",
+    INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles or collapses): "
+    "take kind = 'dynamic', smaller steps or robust = 'projected'",
+    INVERTED: "in equilibrium, but with inverted elements, which no body has: take smaller loads, a stiffer volumetric "
+    "energy or a finer mesh",
+    STEP_CUT: "the step was halved as often as allowed and still failed: take smaller steps or robust = 'projected'",
+}
+
+
+#: Short words for tables.
+NAMES = {
+    CONVERGED: "converged",
+    STALLED: "stalled",
+    NOT_FINITE: "not finite",
+    INDEFINITE: "indefinite",
+    INVERTED: "inverted",
+    STEP_CUT: "step cut",
 }
 
 

@@ -11,37 +11,71 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from liverjax import assembly, boundary, direct, mjed, porosity, terms, viscosity
+from liverjax import assembly, boundary, direct, mjed, nodal_volume, porosity, projection, terms, viscosity
 from liverjax.assembly import BlockMatrix
 from liverjax.coarse import Coarse, coarse, corrected, worthwhile
-from liverjax.kinematics import Matrix, add_matrices, deformation_gradient, scale_matrix
+from liverjax.kinematics import Matrix, Vector, add_matrices, deformation_gradient, determinant, scale_matrix
 from liverjax.linear import conjugate_gradients, stabilised_biconjugate_gradients
 from liverjax.pattern import PAIRS
-from liverjax.scene import Scene
+from liverjax.scene import Scene, element_law
 
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
-def element_blocks(scene: Scene, memory: Any, pressure: Any, F: Matrix) -> dict[tuple[int, int], Matrix]:
+#: How the stiffness of elements is made: true, without negative eigenvalues, or as in the chapter's section 4.1.2 iii.
+KINDS = ("true", "projected", "regularised")
+
+
+def element_blocks(
+    scene: Scene, memory: Any, pressure: Any, F: Matrix, kind: str = "true"
+) -> dict[tuple[int, int], Matrix]:
     """K_ab [N/m] of `PAIRS` of every element: law, memory of the step and sponge at a given pressure."""
     mesh = scene.mesh
-    law = porosity.law_in_force(scene.porosity, scene.law)
+    law = element_law(scene)
     D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
-    if memory is None:
+    if kind != "true":
+        K = _definite(scene, memory, pressure, law, F, D, kind)
+    elif memory is None:
         K = terms.blocks(terms.state(law, F), D, _OWN)
     else:
         K = viscosity.blocks(scene.viscosity, memory, law, F, D, _OWN)
-    if scene.porosity is not None:
-        more = porosity.blocks(scene.porosity, mesh, pressure, F, D, _OWN)
+    volume = _volume(scene, pressure, F)
+    if volume is not None and kind == "true":
+        more = terms.blocks(terms.state(volume, F), D, _OWN)
         K = [add_matrices(a, b) for a, b in zip(K, more, strict=True)]
     own = {(a + 1, b + 1): scale_matrix(mesh.volumes, block) for (a, b), block in zip(_OWN, K, strict=True)}
     full = mjed.all_blocks(own)
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
-def stiffness(scene: Scene, memory: Any, pressure: Any, inertia: Any, x: jax.Array) -> BlockMatrix:
+def _volume(scene: Scene, pressure: Any, F: Matrix) -> porosity.Volume | None:
+    """What acts on an element's volume at given nodal pressures, as a law."""
+    if scene.porosity is not None:
+        return porosity.sponge(scene.porosity, scene.mesh, pressure, F)
+    if scene.solve.volumetric == "nodal":
+        p = porosity.element_pressure(scene.mesh, pressure)
+        return porosity.Volume(p, jnp.zeros_like(p))
+    return None
+
+
+def _definite(
+    scene: Scene, memory: Any, pressure: Any, law: Any, F: Matrix, D: list[Vector], kind: str
+) -> list[Matrix]:
+    """Blocks that stand for the true ones where those have negative eigenvalues."""
+    parts, S = [(1.0, law)], None
+    if memory is not None:
+        parts, S = viscosity.summands(scene.viscosity, memory, law)
+    volume = _volume(scene, pressure, F)
+    if volume is not None:
+        parts.append((1.0, volume))
+    if kind == "projected":
+        return projection.blocks(parts, S, F, D, _OWN)
+    return projection.regularised(parts, S, F, D, _OWN)
+
+
+def stiffness(scene: Scene, memory: Any, pressure: Any, inertia: Any, x: jax.Array, kind: str = "true") -> BlockMatrix:
     """Derivative of internal and inertial forces at positions x (V, 3) and a given pressure."""
-    K = element_blocks(scene, memory, pressure, deformation_gradient(scene.mesh, x))
+    K = element_blocks(scene, memory, pressure, deformation_gradient(scene.mesh, x), kind)
     return assembly.force_matrix(scene.mesh, K, inertia)
 
 
@@ -55,6 +89,11 @@ class Setting(NamedTuple):
     mask: jax.Array  # (V, 3) 1 where free
 
 
+def _coupled(setting: Setting) -> bool:
+    """Whether the unknowns of the matrix are motion and pressure."""
+    return setting.flow is not None or setting.scene.solve.volumetric == "nodal"
+
+
 class Tangent(NamedTuple):
     """A tangent ready to be solved with: assembled at one point, good for some iterations near it."""
 
@@ -65,22 +104,33 @@ class Tangent(NamedTuple):
     at: Any  # part of them that acts
 
 
-def tangent(setting: Setting, pressure: Any, x: jax.Array, at: Any, near: tuple[Any, Tangent] | None = None) -> Tangent:
+def tangent(
+    setting: Setting,
+    pressure: Any,
+    x: jax.Array,
+    at: Any,
+    near: tuple[Any, Tangent] | None = None,
+    kind: str = "true",
+) -> Tangent:
     """The derivative of the forces at positions x (V, 3) [m], of which the part `at` of the follower loads.
 
     `pressure` (V,) [Pa] is the fluid's, or None; `near` a flag and a tangent whose coarse space will do where the flag
-    is set. Everything in the result is without derivative.
+    is set; `kind` is one of `KINDS`. Everything in the result is without derivative.
     """
     setting, pressure, x, at = jax.lax.stop_gradient((setting, pressure, x, at))
     scene, flow, mask = setting.scene, setting.flow, setting.mask
-    if flow is None:
-        A = stiffness(scene, setting.memory, pressure, setting.inertia, x)
+    if not _coupled(setting):
+        A = stiffness(scene, setting.memory, pressure, setting.inertia, x, kind)
         diagonal = A.diagonal
     else:
         F = deformation_gradient(scene.mesh, x)
-        K = element_blocks(scene, setting.memory, pressure, F)
-        A = porosity.coupled(scene.mesh, K, setting.inertia, F, flow)
-        diagonal = porosity.undrained_diagonal(A, flow)
+        K = element_blocks(scene, setting.memory, pressure, F, kind)
+        if flow is None:
+            pressures = nodal_volume.compliance(scene.mesh, scene.law, determinant(F), positive=kind != "true")
+        else:
+            pressures = flow.matrix
+        A = porosity.coupled(scene.mesh, K, setting.inertia, F, pressures)
+        diagonal = porosity.undrained_diagonal(A, 1.0 if flow is None else flow.mask)
     inverse = assembly.inverse_blocks(diagonal, mask)
 
     def new():
@@ -110,7 +160,7 @@ def product(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
     def apply(v):
         motion = [m * c for m, c in zip(free, assembly.columns(v), strict=True)]
         force = assembly.product(A, motion)
-        if setting.flow is not None:
+        if _coupled(setting):
             force = porosity.with_flow(setting.scene.mesh, setting.flow, A, force)
         force = jnp.concatenate(force)
         if K.x is not None:
@@ -125,20 +175,22 @@ def product(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
 
 def solve(
     setting: Setting, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
-) -> tuple[jax.Array, jax.Array]:
-    """Solution of K dq = b and the iterations it took, 0 of a factorisation; flat vectors (3 V,)."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Solution of K dq = b, the iterations it took (0 of a factorisation), and whether K was seen to be positive."""
     if setting.scene.solve.linear_solver == "direct":
-        return _factorised(setting, K, b), jnp.zeros((), jnp.int32)
+        dq = _factorised(setting, K, b)
+        return dq, jnp.zeros((), jnp.int32), jnp.vdot(dq, b) >= 0
     method = conjugate_gradients if K.x is None else stabilised_biconjugate_gradients
     dq, s = method(product(setting, K), b, preconditioner(setting, K), tolerance, max_iterations)
-    return dq, s.iterations
+    return dq, s.iterations, s.positive
 
 
 def _factorised(setting: Setting, K: Tangent, b: jax.Array) -> jax.Array:
     """The same by a factorisation, of the coupled matrix where pressure depends on motion."""
     free, load = setting.mask.T, b.reshape(3, -1)
-    if setting.flow is not None:
-        free = jnp.concatenate([free, setting.flow.mask[None]])
+    if _coupled(setting):
+        known = jnp.ones_like(free[:1]) if setting.flow is None else setting.flow.mask[None]
+        free = jnp.concatenate([free, known])
         load = jnp.concatenate([load, jnp.zeros_like(load[:1])])
     return direct.solve(K.matrix, free, load)[:3].ravel()
 

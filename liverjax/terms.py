@@ -106,15 +106,20 @@ def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
 
 
+#: |J| of the flattest element that a second Piola-Kirchhoff stress is computed of.
+_FLAT = 1e-3
+
+
 def second_piola(F: Matrix, resultant: Stress) -> Matrix:
     """S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
 
-    Section 4.2 needs F^-1 here, so it is not defined at J = 0: infinite there, and of the other sign beyond.
+    Section 4.2 needs F^-1 here, so it is not defined at J = 0: an element flatter than |J| = 1e-3 counts as that flat.
     """
     S, p = resultant
     cof = cofactor(F)
     columns = transpose(cof)
-    p_over_J = p / dot(F[0], cof[0])
+    J = dot(F[0], cof[0])
+    p_over_J = p / jnp.where(abs(J) < _FLAT, jnp.copysign(_FLAT, J), J)
 
     def entry(i: int, j: int) -> Any:
         s = S[i][j] if isinstance(S, tuple) else (S if i == j else 0.0)

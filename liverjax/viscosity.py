@@ -143,14 +143,14 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> His
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
     """The second Piola-Kirchhoff stress that relaxes, (6, E) [Pa]: S_h, or its isochoric part."""
-    s = terms.state(_relaxing(prony, law), F)
+    s = terms.state(relaxing(prony, law), F)
     S = terms.second_piola(F, terms.stress(s))
     return jnp.stack([S[i][j] for i, j in SIX])
 
 
 def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
     """P_v = (1 - sum a) P_h - F past (part "all"), or with the volumetric stress added in full ("isochoric")."""
-    P = terms.first_piola(_relaxing(prony, law), F)
+    P = terms.first_piola(relaxing(prony, law), F)
     remembered = matmul(F, memory.past)
     P = tuple(tuple(memory.now * P[i][j] - remembered[i][j] for j in range(3)) for i in range(3))
     rest = volumetric_part(law) if prony.part == "isochoric" else None
@@ -164,7 +164,7 @@ def blocks(
     prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
 ) -> list[Matrix]:
     """Derivative of `first_piola` as `terms.blocks`: (1 - sum a) K_h - (D_i . past D_j) Id, all per volume."""
-    K = terms.blocks(terms.state(_relaxing(prony, law), F), D, pairs)
+    K = terms.blocks(terms.state(relaxing(prony, law), F), D, pairs)
     K = [scale_matrix(memory.now, block) for block in K]
     result = []
     for (i, j), block in zip(pairs, K, strict=True):
@@ -176,5 +176,13 @@ def blocks(
     return [add_matrices(a, b) for a, b in zip(result, terms.blocks(terms.state(rest, F), D, pairs), strict=True)]
 
 
-def _relaxing(prony: Prony, law: Law) -> Law:
+def summands(prony: Prony, memory: Recall, law: Law) -> tuple[list[tuple[Any, Law]], Matrix]:
+    """Laws with weights and a constant second Piola-Kirchhoff stress that `first_piola` is the sum of."""
+    rest = volumetric_part(law) if prony.part == "isochoric" else None
+    parts = [(memory.now, relaxing(prony, law))]
+    return parts if rest is None else [*parts, (1.0, rest)], scale_matrix(-1.0, memory.past)
+
+
+def relaxing(prony: Prony, law: Law) -> Law:
+    """What relaxes of a law: all of it, or its isochoric part."""
     return law if prony.part == "all" else isochoric_part(law)

@@ -4,6 +4,7 @@ from collections import Counter
 
 import jax
 import jax.numpy as jnp
+import meshio
 import numpy as np
 import pytest
 
@@ -89,3 +90,19 @@ def test_refusals(tmp_path):
 
     meshio.Mesh(points, [("triangle", tets[:, :3])]).write(tmp_path / "surface.vtu")
     _refused("holds triangle but no linear tetrahedra", lambda: lj.read_mesh(tmp_path / "surface.vtu"))
+
+
+def test_copies_other_cells_and_millimetres_are_told(tmp_path):
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    twice = lj.tet_mesh(points, np.concatenate([tets, tets[:1, [1, 2, 0, 3]]]))
+    with pytest.raises(lj.InputError, match="1 tetrahedra stand there twice"):
+        lj.check_mesh(twice)
+    cells = [("tetra", tets), ("hexahedron", np.array([[0, 1, 2, 3, 4, 5, 6, 7]]))]
+    meshio.Mesh(points, cells).write(tmp_path / "mixed.vtk")
+    with pytest.raises(lj.InputError, match="it holds hexahedron beside linear tetrahedra"):
+        lj.read_mesh(tmp_path / "mixed.vtk")
+    meshio.Mesh(280 * points, [("tetra", tets), ("triangle", tets[:1, :3])]).write(tmp_path / "large.vtk")
+    with pytest.warns(UserWarning, match="280 m long: if its numbers are millimetres write unit = 'mm'"):
+        lj.read_mesh(tmp_path / "large.vtk")
+    assert np.isclose(float(lj.read_mesh(tmp_path / "large.vtk", "mm").volumes.sum()), 0.28**3)

@@ -60,7 +60,7 @@ def test_patch_test_is_exact():
     def solved(at, b, *limits):
         slope = jax.linearize(lambda q: residual(q, 1.0)[0], at)[1]
         dq, s = conjugate_gradients(slope, b, lambda r: r, *limits)
-        return dq, s.iterations
+        return dq, s.iterations, s.positive
 
     method = continuation.Method(residual, lambda q, s, *_: q, solved, lambda _: lambda r: r)
     options = StepOptions(tolerance=1e-13)

@@ -98,7 +98,7 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
     method = continuation.Method(
         residual=lambda q, s: (jnp.log(q) + 5, jnp.ones(()), None),
         tangent=lambda q, s, by, near: 1 / q,
-        solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32)),
+        solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32), jnp.array(True)),
         preconditioner=lambda K: lambda r: r / K,
         moved=False,
     )

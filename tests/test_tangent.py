@@ -79,7 +79,7 @@ def test_coupled_matrix_against_autodiff():
     def both():
         F = deformation_gradient(MESH, X)
         flow = porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, MESH.points), 0.05, 1e-10)
-        A = porosity.coupled(MESH, tangent.element_blocks(scene, None, P, F), None, F, flow)
+        A = porosity.coupled(MESH, tangent.element_blocks(scene, None, P, F), None, F, flow.matrix)
 
         def equations(x, P):
             F = deformation_gradient(MESH, x)

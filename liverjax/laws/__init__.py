@@ -11,6 +11,7 @@ import numpy as np
 from liverjax.errors import InputError
 from liverjax.laws.arruda_boyce import ArrudaBoyce
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.laws.continued import Continued, continued
 from liverjax.laws.costa import Costa
 from liverjax.laws.exponential_invariants import FungDemiray, VerondaWestmann
 from liverjax.laws.mooney_rivlin import MooneyRivlin
@@ -26,6 +27,7 @@ __all__ = [
     "LAWS",
     "ArrudaBoyce",
     "Bogen",
+    "Continued",
     "Costa",
     "Exponential",
     "FungDemiray",
@@ -41,6 +43,7 @@ __all__ = [
     "VerondaWestmann",
     "Volumetric",
     "Yeoh",
+    "continued",
     "create",
     "isochoric_part",
     "parameters",
@@ -163,6 +166,8 @@ def scaled(law: Law, factor: Any) -> Law:
     """The law with its energy times `factor`: every parameter in Pa is multiplied, every other one kept."""
 
     def one(s: Law) -> Law:
+        if isinstance(s, Continued):
+            return replace(s, law=scaled(s.law, factor))
         moduli = {f.name: getattr(s, f.name) for f in parameters(s) if f.metadata["unit"] == "Pa"}
         return replace(s, **{k: _times(v, factor) for k, v in moduli.items() if v is not None})
 

@@ -177,16 +177,22 @@ class Volumetric(Law):
 
     bulk: Any = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
     volumetric: str = static("quadratic", "quadratic, log or simo")
+    below: float | None = static(None, "J below which U is its Taylor parabola there")
     invariants: ClassVar = ("J",)
 
     def strain_energy(self, I):
         """U(J)."""
-        return volumetric(self.volumetric, self.bulk, I.J)[0]
+        if self.below is None:
+            return volumetric(self.volumetric, self.bulk, I.J)[0]
+        above = jnp.maximum(I.J, self.below)
+        U, U1, U2 = volumetric(self.volumetric, self.bulk, above)
+        return U + (U1 + 0.5 * U2 * (I.J - above)) * (I.J - above)
 
     def energy_derivatives(self, I):
         """U' and U''."""
-        _, U1, U2 = volumetric(self.volumetric, self.bulk, I.J)
-        return {"J": U1}, {("J", "J"): U2}
+        above = I.J if self.below is None else jnp.maximum(I.J, self.below)
+        _, U1, U2 = volumetric(self.volumetric, self.bulk, above)
+        return {"J": U1 if self.below is None else U1 + U2 * (I.J - above)}, {("J", "J"): U2}
 
     def shear_modulus(self):
         """A fluid has none."""
@@ -256,13 +262,24 @@ def _scalar_derivatives(W: Any, values: dict) -> tuple[First, Second]:
     return first, {(a, b): curvature(a, b) for k, a in enumerate(names) for b in names[k:]}
 
 
-def _is_split(law: Law) -> bool:
-    return hasattr(law, "isochoric_energy") or hasattr(law, "stretch_energy")
+def _isochoric(law: Law) -> Law | None:
+    if hasattr(law, "isochoric"):
+        return law.isochoric()
+    split = hasattr(law, "isochoric_energy") or hasattr(law, "stretch_energy")
+    return replace(law, bulk=None) if split else None
+
+
+def _volumetric(law: Law) -> Law | None:
+    if isinstance(law, Volumetric):
+        return law
+    if hasattr(law, "volumetric_law"):
+        return law.volumetric_law()
+    return None if law.bulk is None else Volumetric(bulk=law.bulk, volumetric=law.volumetric)
 
 
 def isochoric_part(law: Law) -> Law | None:
     """The law without its volumetric energy, or `None` where an energy has no such split (or is only volumetric)."""
-    parts = [replace(s, bulk=None) if _is_split(s) else None for s in summands(law)]
+    parts = [_isochoric(s) for s in summands(law)]
     if any(p is None and not isinstance(s, Volumetric) for p, s in zip(parts, summands(law), strict=True)):
         return None
     kept = tuple(p for p in parts if p is not None)
@@ -271,5 +288,5 @@ def isochoric_part(law: Law) -> Law | None:
 
 def volumetric_part(law: Law) -> Law | None:
     """U(J) of a split law as a law of its own, or `None` where there is none."""
-    kept = tuple(Volumetric(bulk=s.bulk, volumetric=s.volumetric) for s in summands(law) if s.bulk is not None)
+    kept = tuple(v for v in map(_volumetric, summands(law)) if v is not None)
     return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)

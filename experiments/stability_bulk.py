@@ -1,0 +1,159 @@
+"""Locking and its remedy: error and iterations against K/mu, with volume changes by element and averaged at the nodes.
+
+Cook's membrane (plane strain, mean rise of the right edge in two load steps) and a column twisted by a quarter turn in
+ten (torque), against a finer mesh with averaged volumes; solved by a factorisation, and by conjugate gradients.
+``python experiments/stability_bulk.py`` (6 minutes) writes results/stability_bulk.json.
+"""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from common import save
+
+import liverjax as lj
+from liverjax import boundary, shapes, status
+from liverjax.colours import COLOURS
+from liverjax.kinematics import deformation_gradient, determinant
+
+MU = 770.0
+RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4, 1e5)
+COOK, FINEST, COLUMN = (4, 8, 16), 24, (2, 3)
+
+
+def membrane(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:
+    """Cook's membrane of n x n cells, 48 mm wide, and the nodes of its right edge."""
+    flat = shapes.box((1.0, 1.0, 1.0), (n, n, 1))
+    s, t, w = np.asarray(flat.points).T
+    points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * 1e-3
+    mesh = lj.tet_mesh(points, flat.tetrahedra, flat.node_sets)
+    right = boundary.boundary_triangles(mesh, mesh.node_sets["x_max"])
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=MU, bulk=MU * ratio, volumetric="simo"),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]), lj.Fixed(nodes=np.arange(mesh.number_of_nodes), axes="z")),
+        traction=(lj.Traction(triangles=jnp.asarray(right), value=jnp.array([0.0, 0.01 * MU, 0.0])),),
+        solve=lj.Solve(steps=2, **solve),
+    )
+    return scene, np.asarray(mesh.node_sets["x_max"])
+
+
+def rise(scene: lj.Scene, nodes: np.ndarray, result: lj.Result) -> float:
+    """Mean rise of the right edge [m]."""
+    return float(np.mean(np.asarray(result.positions[-1] - scene.mesh.points)[nodes, 1]))
+
+
+def column(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:
+    """A column of n x n x 3 n cells, its top turned by 90 degrees in ten steps, and the nodes of its top."""
+    mesh = shapes.box((0.02, 0.02, 0.06), (n, n, 3 * n))
+    points = np.asarray(mesh.points)
+    bottom, top = (np.flatnonzero(np.isclose(points[:, 2], z)) for z in (0.0, 0.06))
+    centred, steps = points[top] - [0.01, 0.01, 0.06], 10
+    displaced = []
+    for node, r in zip(top, centred, strict=True):
+        turn = np.linspace(0, np.pi / 2, steps + 1)
+        x = np.stack([np.cos(turn) * r[0] - np.sin(turn) * r[1], np.sin(turn) * r[0] + np.cos(turn) * r[1]], axis=1)
+        moved = np.concatenate([x - r[:2], np.zeros((steps + 1, 1))], axis=1)
+        times = jnp.arange(steps + 1.0)
+        displaced.append(lj.Displaced(nodes=jnp.array([node]), times=times, history=jnp.asarray(moved)))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=MU, bulk=MU * ratio, volumetric="simo"),
+        fixed=(lj.Fixed(nodes=bottom),),
+        displaced=tuple(displaced),
+        solve=lj.Solve(dt=1.0, steps=steps, **solve),
+    )
+    return scene, top
+
+
+def torque(scene: lj.Scene, nodes: np.ndarray, result: lj.Result) -> float:
+    """Torque [N m] at the top."""
+    arm = np.asarray(result.positions[-1])[nodes] - [0.01, 0.01, 0.06]
+    force = np.asarray(result.reactions[-1])[nodes]
+    return float(np.sum(arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]))
+
+
+def ran(made: tuple[lj.Scene, np.ndarray], measure) -> dict:
+    """One run and what it took."""
+    scene, nodes = made
+    begin = time.perf_counter()
+    program = jax.jit(lj.simulate).lower(scene).compile()
+    compiled = time.perf_counter()
+    result = jax.block_until_ready(program(scene))
+    seconds, s = time.perf_counter() - compiled, result.statistics
+    J = np.asarray(determinant(deformation_gradient(scene.mesh, result.positions[-1])))
+    codes = np.asarray(result.status)
+    return {
+        "elements": scene.mesh.number_of_elements,
+        "value": measure(scene, nodes, result),
+        "code": status.NAMES[int(codes.max())],
+        "newton": int(s.iterations.sum()),
+        "linear": int(s.linear_iterations.sum()),
+        "residual": float(s.residual.max()) if np.isfinite(s.residual).all() else None,
+        "J": [float(J.min()), float(J.max())],
+        "run_s": seconds,
+        "compile_s": compiled - begin,
+    }
+
+
+def main() -> None:
+    """Both bodies, both volumes, every ratio."""
+    rows = []
+    for ratio in RATIOS:
+        fine = ran(membrane(FINEST, ratio, volumetric="nodal", linear_solver="direct"), rise)["value"]
+        for n in COOK:
+            for volumetric in ("element", "nodal"):
+                for linear in ("direct", "cg") if n == COOK[1] else ("direct",):
+                    row = ran(membrane(n, ratio, volumetric=volumetric, linear_solver=linear), rise)
+                    keys = {"body": "Cook's membrane", "cells": n, "ratio": ratio, "volumetric": volumetric}
+                    rows.append(keys | {"linear_solver": linear, "error": row["value"] / fine - 1} | row)
+                    print(rows[-1], flush=True)
+        fine = ran(column(4, ratio, volumetric="nodal", linear_solver="direct"), torque)["value"]
+        for n in COLUMN:
+            for volumetric in ("element", "nodal"):
+                row = ran(column(n, ratio, volumetric=volumetric, linear_solver="direct"), torque)
+                keys = {"body": "twisted column", "cells": n, "ratio": ratio, "volumetric": volumetric}
+                rows.append(keys | {"linear_solver": "direct", "error": row["value"] / fine - 1} | row)
+                print(rows[-1], flush=True)
+        save("stability_bulk", {"rows": rows})
+    save("stability_bulk", {"rows": rows}, _figure(rows))
+
+
+def _figure(rows: list[dict]) -> plt.Figure:
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.1), layout="constrained")
+    bodies = (("Cook's membrane", COOK), ("twisted column", COLUMN))
+    for axis, (body, sizes) in zip(axes, bodies, strict=False):
+        for n, colour in zip(sizes, COLOURS, strict=False):
+            for volumetric, style in (("element", "--"), ("nodal", "-")):
+                mine = [
+                    r
+                    for r in rows
+                    if (r["body"], r["cells"], r["volumetric"], r["linear_solver"]) == (body, n, volumetric, "direct")
+                    and r["code"] == "converged"
+                ]
+                label = f"{n} cells, {volumetric}"
+                y = [100 * abs(r["error"]) for r in mine]
+                axis.loglog([r["ratio"] for r in mine], y, style, marker="o", ms=3, color=colour, label=label)
+        axis.set(xlabel="K / mu", ylabel="error [%]", title=body)
+        axis.legend(fontsize=6)
+    for volumetric, style in (("element", "--"), ("nodal", "-")):
+        for linear, colour in (("direct", COLOURS[0]), ("cg", COLOURS[1])):
+            mine = [
+                r
+                for r in rows
+                if (r["cells"], r["volumetric"], r["linear_solver"]) == (COOK[1], volumetric, linear)
+                and r["code"] == "converged"
+            ]
+            y = [r["run_s"] for r in mine]
+            axes[2].loglog(
+                [r["ratio"] for r in mine], y, style, marker="o", ms=3, color=colour, label=f"{volumetric}, {linear}"
+            )
+    axes[2].set(xlabel="K / mu", ylabel="run time [s]", title=f"Cook's membrane, {COOK[1]} cells")
+    axes[2].legend(fontsize=6)
+    return figure
+
+
+if __name__ == "__main__":
+    main()

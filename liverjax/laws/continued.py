@@ -1,0 +1,113 @@
+"""A law continued below a chosen J: finite energy for flat and inverted elements, where the law itself has none."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from liverjax.errors import InputError
+from liverjax.kinematics import determinant
+from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.struct import param, static, struct
+
+
+@struct
+class Continued(Law):
+    """A law of I1, I2 and J, the same above J = c; below, value and slope of its energy go on smoothly.
+
+    Isochoric energies are those at c^2/(2c - J) in place of J, which is positive for every J, so that isochoric
+    invariants exist; a volumetric energy is its Taylor parabola at c. The energy rises towards inversion.
+    """
+
+    law: Any = param("1", "the law")
+    below: float = static(0.1, "c")
+
+    @property
+    def invariants(self) -> tuple:
+        """Those of the law, and J."""
+        return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
+
+    def isochoric(self) -> Law | None:
+        """Without its volumetric energy; None where the law has no such split."""
+        part = isochoric_part(self.law)
+        return None if part is None else Continued(law=part, below=self.below)
+
+    def volumetric_law(self) -> Law | None:
+        """The volumetric energy alone, or None."""
+        part = volumetric_part(self.law)
+        return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
+
+    def measures(self, F):
+        """Invariants of the law with J replaced, and J itself."""
+        J = determinant(F)
+        return self._whole().measures(F)._replace(J=self._replaced(J)[0]), J
+
+    def strain_energy(self, I):
+        """That of the law at the replaced J, and the volumetric one at J."""
+        I, J = I
+        W, volume = self._whole().strain_energy(I), self.volumetric_law()
+        return W if volume is None else W + volume.strain_energy(I._replace(J=J))
+
+    def energy_derivatives(self, I):
+        """By the chain rule."""
+        I, J = I
+        _, slope, curvature = self._replaced(J)
+        first, second = self._whole().energy_derivatives(I)
+        if "J" in first:
+            W_J = first["J"]
+            first = first | {"J": W_J * slope}
+            mixed = {key: W * slope if "J" in key else W for key, W in second.items()}
+            second = mixed | {("J", "J"): second.get(("J", "J"), 0.0) * slope * slope + W_J * curvature}
+        volume = self.volumetric_law()
+        if volume is not None:
+            more, curved = volume.energy_derivatives(I._replace(J=J))
+            first = first | {"J": first.get("J", 0.0) + more["J"]}
+            second = second | {("J", "J"): second.get(("J", "J"), 0.0) + curved["J", "J"]}
+        return first, second
+
+    def shear_modulus(self):
+        """That of the law."""
+        return self.law.shear_modulus()
+
+    def bulk_modulus(self):
+        """That of the law."""
+        return self.law.bulk_modulus()
+
+    def _whole(self) -> Law:
+        """The law without what `volumetric_law` is."""
+        part = isochoric_part(self.law)
+        return self.law if part is None else part
+
+    def _replaced(self, J: Any) -> tuple[Any, Any, Any]:
+        """c^2/(2c - J) below c and J above, its slope and curvature."""
+        c, lower = self.below, self.below > J
+        inverse = 1 / (2 * c - jnp.minimum(J, c))
+        squared = c * c * inverse * inverse
+        return (
+            jnp.where(lower, c * c * inverse, J),
+            jnp.where(lower, squared, 1.0),
+            jnp.where(lower, 2 * squared * inverse, 0.0),
+        )
+
+
+def continued(law: Law, below: float) -> Law:
+    """The law with finite energy and forces for every J, the same above J = `below`; see `Continued`.
+
+    Args:
+        law: of I1, I2, J; a sum of such.
+        below: c, between 0 and 1, e.g. 0.1.
+
+    Raises:
+        InputError: c out of bounds; an energy of stretches, of fibres or of Green's strain (the last is finite anyway).
+    """
+    if isinstance(below, bool) or not isinstance(below, (int, float)) or not 0 < below < 1:
+        raise InputError(f"law continued_below = {below!r} must lie between 0 and 1: give e.g. 0.1")
+    for part in summands(law):
+        kinds = {"stretch_energy": "principal stretches", "green_energy": "Green's strain", "fibre": "fibres"}
+        for attribute, kind in kinds.items():
+            if hasattr(part, attribute):
+                raise InputError(
+                    f"law continued_below is for energies of I1, I2 and J, not for {type(part).__name__} of {kind}: "
+                    "leave it out"
+                )
+    parts = tuple(Continued(law=part, below=float(below)) for part in summands(law))
+    return parts[0] if len(parts) == 1 else Sum(laws=parts)

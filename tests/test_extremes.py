@@ -1,0 +1,210 @@
+"""Stiff numbers: sizes, moduli, steps and materials far apart, without an absolute tolerance hidden anywhere."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import boundary, laws, nodal_volume, shapes, status, viscosity
+from liverjax.kinematics import deformation_gradient, determinant
+from liverjax.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+EPS = np.finfo(float).eps
+UNIT = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+
+
+def pulled(size: float, modulus: float, **solve) -> lj.Scene:
+    """A block of a size [m] and modulus [Pa], pulled and sheared to a fifth of its size."""
+    mesh = lj.tet_mesh(size * UNIT.points, UNIT.tetrahedra, UNIT.node_sets)
+    by = size * jnp.array([0.1, 0.0, 0.2])
+    return lj.Scene(
+        mesh=mesh,
+        law=laws.MooneyRivlin(c10=0.4 * modulus, c01=0.1 * modulus, bulk=4 * modulus),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_max"], by=by),),
+        solve=lj.Solve(**({"tolerance": 1e-10} | solve)),
+    )
+
+
+def test_lengths_and_moduli_are_units_only():
+    reference = lj.simulate(pulled(1.0, 1.0)).check()
+    for size, modulus in ((1e-6, 1e3), (1e3, 1e3), (1.0, 1e6), (1e-3, 1e9), (1.0, 1.0e-3)):
+        result = lj.simulate(pulled(size, modulus)).check()
+        assert int(result.statistics.iterations.sum()) == int(reference.statistics.iterations.sum())
+        # Newton's last correction is of the size of the tolerance.
+        assert np.abs(result.positions / size - reference.positions).max() < 1e-9
+        scale = modulus * size**2
+        assert np.abs(result.reactions / scale - reference.reactions).max() < 1e-8
+
+
+@pytest.mark.parametrize("ratio", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("scheme", viscosity.SCHEMES)
+def test_steps_far_from_the_relaxation_time(ratio, scheme):
+    """A stretch applied in one step: alpha(dt) of the stress is left, by the scheme's own formula."""
+    g, dt = 0.9, 0.5
+    prony = lj.Prony(ratios=jnp.array([g]), relaxation_times=jnp.array([dt / ratio]), scheme=scheme)
+    elastic = pulled(1.0, 1e3, dt=dt, steps=1)
+    result = lj.simulate(replace(elastic, viscosity=prony)).check()
+    whole = lj.simulate(elastic).check()
+    left = 1 - float(np.sum(viscosity.coefficients(prony, dt)[0]))
+    limit = 1 - g * (ratio / (1 + ratio) if scheme == "chapter" else 1 - -np.expm1(-ratio) / ratio)
+    assert np.isclose(left, limit, rtol=1e-9)
+    # The same positions, a fraction of the force; the tolerance is of the force at work.
+    assert np.abs(result.positions - whole.positions).max() < 1e-8
+    assert np.abs(result.reactions - left * whole.reactions).max() < 1e-8 * np.abs(whole.reactions).max()
+
+
+@pytest.mark.parametrize("times", [[0.0], [np.inf], [-1.0], [np.nan]])
+def test_relaxation_times_of_nothing_and_forever_are_refused(times):
+    with pytest.raises(lj.InputError, match="relaxation_times"):
+        viscosity.check(lj.Prony(ratios=jnp.array([0.2]), relaxation_times=jnp.array(times)), laws.typical("yeoh"))
+
+
+def test_ratios_that_leave_almost_nothing():
+    prony = lj.Prony(ratios=jnp.array([0.5, 0.4999999]), relaxation_times=jnp.array([1e-6, 1e-5]))
+    scene = replace(pulled(1.0, 1e3, dt=1.0, steps=3), viscosity=prony)
+    result = lj.simulate(scene).check()
+    elastic = lj.simulate(replace(scene, viscosity=None)).reactions[-1]
+    # Everything but 1e-7 and what a ramp of the size of the relaxation times leaves.
+    assert np.abs(result.reactions[-1]).max() < 2e-5 * np.abs(elastic).max()
+
+
+@pytest.mark.parametrize("solver", ["cg", "direct"])
+def test_a_capsule_ten_thousand_times_stiffer(solver):
+    """Moduli an element; in series the stiff layer hardly moves, whatever the other's modulus."""
+    mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 4))
+    height = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)[:, 2]
+    mu = jnp.asarray(np.where(height > 0.75, 1e7, 1e3))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=laws.NeoHookean(mu=mu, bulk=4 * mu),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_max"], by=jnp.array([0.0, 0.0, 0.1]), axes="z"),),
+        solve=lj.Solve(linear_solver=solver),
+    )
+    scene = replace(scene, fixed=(*scene.fixed, lj.Fixed(nodes=mesh.node_sets["z_max"], axes="xy")))
+    result = lj.simulate(scene).check()
+    layer = np.flatnonzero(np.isclose(np.asarray(mesh.points)[:, 2], 0.75))
+    moved = np.asarray(result.positions[-1] - mesh.points)[layer, 2]
+    assert np.abs(moved - 0.1).max() < 1e-3 * 0.1
+    total = np.asarray(result.reactions[-1]).sum(axis=0)
+    # Forces balance as far as they were solved for: 1e-8 of those at work, stiff ones and all.
+    assert np.abs(total).max() < 1e-7 * np.linalg.norm(np.asarray(result.reactions[-1]))
+
+
+def test_slivers():
+    """Elements 1e4 times longer than high: the same solution as a solid block's, by either solver."""
+    mesh = shapes.box((1.0, 1.0, 1e-4), (2, 2, 1))
+    stretch = jnp.array([0.1, 0.0, 0.0])
+    scene = lj.Scene(
+        mesh=mesh,
+        law=laws.NeoHookean(mu=1e3, bulk=4e3),
+        fixed=tuple(lj.Fixed(nodes=mesh.node_sets[f"{a}_min"], axes=a) for a in "xyz"),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["x_max"], by=stretch, axes="x"),),
+        solve=lj.Solve(tolerance=1e-10),
+    )
+    cube = replace(scene, mesh=lj.tet_mesh(mesh.points * jnp.array([[1, 1, 1e4]]), mesh.tetrahedra, mesh.node_sets))
+    for solver in ("cg", "direct"):
+        solve = replace(scene.solve, linear_solver=solver)
+        thin, thick = (lj.simulate(replace(s, solve=solve)).check().positions[-1] for s in (scene, cube))
+        assert np.abs(thin * jnp.array([[1, 1, 1e4]]) - thick).max() < 1e-6
+
+
+def test_tight_and_open_sponges():
+    """Nothing flows at permeability 0; at a huge one no pressure is left where the surface is open."""
+    by = jnp.array([0.0, 0.0, -0.1])
+    scene = replace(
+        pulled(1.0, 1e3, dt=1.0, steps=2, tolerance=1e-9),
+        displaced=(lj.Displaced(nodes=UNIT.node_sets["z_max"], by=by),),
+        porosity=lj.Porosity(
+            bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=0.0, drained=UNIT.node_sets["z_max"]
+        ),
+    )
+    tight = lj.simulate(scene).check()
+    assert np.abs(tight.pressure).max() > 10
+    wide = lj.simulate(replace(scene, porosity=replace(scene.porosity, permeability=1e3))).check()
+    assert np.abs(wide.pressure).max() < 1e-3
+
+
+# -- near-incompressible ----------------------------------------------------------------------------------------------
+
+
+def membrane(n: int, ratio: float, volumetric: str) -> lj.Scene:
+    """Cook's membrane, 48 mm wide, in plane strain."""
+    flat = shapes.box((1.0, 1.0, 1.0), (n, n, 1))
+    s, t, w = np.asarray(flat.points).T
+    points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * 1e-3
+    mesh = lj.tet_mesh(points, flat.tetrahedra, flat.node_sets)
+    right = jnp.asarray(boundary.boundary_triangles(mesh, mesh.node_sets["x_max"]))
+    return lj.Scene(
+        mesh=mesh,
+        law=laws.NeoHookean(mu=770.0, bulk=770.0 * ratio, volumetric="simo"),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]), lj.Fixed(nodes=np.arange(len(points)), axes="z")),
+        traction=(lj.Traction(triangles=right, value=jnp.array([0.0, 0.38, 0.0])),),
+        solve=lj.Solve(volumetric=volumetric, linear_solver="direct"),
+    )
+
+
+def rise(scene: lj.Scene) -> float:
+    """Mean rise of the right edge [m]."""
+    moved = lj.simulate(scene).check().positions[-1] - scene.mesh.points
+    return float(np.mean(np.asarray(moved)[np.asarray(scene.mesh.node_sets["x_max"]), 1]))
+
+
+def test_averaged_volumes_do_not_lock():
+    # Averaged, refinement lets the edge rise on; element by element it does not move (3.6e-5 m/Pa on every mesh).
+    coarse, fine = (rise(membrane(n, 1e5, "nodal")) for n in (8, 16))
+    assert fine > 1.4 * coarse and fine > 2.5 * rise(membrane(16, 1e5, "element"))
+    # Where nothing locks the two agree to the error of the mesh.
+    soft = [rise(membrane(16, 2.0, kind)) for kind in ("nodal", "element")]
+    assert abs(soft[0] / soft[1] - 1) < 0.06
+
+
+def test_averaged_volumes_pass_the_patch_test():
+    """Homogeneous stretch: averaging changes nothing."""
+    scene = pulled(1.0, 1e3)
+    nodal = replace(scene, solve=replace(scene.solve, volumetric="nodal"))
+    F = np.eye(3) + 0.1 * np.random.default_rng(0).standard_normal((3, 3))
+    outer = np.unique(boundary.boundary_triangles(UNIT))
+    moves = tuple(lj.Displaced(nodes=jnp.array([k]), by=jnp.asarray((F - np.eye(3)) @ UNIT.points[k])) for k in outer)
+    result = lj.simulate(replace(nodal, fixed=(), displaced=moves)).check()
+    assert np.abs(result.positions[-1] - np.asarray(UNIT.points) @ F.T).max() < 1e-9
+    J = determinant(deformation_gradient(UNIT, result.positions[-1]))
+    p = nodal_volume.pressure(UNIT, scene.law, J)
+    assert np.allclose(p, 4e3 * (np.linalg.det(F) - 1), rtol=1e-8)
+
+
+def test_averaged_volumes_have_a_gradient():
+    def top(bulk):
+        scene = membrane(4, 100.0, "nodal")
+        scene = replace(scene, law=replace(scene.law, bulk=bulk), solve=replace(scene.solve, tolerance=1e-11))
+        return lj.simulate(scene).positions[-1, -1, 1]
+
+    import jax
+
+    h = 10.0
+    difference = (top(77e3 + h) - top(77e3 - h)) / (2 * h)
+    assert np.isclose(jax.grad(top)(77e3), difference, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "change, sentence",
+    [
+        (dict(law=laws.typical("saint_venant_kirchhoff")), "needs a law with bulk apart"),
+        (dict(porosity=lj.Porosity(bulk=1.0, limit_bulk=2.0, fluid_fraction=0.5, permeability=1.0)), "sponge"),
+        (dict(viscosity=lj.Prony(ratios=jnp.array([0.2]), relaxation_times=jnp.array([1.0]))), "part = 'isochoric'"),
+    ],
+)
+def test_averaged_volumes_that_mean_nothing_are_refused(change, sentence):
+    scene = replace(membrane(2, 10.0, "nodal"), **change)
+    with pytest.raises(lj.InputError, match=sentence):
+        lj.simulate(scene)
+
+
+def test_a_hopeless_step_says_that_it_was_cut():
+    scene = pulled(1.0, 1e3)
+    crushed = lj.Displaced(nodes=UNIT.node_sets["z_max"], by=jnp.array([0.0, 0.0, -1.5]))
+    code = int(lj.simulate(replace(scene, displaced=(crushed,))).status[-1])
+    assert code in (status.STEP_CUT, status.INDEFINITE, status.NOT_FINITE)
