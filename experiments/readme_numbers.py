@@ -177,7 +177,126 @@ def speed() -> str:
     return "\n".join(rows)
 
 
-PARTS = {"numbers": numbers, "laws": laws, "simulations": simulations, "speed": speed}
+def runs() -> str:
+    """Rows a minute, what a sweep survives, a posterior carried through the liver, a training set."""
+    bench, lives, spread, training = _results(
+        "sweep_benchmark", "sweep_survival", "propagate_posterior", "training_set"
+    )
+    kills, others = lives["kills"], lives["loopback"]
+    killed, lost = kills["kills"] + sum(r["killed"] for r in others), kills["finished_chunks_lost"]
+    equal = kills["equal_bytes"] and all(r["equal_bytes"] for r in others)
+    memory = [f"{b / 1e9:.2g} GB at {rows}" for rows, b in bench["peak_memory_bytes"].items()]
+    low, high = (1e3 * edge[-1] for edge in spread["interval_m"])
+    last, first = ({n: v[k] for n, v in spread["total_order"].items()} for k in (-1, 0))
+    best = training["surrogate"][-1]
+    single, loop = bench["seconds_a_row_1"], bench["seconds_a_row_loop"]
+    gain, off = bench["two_devices_over_one"], bench["difference_m"]
+    table = [
+        ("rows a minute, one device", f"{bench['rows_a_minute']['1']:,.0f}"),
+        ("two devices over one", f"{gain:.3g}, results differ by {off:.0e} m"),
+        ("a loop by hand over one device", f"{loop / single:.3g} of the time"),
+        (f"{bench['most_rows']:,} rows, two devices", f"{bench['most_rows_s']:.0f} s, {', '.join(memory)}"),
+        ("kills, of one process or of one of several", f"{killed}, {lost} finished chunks lost"),
+        ("resumed results", f"{'the same' if equal else 'OTHER'} bytes as undisturbed ones"),
+    ]
+    rows = [
+        f"A block of 384 tetrahedra, two load steps, residuals to {bench['largest_residual']:.0e} of the forces:",
+        "",
+        "| what | |",
+        "|---|---|",
+        *(f"| {what} | {value} |" for what, value in table),
+        "",
+        f"Noise of {100 * spread['noise']:g} % on a synthetic sweep of porcine liver leaves the tip of the liver",
+        f"phantom, after {spread['times_s'][-1]:g} s, between {low:.1f} and {high:.1f} mm lower: of {spread['draws']}",
+        f"draws from the posterior in {spread['seconds_propagation']:.0f} s, the mean known to",
+        f"{1e3 * spread['error_of_mean_m'][-1]:.2g} mm. Total Sobol indices there: G0 {last['G0']:.2f},",
+        f"g2 {last['g2']:.2f}, g1 {last['g1']:.2f}; in the first step tau2 has {first['tau2']:.2f}.",
+        "",
+        f"A training set of {training['rows']:,} static runs of the phantom (moduli, direction of gravity)",
+        f"takes {training['seconds_sweep']:.0f} s on two cores, {1e3 * training['seconds_reading']:.0f} ms to read",
+        f"back; a cubic polynomial for {best['modes']} modes, fitted to 800 rows in {best['seconds_to_fit']:.1f} s,",
+        f"misses the others by {100 * best['median_error']:.2g} % (median) to",
+        f"{100 * best['largest_error']:.2g} % (near collapse).",
+    ]
+    return "\n".join(rows)
+
+
+def stability() -> str:
+    """Inverted starts, the liver at any step, locking."""
+    return "\n".join([*_inverted(), "", *_steps(), "", *_locking()])
+
+
+def _inverted() -> list[str]:
+    (data,) = _results("stability_inverted")
+    cases = list(next(iter(data["laws"].values()))["plain"])
+    rows = [
+        f"A hanging block of {data['elements']} tetrahedra from {data['seeds']} scrambled starts a column: per cent",
+        "that end at the minimum reached from rest, to 1e-6 of the size (most iterations; time a start):",
+        "",
+        "| law | solver | " + " | ".join(cases) + " |",
+        "|---" * (2 + len(cases)) + "|",
+    ]
+
+    def cell(r: dict) -> str:
+        rate = f"{100 * r['right'] / r['starts']:.0f} %"
+        return rate + (f" ({r['most_iterations']}; {1e3 * r['seconds_a_start']:.2g} ms)" if r["right"] else "")
+
+    for law, tables in data["laws"].items():
+        for solver, table in tables.items():
+            rows.append(f"| `{law}` | {solver} | " + " | ".join(cell(table[case]) for case in cases) + " |")
+    return rows
+
+
+def _steps() -> list[str]:
+    (data,) = _results("stability_steps")
+    sizes, wanted = sorted({r["dt"] for r in data["rows"]}), data["steps"]
+    rows = [
+        f"The liver phantom under its full weight, {wanted} steps of each size: steps in equilibrium (residual below",
+        "1e-6), Newton iterations a step, steps a second:",
+        "",
+        "| model | robust | " + " | ".join(f"{dt:g} s" for dt in sizes) + " |",
+        "|---" * (2 + len(sizes)) + "|",
+    ]
+    for model, robust in dict.fromkeys((r["model"], r["robust"]) for r in data["rows"]):
+        mine = {r["dt"]: r for r in data["rows"] if (r["model"], r["robust"]) == (model, robust)}
+        cells = [
+            f"{mine[dt]['converged']}/{wanted}, {mine[dt]['newton_a_step']:.3g}, {mine[dt]['steps_per_s']:.3g}"
+            for dt in sizes
+        ]
+        rows.append(f"| {model} | {robust} | " + " | ".join(cells) + " |")
+    return rows
+
+
+def _locking() -> list[str]:
+    (data,) = _results("stability_bulk")
+    rows = [
+        "Locking, against a finer mesh with averaged volumes (factorised; Newton iterations, run time):",
+        "",
+        "| body | cells | K/mu | by element | at the nodes |",
+        "|---|---|---|---|---|",
+    ]
+
+    def cell(r: dict) -> str:
+        found = f"{100 * abs(r['error']):.2g} %, {r['newton']} iterations, {r['run_s']:.2g} s"
+        return found if r["code"] == "converged" else r["code"]
+
+    direct = [r for r in data["rows"] if r["linear_solver"] == "direct"]
+    finest = {body: max(r["cells"] for r in direct if r["body"] == body) for body in {r["body"] for r in direct}}
+    for body, ratio in dict.fromkeys((r["body"], r["ratio"]) for r in direct):
+        key = (body, ratio, finest[body])
+        pair = {r["volumetric"]: r for r in direct if (r["body"], r["ratio"], r["cells"]) == key}
+        rows.append(f"| {body} | {key[2]} | {ratio:g} | {cell(pair['element'])} | {cell(pair['nodal'])} |")
+    return rows
+
+
+PARTS = {
+    "numbers": numbers,
+    "laws": laws,
+    "simulations": simulations,
+    "speed": speed,
+    "runs": runs,
+    "stability": stability,
+}
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ def _bounds(metadata) -> str:
 def list_laws() -> None:
     """Print every law with its energy, parameters, units and bounds."""
     print(f"every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
+    print("every law of I1, I2 and J: continued_below = 0.1, finite energy below that J (default off)")
     for name, cls in laws.LAWS.items():
         print(f"{name}\n    {cls.__doc__.splitlines()[0]}")
         for field in laws.parameters(cls):

@@ -27,7 +27,7 @@ class Displaced:
     """Nodes that are moved: by `by` at the last step, proportionally before, or along a history."""
 
     nodes: Any = param("1", "node numbers (n,)")
-    by: Any = param("m", "displacement (3,) reached at the last step", default=None)
+    by: Any = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
     times: Any = param("s", "times of a history (T,)", default=None)
     history: Any = param("m", "displacements at these times (T, 3), linear in between", default=None)
     axes: str = static("xyz", "prescribed axes")
@@ -112,7 +112,7 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Any, fraction: Any) -> jax
         for axis in condition.axes:
             k = AXES.index(axis)
             if condition.by is not None:
-                value = jnp.asarray(condition.by, u.dtype)[k] * fraction
+                value = jnp.asarray(condition.by, u.dtype)[..., k] * fraction
             else:
                 value = jnp.interp(time, condition.times, jnp.asarray(condition.history)[:, k])
             u = u.at[condition.nodes, k].set(value)

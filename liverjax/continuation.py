@@ -41,7 +41,7 @@ class StepOptions(NamedTuple):
     max_linear_iterations: int = 3000
     max_halvings: int = 6
     max_cuts: int = 12
-    max_minimisation: int = 100  # iterations on the energy
+    max_minimisation: int = 300  # iterations on the energy
     max_shortenings: int = 30  # of one of them
 
 

@@ -12,6 +12,8 @@ import liverjax as lj
 from liverjax import spectral
 from liverjax.kinematics import unpack
 
+pytestmark = pytest.mark.quick_to_compile
+
 RNG = np.random.default_rng(11)
 
 

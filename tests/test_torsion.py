@@ -11,6 +11,8 @@ from fitting.torsion import Drive
 from liverjax import viscosity
 from liverjax.struct import replace
 
+pytestmark = pytest.mark.quick_to_compile
+
 OMEGA = 2 * np.pi * np.array([0.1, 1.0, 4.0])
 STRAIN = 1e-4
 
