@@ -15,8 +15,8 @@ from liverjax import status
 
 #: Fall of the energy asked for, over that of its slope (Armijo; Nocedal and Wright 2006, 3.1).
 _FALL = 1e-4
-#: Differences of energies below this part of them are roundoff: there the residual must fall instead.
-_ROUNDOFF = 1e-12
+#: Differences of energies below so many times the precision are roundoff: there the residual must fall instead.
+_ROUNDOFF = 5e3
 #: The true tangent is tried again after at most so many iterations.
 _PATIENCE = 8
 #: Residual at which a surrogate body is untangled enough.
@@ -121,7 +121,7 @@ def _length(method: Any, options: Any, c: _Point, dq: jax.Array, slope: jax.Arra
         q = c.q + t * dq
         energy = method.energy(q)
         falls = energy <= c.energy + _FALL * t * slope
-        level = abs(energy - c.energy) <= _ROUNDOFF * abs(c.energy)
+        level = abs(energy - c.energy) <= _ROUNDOFF * jnp.finfo(c.q.dtype).eps * abs(c.energy)
         better = jnp.linalg.norm(method.residual(q, one)[0]) < size
         return falls | (level & better)
 

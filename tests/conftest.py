@@ -22,6 +22,7 @@ SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
 
 def pytest_configure(config):
     """Programs compiled once are found again by the other worker and by commands that tests start."""
+    config.addinivalue_line("markers", "slow: run by python -m pytest -m slow, not by default")
     config.addinivalue_line("markers", "quick_to_compile: few optimisations, where compiling takes longer than running")
     if not hasattr(config, "workerinput"):
         config.compiled = tempfile.mkdtemp()

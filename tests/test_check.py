@@ -167,6 +167,7 @@ def test_differences_have_the_v_shape():
         assert errors[0] > 1e3 * errors[k] < errors[-1]
 
 
+@pytest.mark.slow
 def test_stable_ranges_of_known_laws():
     # Mooney-Rivlin with c01 < 0: P = 2 (l - l^-2)(c10 + c01/l) falls below the root of its derivative.
     c10, c01 = 400.0, -100.0

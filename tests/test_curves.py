@@ -55,6 +55,7 @@ def test_noise_free_curves_give_the_parameters_back(name):
     assert np.isclose(found.shear_modulus, float(KNOWN[name].shear_modulus()), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_repeated_fits():
     law = lj.laws.FungDemiray(c1=500.0, c2=2.0, bulk=None)
     (candidate,) = stress_stretch.candidates("fung_demiray")
@@ -73,6 +74,7 @@ def _stress_of_rubber(test: str, l: np.ndarray, mu: np.ndarray, alpha: np.ndarra
     return (l ** (alpha - 1) - l**free) @ mu
 
 
+@pytest.mark.slow
 def test_rubber_no_worse_than_scipy_from_100_starts():
     found, _ = curves.read_curves([DATA / "rubber_curves.csv"])
     assert [len(c.stress) for c in found] == [24, 16, 13]

@@ -46,6 +46,7 @@ def test_a_factorisation_finds_the_same():
     assert int(one.statistics.linear_iterations.sum()) > 0 == int(other.statistics.linear_iterations.sum())
 
 
+@pytest.mark.slow
 def test_its_gradient_against_differences():
     @jax.jit
     @jax.value_and_grad

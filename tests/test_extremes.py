@@ -39,7 +39,7 @@ def test_lengths_and_moduli_are_units_only():
         assert np.abs(result.reactions / scale - reference.reactions).max() < 1e-8
 
 
-@pytest.mark.parametrize("ratio", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("ratio", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("scheme", viscosity.SCHEMES)
 def test_steps_far_from_the_relaxation_time(ratio, scheme):
     """A stretch applied in one step: alpha(dt) of the stress is left, by the scheme's own formula."""
@@ -62,6 +62,7 @@ def test_relaxation_times_of_nothing_and_forever_are_refused(times):
         viscosity.check(lj.Prony(ratios=jnp.array([0.2]), relaxation_times=jnp.array(times)), laws.typical("yeoh"))
 
 
+@pytest.mark.slow
 def test_ratios_that_leave_almost_nothing():
     prony = lj.Prony(ratios=jnp.array([0.5, 0.4999999]), relaxation_times=jnp.array([1e-6, 1e-5]))
     scene = replace(pulled(1.0, 1e3, dt=1.0, steps=3), viscosity=prony)
@@ -94,6 +95,7 @@ def test_a_capsule_ten_thousand_times_stiffer(solver):
     assert np.abs(total).max() < 1e-7 * np.linalg.norm(np.asarray(result.reactions[-1]))
 
 
+@pytest.mark.slow
 def test_slivers():
     """Elements 1e4 times longer than high: the same solution as a solid block's, by either solver."""
     mesh = shapes.box((1.0, 1.0, 1e-4), (2, 2, 1))
@@ -112,6 +114,7 @@ def test_slivers():
         assert np.abs(thin * jnp.array([[1, 1, 1e4]]) - thick).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_tight_and_open_sponges():
     """Nothing flows at permeability 0; at a huge one no pressure is left where the surface is open."""
     by = jnp.array([0.0, 0.0, -0.1])
@@ -176,6 +179,7 @@ def test_averaged_volumes_pass_the_patch_test():
     assert np.allclose(p, 4e3 * (np.linalg.det(F) - 1), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_averaged_volumes_have_a_gradient():
     def top(bulk):
         scene = membrane(4, 100.0, "nodal")

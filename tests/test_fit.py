@@ -203,6 +203,7 @@ def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
     assert warned(f, "discretisation moves it by")
 
 
+@pytest.mark.slow
 def test_chapter_recursion_biases_the_fit():
     s = sweep(omega=OMEGA[::3])
     closed = fit.closed_form(s, 2)
@@ -211,6 +212,7 @@ def test_chapter_recursion_biases_the_fit():
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() > 0.02
 
 
+@pytest.mark.slow
 def test_twelve_decades_need_more_than_six_modes():
     tau = 10.0 ** np.arange(4, -4, -1)
     model = np.concatenate([[1e5], np.full(8, 0.1), tau])

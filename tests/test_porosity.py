@@ -58,6 +58,7 @@ def column(layers: int, steps: int, duration: float, scheme: str = "implicit", *
     )
 
 
+@pytest.mark.slow
 def test_terzaghis_consolidation():
     at = np.array([0.05, 0.1, 0.197, 0.5, 0.848, 1.0])
     settled = np.array([0.2523, 0.3568, 0.5003, 0.7640, 0.9000, 0.9313])

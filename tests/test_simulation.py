@@ -335,6 +335,7 @@ def test_gradients_against_differences():
         assert best < 1e-7
 
 
+@pytest.mark.slow
 def test_vmap_is_the_loop():
     mesh = box(1)
     scene = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, by=jnp.array([0.0, 0.0, 0.03])),))
@@ -382,6 +383,7 @@ def test_one_newton_iteration_is_the_chapters_scheme():
     assert 0 < np.abs(np.asarray(one.positions - full.positions)).max() < 0.05 * moved
 
 
+@pytest.mark.slow
 def test_single_precision_says_so():
     mesh = box(1)
     scene = lj.Scene(
@@ -399,6 +401,7 @@ def test_single_precision_says_so():
     assert jax.eval_shape(lj.simulate, once).positions.dtype == jnp.float32
 
 
+@pytest.mark.slow
 def test_cooks_membrane():
     # Miehe 1994, plane strain: the middle of the right edge rises by 14.74 mm.
     errors = []

@@ -171,6 +171,7 @@ def test_derivatives_where_stretches_are_equal(what, ours, exact, limit):
     assert (np.abs(a - b).max(axis=axes) / np.maximum(size, np.median(size))).max() < limit
 
 
+@pytest.mark.slow
 def test_derivative_by_the_exponent_has_the_v_shape():
     # Central differences fall with h^2 and rise with eps/h; the lowest point is near eps^(2/3).
     F = gradients()
@@ -188,6 +189,7 @@ def test_derivative_by_the_exponent_has_the_v_shape():
     assert min(errors) < 1e-9 < errors[-1]
 
 
+@pytest.mark.slow
 def test_derivatives_beyond_the_third_are_refused():
     law, F = LAWS["bogen"], jnp.eye(3)
     for function in (

@@ -83,6 +83,7 @@ def test_geometry_factor_converges_at_second_order(law):
     assert excess[-1] < 0.05 and rates[-1] > 1.7, (excess, rates)
 
 
+@pytest.mark.slow
 def test_correction_removes_the_mesh_bias(law, prony):
     meshes = [torsion.make_rig(cell_size=c) for c in (0.004, 0.0025)]
     raw, corrected = (
@@ -109,7 +110,7 @@ def test_relaxing_the_isochoric_part_alone(rig, law, prony):
 LAWS_OWN = {"neo_hookean": {"bulk": 1.0}, "mooney_rivlin": {"c10": 1.0, "c01": 1.0}}
 
 
-@pytest.mark.parametrize("name", LAWS_OWN)
+@pytest.mark.parametrize("name", ["neo_hookean", pytest.param("mooney_rivlin", marks=pytest.mark.slow)])
 def test_gradients_against_central_differences(rig, name):
     """V-shaped error curve: falls with the step (truncation), rises again (roundoff), lowest below 1e-6."""
     base = lj.laws.typical(name)
@@ -139,6 +140,7 @@ def test_gradients_against_central_differences(rig, name):
         assert errors[-1] > errors[best] and (errors[0] > errors[best] or errors[0] < 1e-9), (k, errors)
 
 
+@pytest.mark.slow
 def test_reverse_mode_agrees_with_forward_mode(rig, law, prony):
     def loss(tau):
         m = torsion.moduli(rig, law, replace(prony, relaxation_times=tau), OMEGA[1:2], _amplitude(rig, "torque"))
@@ -163,6 +165,7 @@ def test_torque_history_against_febio(febio, prony):
     assert np.abs(run.torque - rows[:, 2]).max() < 1e-6 * np.abs(rows[:, 2]).max()
 
 
+@pytest.mark.slow
 def test_inertia_against_the_torsional_wave(law, prony):
     """A tall sample: M = pi r^4/2 G* k cot(k h) theta, k = omega sqrt(rho/G*); at 41 mm inertia is no small thing."""
     height, omega = 0.041, 2 * np.pi * 2.0
