@@ -46,7 +46,7 @@ def main() -> None:
             }
         )
         print(rows[-1], flush=True)
-    save("stability_cost", {"dt": DT, "rounds": ROUNDS, "rows": rows})
+        save("stability_cost", {"dt": DT, "rounds": ROUNDS, "rows": rows})
 
 
 if __name__ == "__main__":

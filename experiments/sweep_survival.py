@@ -17,24 +17,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 from common import save
+from sweep_benchmark import SCENE
 
-SCENE = """
-[mesh]
-shape = "box"
-size = [0.1, 0.1, 0.1]
-cells = [4, 4, 4]
-[law]
-name = "neo_hookean"
-mu = 770.0
-bulk = 2200.0
-[[fixed]]
-where = {z_max = 0.0}
-[[displaced]]
-where = {z_min = 0.1}
-by = [0.01, 0.0, 0.02]
-[solve]
-steps = 2
-"""
 ROWS, CHUNK, KILLS, SEED = 4096, 32, 20, 7
 
 
