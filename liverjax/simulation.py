@@ -305,8 +305,8 @@ def simulate(scene: Scene, report: Callable[[int], None] | None = None, start: j
 
     Args:
         scene: `Scene`.
-        start: positions (V, 3) [m] to begin at, at rest; None: the reference positions. Inverted elements need
-            robust = "projected" and a law that is finite there.
+        start: positions (V, 3) [m] to begin at, at rest, with the pressure and memory of the reference; None: the
+            reference positions. Inverted elements need robust = "projected".
         report: called on the host with the number of every finished step, for progress.
 
     Raises:

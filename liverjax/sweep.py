@@ -6,10 +6,13 @@ Several processes may work on one sweep: each takes every n-th chunk, and the la
 """
 
 import csv
+import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
+import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -222,12 +225,20 @@ def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
     filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
     values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
     result = program(sweep.scene, values)
-    temporary = file.with_suffix(f".{os.getpid()}")
-    with h5py.File(temporary, "w") as part:
+    # Made in memory: where a disk is full HDF5 takes the process down, a plain write raises OSError.
+    content = io.BytesIO()
+    with h5py.File(content, "w") as part:
         for name, value in result.items():
             part[name] = np.asarray(value)[: len(chosen)]
-    with temporary.open("rb") as written:
-        os.fsync(written.fileno())
+    temporary = file.with_suffix(f".{os.getpid()}")
+    try:
+        with temporary.open("wb") as out:
+            out.write(content.getbuffer())
+            out.flush()
+            os.fsync(out.fileno())
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
     temporary.replace(file)
 
 
@@ -295,7 +306,15 @@ def _joined(sweep: Sweep, out: Path, parts: Path, computed: int) -> Done:
     return Done(out, _failures(sweep, codes), computed)
 
 
+#: Bytes that HDF5 needs beside the datasets.
+_HEADERS = 100_000
+
+
 def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
+    mesh = sweep.scene.mesh
+    needed = sum(f.stat().st_size for f in files) + mesh.points.nbytes + mesh.tetrahedra.nbytes + sweep.rows.nbytes
+    if shutil.disk_usage(out.parent).free < needed + _HEADERS:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     temporary, n = out.with_suffix(".joining"), len(sweep.rows)
     with h5py.File(temporary, "w") as whole:
         for k, file in enumerate(files):

@@ -207,7 +207,7 @@ def test_averaged_volumes_that_mean_nothing_are_refused(change, sentence):
         lj.simulate(scene)
 
 
-def test_a_hopeless_step_says_that_it_was_cut():
+def test_a_hopeless_step_is_told():
     scene = pulled(1.0, 1e3)
     crushed = lj.Displaced(nodes=UNIT.node_sets["z_max"], by=jnp.array([0.0, 0.0, -1.5]))
     code = int(lj.simulate(replace(scene, displaced=(crushed,))).status[-1])

@@ -54,8 +54,8 @@ tolerance = 1e-6
 SWEEP = Path(__file__).parent.parent / "data" / "lions_mane_frequency_sweep.csv"
 ROWS = "law.c10,body.density\n" + "".join(f"{300 + k},{1000 + k}\n" for k in range(6))
 WORDS = ("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e-320", '"text"', "true", "[]", "[1.0]", "{}", "''", "")
-#: A sentence of advice: it names what is wrong and says what to do.
-SENTENCE = re.compile(r"\S.*\S", re.DOTALL)
+#: One sentence: what is wrong, then what to do.
+SENTENCE = re.compile(r"\S[^\n]+[:;,(][^\n]+\S")
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,11 @@
 """Batches and sweeps: the numbers of single runs, whatever strategy, devices, kills and resumes."""
 
+import os
+import resource
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import h5py
 import jax
@@ -225,15 +228,28 @@ def test_unusable_tables_are_refused(files, table, sentence):
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 
-def test_a_full_disk_keeps_what_was_computed(files, monkeypatch, capsys):
-    original = sweep._write_part
+def test_writes_that_fail_keep_what_was_computed(files):
+    """A limit on the size of files, where a full disk would be: the same failing write."""
+    table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
+    out = files / "rows.h5"
+    sweep.run(table, out, process=(0, 2))  # every second chunk
+    finished = sorted(files.glob("rows.h5.parts/part_*"))
+    most = finished[0].stat().st_size - 1
+    call = [sys.executable, "-m", "liverjax", *command(files, "--resume")]
+    small = {**os.environ, "JAX_COMPILATION_CACHE_DIR": ""}  # JAX would write there
 
-    def full(file, table, k, program):
-        if k == 1:
-            raise OSError(28, "No space left on device")
-        original(file, table, k, program)
+    def limited():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
 
-    monkeypatch.setattr(sweep, "_write_part", full)
+    run = subprocess.run(call, capture_output=True, text=True, timeout=300, preexec_fn=limited, env=small)
+    assert run.returncode == 1 and len(run.stderr.splitlines()) == 1
+    assert "File too large: finished chunks are kept, go on with --resume" in run.stderr
+    assert sorted(files.glob("rows.h5.parts/part_*")) == finished and len(finished) == 2
+    assert main(command(files, "--resume")) == 0
+
+
+def test_no_room_for_the_joined_file_keeps_the_parts(files, monkeypatch, capsys):
+    monkeypatch.setattr(sweep.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     assert main(command(files)) == 1
     assert "No space left on device: finished chunks are kept, go on with --resume" in capsys.readouterr().err
     monkeypatch.undo()
