@@ -19,6 +19,7 @@ from liverjax import boundary, laws, mjed, reference, shapes, viscosity
 from liverjax.batch import Batch, simulate_batch
 from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
+from liverjax.gradients import Gradient, value_and_gradient
 from liverjax.laws import Law
 from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
 from liverjax.porosity import Porosity
@@ -34,6 +35,7 @@ __all__ = [
     "Body",
     "Displaced",
     "Fixed",
+    "Gradient",
     "InputError",
     "Law",
     "Porosity",
@@ -59,6 +61,7 @@ __all__ = [
     "struct",
     "tet_mesh",
     "viscosity",
+    "value_and_gradient",
     "with_parameters",
     "write_mesh",
 ]

@@ -12,10 +12,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from liverjax import status
-from liverjax.linear import differentiable_solve
+from liverjax.linear import differentiable_solve, refined
 from liverjax.minimisation import minimise, untangled
+
+
+#: Name of a step's root among what reverse mode may keep: with it nothing of how it was found is computed again.
+ROOT = "root"
 
 
 class StepStatistics(NamedTuple):
@@ -147,12 +152,18 @@ def solve(
     # Two rules: how the root was found has no derivative, and the root's own is by the tangent there.
     q, aux = jax.lax.custom_root(at_end, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     statistics, kept = jax.lax.stop_gradient(aux)
-    q = jax.lax.stop_gradient(q)
+    q, statistics = checkpoint_name((jax.lax.stop_gradient(q), statistics), ROOT)
 
     def tangent_solve(linear, y):
         K = method.tangent(q, one, jax.lax.stop_gradient(method.residual(q, one)[2]), None)
         limits = (jnp.maximum(options.adjoint * options.tolerance, 1e-13), options.max_linear_iterations)
-        solver = (lambda b: method.solve(K, b, *limits)[0]) if method.exact else None
+        solver = None
+        if method.symmetric:
+
+            def nearly(b, tolerance):
+                return method.solve(K, b, tolerance, options.max_linear_iterations)[0]
+
+            solver = (lambda _, b: nearly(b, limits[0])) if method.exact else partial(refined, nearly, limits[0])
         return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric, solver)
 
     root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)

@@ -1,5 +1,6 @@
 """Meshes of linear tetrahedra: positions, constant shape vectors, node sets; read and written by meshio."""
 
+import dataclasses
 import os
 import warnings
 from pathlib import Path
@@ -61,6 +62,15 @@ def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = No
         node_sets=sets,
         pattern=neighbours,
     )
+
+
+def with_points(mesh: TetMesh, points: Any) -> TetMesh:
+    """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with."""
+    points = jnp.asarray(points, mesh.points.dtype)
+    if points.shape != mesh.points.shape:
+        raise InputError(f"mesh.points has shape {points.shape}: give positions of shape {mesh.points.shape}")
+    shape_vectors, volumes = _geometry(points, mesh.tetrahedra)
+    return dataclasses.replace(mesh, points=points, shape_vectors=shape_vectors, volumes=volumes)
 
 
 @jax.jit

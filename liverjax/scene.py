@@ -15,7 +15,7 @@ from liverjax import boundary, laws, porosity, shapes, viscosity
 from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
-from liverjax.mesh import UNITS, TetMesh, check_mesh, read_mesh
+from liverjax.mesh import UNITS, TetMesh, check_mesh, read_mesh, with_points
 from liverjax.porosity import Porosity
 from liverjax.struct import param, replace, static, struct
 from liverjax.viscosity import Prony
@@ -469,7 +469,8 @@ def with_parameters(scene: Scene, values: dict[str, Any]) -> Scene:
     Args:
         scene: `Scene`.
         values: dotted names as in the scene file -> values: ``law.mu`` (``law.1.mu`` of several laws),
-            ``viscosity.relaxation_times``, ``viscosity.ratios.0``, ``body.density``, ``displaced.0.by``, ``solve.dt``.
+            ``viscosity.relaxation_times``, ``viscosity.ratios.0``, ``body.density``, ``displaced.0.by``, ``solve.dt``,
+            ``mesh.points``; a number of a law may be one an element (E,).
 
     Raises:
         InputError: a name that the scene does not have.
@@ -485,6 +486,8 @@ def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
             return tuple(value)
         return jnp.asarray(value, float) if isinstance(thing, jax.Array) else value
     key, rest = path[0], path[1:]
+    if isinstance(thing, TetMesh) and path == ["points"]:
+        return with_points(thing, value)
     if isinstance(thing, laws.Continued):
         return replace(thing, law=_with(thing.law, path, value, name))
     if isinstance(thing, laws.Sum) and key.isdigit():

@@ -10,6 +10,7 @@ import numpy as np
 
 from liverjax import (
     boundary,
+    checkpointing,
     continuation,
     laws,
     mjed,
@@ -273,12 +274,12 @@ def _motion(e: Equations, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return velocity, acceleration
 
 
-@partial(jax.jit, static_argnames="report")
-def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None) -> Result:
-    steps = scene.solve.steps
-    dtype = scene.mesh.points.dtype
+@partial(jax.jit, static_argnames=("report", "store"))
+def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None, store: Any) -> Result:
+    steps, dtype = scene.solve.steps, scene.mesh.points.dtype
+    stiff = unit_strain_force(scene)
 
-    def advance(carry, k):
+    def physics(carry, k):
         state, kept = carry
         new, reactions, statistics, kept = step(equations(scene, state, k, stiff), kept)
         # A state that is not finite spoils nothing further: the run stays where it last was.
@@ -287,20 +288,30 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
         statistics = statistics._replace(status=jnp.where(finite, statistics.status, status.NOT_FINITE))
         new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
         P = None if new.fluid is None else new.fluid.pressure
+        kept = kept._replace(made=kept.made & good)
+        return (new, kept), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
+
+    def advance(carry, k):
+        new = checkpointing.one_step(physics)(carry, k)
         if report is not None:
             jax.debug.callback(report, k)
-        return (new, kept._replace(made=kept.made & good)), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
+        return new
 
-    numbers, stiff = jnp.arange(1, steps + 1, dtype=dtype), unit_strain_force(scene)
+    numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     kept = continuation.nothing_kept(_method(equations(scene, start, numbers[0], stiff)), flat(start.x))
-    _, (x, reactions, P, statistics) = jax.lax.scan(advance, (start, kept), numbers)
+    x, reactions, P, statistics = checkpointing.scan(advance, (start, kept), numbers, store)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status
     return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
 
 
-def simulate(scene: Scene, report: Callable[[int], None] | None = None, start: jax.Array | None = None) -> Result:
+def simulate(
+    scene: Scene,
+    report: Callable[[int], None] | None = None,
+    start: jax.Array | None = None,
+    store: str | int = "all",
+) -> Result:
     """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
 
     Args:
@@ -308,6 +319,9 @@ def simulate(scene: Scene, report: Callable[[int], None] | None = None, start: j
         start: positions (V, 3) [m] to begin at, at rest, with the pressure and memory of the reference; None: the
             reference positions. Inverted elements need robust = "projected".
         report: called on the host with the number of every finished step, for progress.
+        store: of a derivative in reverse mode: "all" keeps what every step ended with; "sqrt", or a number, keeps as
+            many states (the root of the number of steps) and runs what lies between a second time. Without a
+            derivative it does nothing. See `liverjax.gradients`.
 
     Raises:
         InputError: choices that mean nothing; precision "float64" where JAX's 64-bit mode is off. Numbers are checked
@@ -322,7 +336,7 @@ def simulate(scene: Scene, report: Callable[[int], None] | None = None, start: j
         start = jnp.asarray(start, scene.mesh.points.dtype)
         if start.shape != scene.mesh.points.shape:
             raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
-    return _run(scene, start, report)
+    return _run(scene, start, report, checkpointing.number_kept(store, scene.solve.steps))
 
 
 def _cast(value: Any, dtype: Any) -> Any:

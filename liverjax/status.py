@@ -6,6 +6,8 @@ NOT_FINITE = 2
 INDEFINITE = 3
 INVERTED = 4
 STEP_CUT = 5
+GRADIENT_UNCONVERGED = 6
+ADJOINT_FAILED = 7
 
 ADVICE = {
     CONVERGED: "converged",
@@ -17,6 +19,10 @@ ADVICE = {
     INVERTED: "in equilibrium, but with inverted elements, which no body has: take smaller loads, a stiffer volumetric "
     "energy or a finer mesh",
     STEP_CUT: "the step was halved as often as allowed and still failed: take smaller steps or robust = 'projected'",
+    GRADIENT_UNCONVERGED: "the derivative was taken through a step that did not converge, so it is not that of a "
+    "solution: mend the run first (Result.status)",
+    ADJOINT_FAILED: "the linear solves of the derivative did not converge and it is not finite: take "
+    "linear_solver = 'direct' or smaller steps",
 }
 
 
@@ -28,6 +34,8 @@ NAMES = {
     INDEFINITE: "indefinite",
     INVERTED: "inverted",
     STEP_CUT: "step cut",
+    GRADIENT_UNCONVERGED: "gradient unconverged",
+    ADJOINT_FAILED: "adjoint failed",
 }
 
 

@@ -1,0 +1,203 @@
+"""Derivatives through runs: against central differences, forward against reverse, what is kept, and the codes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import checkpointing, gradients, status
+from liverjax.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+RNG = np.random.default_rng(5)
+
+
+def _scene(kind: str) -> lj.Scene:
+    """A block of 81 tetrahedra that hangs, is pulled, pushed and moved, with the physics of `kind`."""
+    mesh = lj.shapes.box((0.05, 0.04, 0.03), (3, 3, 2))
+    top = mesh.node_sets["x_max"]
+    side = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["y_max"]))
+    load = {"pressure": 30.0} if kind == "follower" else {"value": jnp.array([5.0, -30.0, 10.0])}
+    dynamic = kind in ("dynamic", "newmark", "complete")
+    viscous = kind in ("viscous", "isochoric", "complete")
+    porous = kind in ("porous", "chapter", "complete")
+    sponge = lj.Porosity(
+        bulk=400.0,
+        limit_bulk=2200.0,
+        fluid_fraction=0.5,
+        permeability=2e-6,
+        drained=mesh.node_sets["z_max"] if kind == "porous" else None,
+        scheme="chapter" if kind == "chapter" else "implicit",
+    )
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=jnp.asarray(770.0), bulk=jnp.asarray(2200.0)),
+        viscosity=lj.Prony(
+            ratios=jnp.array([0.235, 0.333]),
+            relaxation_times=jnp.array([0.27, 0.03]),
+            part="isochoric" if kind == "isochoric" else "all",
+        )
+        if viscous
+        else None,
+        porosity=sponge if porous else None,
+        body=lj.Body(density=1060.0, gravity=jnp.array([1.0, 0.5, -4.0])),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        displaced=(lj.Displaced(nodes=top, by=jnp.array([0.004, 0.002, 0.001]), axes="xz"),),
+        traction=(lj.Traction(triangles=side, **load),),
+        solve=lj.Solve(
+            kind="dynamic" if dynamic else "static",
+            integrator="newmark" if kind == "newmark" else "euler",
+            steps=3,
+            dt=0.02 if dynamic or viscous or porous else None,
+            tolerance=1e-12,
+        ),
+    )
+
+
+def _leaves(scene: lj.Scene) -> dict:
+    """Every number the scene has, by its name."""
+    names = ["law.mu", "law.bulk", "body.density", "body.gravity", "displaced.0.by", "mesh.points", "start"]
+    names += ["viscosity.ratios", "viscosity.relaxation_times"] if scene.viscosity is not None else []
+    if scene.porosity is not None:
+        names.remove("law.bulk")
+        names += [f"porosity.{n}" for n in ("bulk", "limit_bulk", "fluid_fraction", "permeability")]
+    names += ["solve.dt"] if scene.solve.dt is not None else []
+    names += ["traction.0.pressure" if lj.boundary.follows(scene.traction) else "traction.0.value"]
+    if scene.solve.kind == "static" and (scene.porosity is None or scene.porosity.scheme == "chapter"):
+        names.remove("start")  # the equilibrium does not know where it was sought from
+    return {name: _value(scene, name) for name in names} | {"law.mu": jnp.full(scene.mesh.number_of_elements, 770.0)}
+
+
+def _value(scene: lj.Scene, name: str):
+    thing = scene
+    if name == "start":
+        return scene.mesh.points
+    for key in name.split("."):
+        thing = thing[int(key)] if key.isdigit() else getattr(thing, key)
+    return jnp.asarray(thing, float)
+
+
+KINDS = ("complete",)
+MORE = ("static", "follower", "dynamic", "newmark", "viscous", "isochoric", "porous", "chapter")
+
+
+@pytest.mark.parametrize("kind", [*KINDS, *(pytest.param(kind, marks=pytest.mark.slow) for kind in MORE)])
+def test_every_leaf_of_a_scene(kind):
+    """Reverse mode against central differences (best of several steps) and against forward mode."""
+    scene = _scene(kind)
+    at = _leaves(scene)
+    names = list(at)
+    shape = (scene.solve.steps, *scene.mesh.points.shape)
+    weight, sideways = jnp.asarray(RNG.normal(size=shape)), jnp.asarray(1e-3 * RNG.normal(size=shape))
+    along = {}
+    for name, value in at.items():
+        size = 0.01 if name in ("mesh.points", "start") else 1.0
+        spread = 0.003 if name in ("mesh.points", "start") else jnp.abs(value)
+        along[name] = size * spread * jnp.asarray(RNG.choice([-1.0, 1.0], value.shape) * RNG.uniform(0.5, 1, value.shape))
+
+    def loss(result):
+        return jnp.sum(weight * result.positions) + jnp.sum(sideways * result.reactions)
+
+    @jax.jit
+    def moved(eps):
+        values = {name: at[name] + e * along[name] for name, e in zip(names, eps, strict=True)}
+        start = values.pop("start", None)
+        result = lj.simulate(lj.with_parameters(scene, values), start=start)
+        return loss(result), result.status
+
+    found = lj.value_and_gradient(loss, scene, at)
+    assert int(found.status) == status.CONVERGED
+    slopes = np.array([float(jnp.vdot(found.gradient[name], along[name])) for name in names])
+    zero = jnp.zeros(len(names))
+    direction = jnp.asarray(RNG.normal(size=len(names)))
+    forward = jax.jit(lambda eps: jax.jvp(lambda eps: moved(eps)[0], (eps,), (direction,))[1])(zero)
+    # The same products in another order; the adjoint solves end at 1e-13 of their loads.
+    assert abs(forward - slopes @ direction) < 1e-10 * (abs(slopes) @ abs(direction))
+
+    steps = (4e-4, 1e-4)
+    errors = np.full((len(steps), len(names)), np.inf)
+    for i, h in enumerate(steps):
+        for j in range(len(names)):
+            ends = [moved(zero.at[j].set(s)) for s in (h, -h)]
+            assert not any(np.any(codes) for _, codes in ends)
+            errors[i, j] = abs(float(ends[0][0] - ends[1][0]) / (2 * h) / slopes[j] - 1)
+    best = dict(zip(names, errors.min(axis=0), strict=True))
+    assert max(best.values()) < 1e-7, best
+
+
+def _sum(result):
+    return jnp.sum(result.positions[-1] ** 2)
+
+
+@pytest.mark.parametrize("store", ["sqrt", *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3))])
+def test_what_is_kept_changes_no_derivative(store):
+    """Five steps: segments of three and two; one of all; of two, two and one."""
+    scene = _scene("viscous")
+    scene = replace(scene, solve=replace(scene.solve, steps=5, tolerance=1e-8))
+    at = {"law.mu": 770.0, "viscosity.ratios": scene.viscosity.ratios}
+    whole = lj.value_and_gradient(_sum, scene, at)
+    parts = lj.value_and_gradient(_sum, scene, at, store=store)
+    for name in at:
+        np.testing.assert_allclose(parts.gradient[name], whole.gradient[name], rtol=1e-9)
+    forward = lj.value_and_gradient(_sum, scene, at, mode="forward")
+    for name in at:
+        np.testing.assert_allclose(forward.gradient[name], whole.gradient[name], rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_step_keeps_no_more_than_its_state_and_root():
+    """The derivative's program holds no array of all steps that is larger than the state: XLA's own account."""
+    scene = _scene("complete")
+    sizes = []
+    for steps in (20, 120):
+        longer = replace(scene, solve=replace(scene.solve, steps=steps))
+        program = gradients._program(_sum, "all", "reverse").lower(longer, {"law.mu": jnp.asarray(770.0)}).compile()
+        sizes.append(program.memory_analysis().temp_size_in_bytes)
+        predicted = gradients.memory(longer)
+    a_step = (sizes[1] - sizes[0]) / 100
+    one = replace(scene, solve=replace(scene.solve, steps=1))
+    two = replace(scene, solve=replace(scene.solve, steps=2))
+    assert abs((gradients.memory(two) - gradients.memory(one)) / a_step - 1) < 0.2
+    assert abs(predicted / sizes[1] - 1) < 0.2
+
+
+def test_codes_of_derivatives():
+    """Through a step that did not converge, and where the adjoint solve gives nothing."""
+    scene = _scene("static")
+    hasty = replace(scene, solve=replace(scene.solve, newton_iterations=2, tolerance=1e-14))
+    assert int(lj.value_and_gradient(_sum, hasty, {"law.mu": 770.0}).status) == status.GRADIENT_UNCONVERGED
+    good = replace(scene, solve=replace(scene.solve, steps=1, tolerance=1e-8))
+
+    def spoiled(result):
+        return jnp.sum(jnp.where(jnp.isfinite(result.positions), jnp.nan, 0.0) * result.positions)
+
+    assert int(lj.value_and_gradient(spoiled, good, {"law.mu": 770.0}).status) == status.ADJOINT_FAILED
+    for code in (status.GRADIENT_UNCONVERGED, status.ADJOINT_FAILED):
+        assert "derivative" in status.advice(code)
+
+
+@pytest.mark.parametrize("store", [0, -1, 1.5, "some", True])
+def test_unknown_stores_are_refused(store):
+    with pytest.raises(lj.InputError, match="store"):
+        lj.value_and_gradient(_sum, _scene("static"), {"law.mu": 770.0}, store=store)
+
+
+def test_unknown_modes_and_names_are_refused():
+    scene = _scene("static")
+    with pytest.raises(lj.InputError, match="mode"):
+        lj.value_and_gradient(_sum, scene, {"law.mu": 770.0}, mode="sideways")
+    with pytest.raises(lj.InputError, match="no parameters"):
+        lj.value_and_gradient(_sum, scene, {})
+    with pytest.raises(lj.InputError, match="did you mean mu"):
+        lj.value_and_gradient(_sum, scene, {"law.nu": 770.0})
+    with pytest.raises(lj.InputError, match="shape"):
+        lj.value_and_gradient(_sum, scene, {"mesh.points": np.zeros((3, 3))})
+
+
+def test_segments_cover_all_steps():
+    for steps in range(1, 40):
+        for kept in range(1, steps):
+            count, length, rest = checkpointing.lengths(steps, kept)
+            assert count * length + rest == steps and count + (rest > 0) <= kept
