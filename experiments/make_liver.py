@@ -32,12 +32,12 @@ def level(points: np.ndarray) -> np.ndarray:
     return blend + 0.35 * dent
 
 
-def surface(offset: float) -> tuple[np.ndarray, np.ndarray]:
+def surface(offset: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of level = offset, evened out and drawn back onto the surface."""
     low, high = np.array([-0.17, -0.11, -0.07]), np.array([0.17, 0.11, 0.07])
-    shape = np.ceil((high - low) / SPACING).astype(int) + 1
-    grid = low + SPACING * np.moveaxis(np.indices(shape), 0, -1)
-    vertices, triangles, _, _ = marching_cubes(level(grid), offset, spacing=(SPACING,) * 3, allow_degenerate=False)
+    shape = np.ceil((high - low) / spacing).astype(int) + 1
+    grid = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
+    vertices, triangles, _, _ = marching_cubes(level(grid), offset, spacing=(spacing,) * 3, allow_degenerate=False)
     vertices = vertices + low
     neighbours = [[] for _ in vertices]
     for a, b, c in triangles:
@@ -61,21 +61,26 @@ def enclosed(vertices: np.ndarray, triangles: np.ndarray) -> float:
     return abs(float(np.sum(a * np.cross(b, c)))) / 6
 
 
-def main() -> None:
-    """Find the level of the wanted volume, fill it with tetrahedra, name the node sets, write the file."""
+def filled(spacing: float, largest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points and tetrahedra of at most `largest` [m^3], of the phantom; `spacing` [m] of its surface's grid."""
     low, high = -0.3, 0.3
     for _ in range(18):
         offset = (low + high) / 2
-        low, high = (offset, high) if enclosed(*surface(offset)) < VOLUME else (low, offset)
-    vertices, triangles = surface(offset)
-    mesher = tetgen.TetGen(vertices, triangles)
-    mesher.tetrahedralize(order=1, mindihedral=14, minratio=1.4, maxvolume=3.2e-7, nobisect=True)
+        enough = enclosed(*surface(offset, spacing)) >= VOLUME
+        low, high = (low, offset) if enough else (offset, high)
+    mesher = tetgen.TetGen(*surface(offset, spacing))
+    mesher.tetrahedralize(order=1, mindihedral=14, minratio=1.4, maxvolume=largest, nobisect=True)
     points, tets = np.asarray(mesher.node), np.asarray(mesher.elem)
     tets = tets[:, [0, 1, 2, 3]]
     flipped = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) < 0
     tets[flipped] = tets[flipped][:, [0, 2, 1, 3]]
     used = np.unique(tets)
-    points, tets = points[used], np.searchsorted(used, tets)
+    return points[used], np.searchsorted(used, tets)
+
+
+def main() -> None:
+    """Find the level of the wanted volume, fill it with tetrahedra, name the node sets, write the file."""
+    points, tets = filled(SPACING, 3.2e-7)
     outer = np.unique(boundary_triangles(lj.tet_mesh(points, tets)))
     x, y, z = points[outer].T
     middle = (x > -0.045) & (x < 0.005)

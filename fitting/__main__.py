@@ -1,10 +1,11 @@
-"""``python -m fitting SWEEP.csv`` and ``python -m fitting curves LAW FILES``: parameters with their uncertainty."""
+"""``python -m fitting SWEEP.csv``, ``… curves LAW FILES``, ``… field SCENE DISPLACEMENTS``: parameters, uncertainty."""
 
 import argparse
 import os
 import sys
 from pathlib import Path
 
+from fitting.exit_codes import EXIT_CODES
 from liverjax.errors import InputError
 from liverjax.folders import writable
 
@@ -18,14 +19,12 @@ def _modes(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
 
 
-_EXIT_CODES = "Exit code 0: done; 1: the fit did not converge (its best point is kept, marked); 2: unusable input."
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m fitting",
         description="Identify a generalised Maxwell (Prony) model from a rheometer's frequency sweep.",
-        epilog="Stress-stretch curves: python -m fitting curves --help. " + _EXIT_CODES,
+        epilog="Stress-stretch curves: python -m fitting curves --help. Displacements of a body: python -m fitting "
+        "field --help. " + EXIT_CODES,
     )
     parser.add_argument("sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text")
     parser.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
@@ -47,7 +46,7 @@ def _curves_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m fitting curves",
         description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves at once.",
-        epilog=_EXIT_CODES,
+        epilog=EXIT_CODES,
     )
     parser.add_argument("law", metavar="LAW", help="name of a law, or all")
     parser.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
@@ -156,6 +155,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if arguments[:1] == ["curves"]:
             return identify_laws(_curves_parser().parse_args(arguments[1:]))
+        if arguments[:1] == ["field"]:
+            from fitting import field_command
+
+            return field_command.identify(field_command.parser().parse_args(arguments[1:]))
         return identify(_parser().parse_args(arguments))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -23,6 +23,7 @@ from liverjax.gradients import Gradient, value_and_gradient
 from liverjax.laws import Law
 from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
 from liverjax.porosity import Porosity
+from liverjax.regions import Region
 from liverjax.scene import Body, Scene, Solve, check_scene, load_scene, with_parameters
 from liverjax.simulation import Result, simulate
 from liverjax.struct import param, static, struct
@@ -40,6 +41,7 @@ __all__ = [
     "Law",
     "Porosity",
     "Prony",
+    "Region",
     "Result",
     "Scene",
     "Solve",
@@ -60,8 +62,8 @@ __all__ = [
     "static",
     "struct",
     "tet_mesh",
-    "viscosity",
     "value_and_gradient",
+    "viscosity",
     "with_parameters",
     "write_mesh",
 ]

@@ -18,7 +18,6 @@ from liverjax import status
 from liverjax.linear import differentiable_solve, refined
 from liverjax.minimisation import minimise, untangled
 
-
 #: Name of a step's root among what reverse mode may keep: with it nothing of how it was found is computed again.
 ROOT = "root"
 

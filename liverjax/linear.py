@@ -156,7 +156,10 @@ _INNER, _REFINEMENTS = 1e-2, 40
 
 
 def refined(
-    nearly: Callable[[jax.Array, Any], jax.Array], tolerance: Any, matvec: Callable[[jax.Array], jax.Array], b: jax.Array
+    nearly: Callable[[jax.Array, Any], jax.Array],
+    tolerance: Any,
+    matvec: Callable[[jax.Array], jax.Array],
+    b: jax.Array,
 ) -> jax.Array:
     """Solve A x = b by repeated solves of a system near it: few products with a dear A (iterative refinement).
 

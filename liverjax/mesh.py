@@ -29,6 +29,7 @@ class TetMesh:
     shape_vectors: jax.Array = param("1/m", "D_a = grad N_a of nodes a = 1, 2, 3, shape (3, 3, E); D_0 = -(sum)")
     volumes: jax.Array = param("m^3", "reference volumes (E,)")
     node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
+    element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
     pattern: Pattern = param("1", "which nodes share an element")
 
     @property
@@ -42,7 +43,12 @@ class TetMesh:
         return self.tetrahedra.shape[0]
 
 
-def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = None) -> TetMesh:
+def tet_mesh(
+    points: Any,
+    tetrahedra: Any,
+    node_sets: dict[str, Any] | None = None,
+    element_sets: dict[str, Any] | None = None,
+) -> TetMesh:
     """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`).
 
     The positions may be traced, the node numbers may not.
@@ -53,13 +59,16 @@ def tet_mesh(points: Any, tetrahedra: Any, node_sets: dict[str, Any] | None = No
     neighbours = pattern(tetrahedra, points)
     tetrahedra = jnp.asarray(tetrahedra, dtype=jnp.int32)
     shape_vectors, volumes = _geometry(points, tetrahedra)
-    sets = {k: jnp.asarray(v, dtype=jnp.int32) for k, v in (node_sets or {}).items()}
+    nodes, elements = (
+        {k: jnp.asarray(v, dtype=jnp.int32) for k, v in (sets or {}).items()} for sets in (node_sets, element_sets)
+    )
     return TetMesh(
         points=points,
         tetrahedra=tetrahedra,
         shape_vectors=shape_vectors,
         volumes=volumes,
-        node_sets=sets,
+        node_sets=nodes,
+        element_sets=elements,
         pattern=neighbours,
     )
 
@@ -119,7 +128,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
 
 def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
-    """Read any file meshio reads that holds linear tetrahedra; node sets come along.
+    """Read any file meshio reads that holds linear tetrahedra; sets of nodes and elements come along.
 
     Args:
         path: mesh file.
@@ -159,7 +168,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
         raise InputError(
             f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
         )
-    mesh = tet_mesh(points, tets, _node_sets(data))
+    mesh = tet_mesh(points, tets, _node_sets(data), _element_sets(data))
     check_mesh(mesh, f"mesh file {path}")
     size = float(np.ptp(points, axis=0).max())
     if size > _LARGE and unit == "m":
@@ -184,8 +193,42 @@ def _node_sets(data: Any) -> dict[str, np.ndarray]:
     return sets
 
 
+#: A cell array of whole numbers with more of them than this numbers the cells, it does not group them.
+_MOST_GROUPS = 100
+
+
+def _element_sets(data: Any) -> dict[str, np.ndarray]:
+    """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups of whole numbers.
+
+    A group is called as the file does (Gmsh's physical names), or after array and number, ``medit:ref=2``.
+    """
+    kinds = [block.type for block in data.cells]
+    first = np.cumsum([0, *(len(block.data) if block.type == "tetra" else 0 for block in data.cells)])
+    sets = {}
+    for name, parts in (data.cell_sets or {}).items():
+        picks = [
+            first[k] + np.asarray(part, int)
+            for k, part in enumerate(parts)
+            if part is not None and kinds[k] == "tetra" and not name.startswith("gmsh:bounding")
+        ]
+        if picks and sum(map(len, picks)):
+            sets[name] = np.concatenate(picks)
+    names = {(int(tag[0]), "gmsh:physical"): name for name, tag in data.field_data.items() if tag[-1] == 3}
+    for name, parts in data.cell_data.items():
+        values = np.concatenate([np.asarray(p) for p, kind in zip(parts, kinds, strict=True) if kind == "tetra"])
+        if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
+            continue
+        if name.startswith("set:"):
+            sets[name.removeprefix("set:")] = np.flatnonzero(values)
+            continue
+        groups = np.unique(values)
+        for group in groups if len(groups) <= _MOST_GROUPS else ():
+            sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
+    return sets
+
+
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any] | None = None) -> None:
-    """Write a mesh [m] with meshio; node sets are kept as 0/1 point data ``set:NAME``, in formats that carry data."""
+    """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that carry data."""
     import meshio
 
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
@@ -193,7 +236,14 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any
         mask = np.zeros(mesh.number_of_nodes, dtype=np.int32)
         mask[np.asarray(nodes)] = 1
         data[f"set:{name}"] = mask
+    cell_data = {}
+    for name, elements in mesh.element_sets.items():
+        mask = np.zeros(mesh.number_of_elements, dtype=np.int32)
+        mask[np.asarray(elements)] = 1
+        cell_data[f"set:{name}"] = [mask]
     cells = [("tetra", np.asarray(mesh.tetrahedra))]
     # meshio takes .msh for an ANSYS file; in this field it is Gmsh's.
     file_format = "gmsh" if Path(path).suffix == ".msh" else None
-    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data).write(path, file_format=file_format)
+    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
+        path, file_format=file_format
+    )

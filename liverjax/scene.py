@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import boundary, laws, porosity, shapes, viscosity
+from liverjax import boundary, laws, porosity, regions, shapes, viscosity
 from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
 from liverjax.mesh import UNITS, TetMesh, check_mesh, read_mesh, with_points
 from liverjax.porosity import Porosity
+from liverjax.regions import Region
 from liverjax.struct import param, replace, static, struct
 from liverjax.viscosity import Prony
 
@@ -51,6 +52,7 @@ class Scene:
 
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")
+    region: tuple[Region, ...] = param("1", "parts of the body with other numbers in the law", default=())
     viscosity: Prony | None = param("1", "Prony series", default=None)
     porosity: Porosity | None = param("1", "sponge and fluid", default=None)
     body: Body | None = param("1", "density and gravity", default=None)
@@ -71,6 +73,7 @@ def element_law(scene: Scene) -> Law:
 
 _KEYS = {
     "mesh": ("file", "unit", "shape", "size", "cells", "radius", "height", "cell_size"),
+    "region": ("where", "set", "law"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
     "porosity": ("bulk", "limit_bulk", "fluid_fraction", "permeability", "drained", "scheme", "keep_bulk"),
     "body": ("density", "gravity"),
@@ -116,6 +119,7 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
     scene = Scene(
         mesh=mesh,
         law=_law(content["law"]),
+        region=tuple(_region(mesh, k, t) for k, t in enumerate(_tables(content, "region"))),
         viscosity=prony,
         porosity=_section(content, "porosity", lambda table: _porosity(mesh, table)),
         body=_section(content, "body", _body),
@@ -197,6 +201,29 @@ def _law(value: Any) -> Law:
         law = laws.create(table["name"], **{k: v for k, v in table.items() if k not in ("name", "continued_below")})
         made.append(laws.continued(law, table["continued_below"]) if "continued_below" in table else law)
     return made[0] if len(made) == 1 else laws.Sum(laws=tuple(made))
+
+
+def _region(mesh: TetMesh, k: int, table: dict) -> Region:
+    name = f"region.{k}"
+    where, given = table.get("where"), table.get("law")
+    if where is not None and not isinstance(where, dict):
+        raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
+    if not isinstance(given, dict) or not given:
+        raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
+    elements = regions.select(mesh, where, table.get("set"), name)
+    return Region(elements=jnp.asarray(elements, jnp.int32), law=dict(_dotted(f"{name} law", given)))
+
+
+def _dotted(name: str, table: dict) -> list[tuple[str, float]]:
+    """Numbers of nested tables and lists, by dotted names."""
+    out = []
+    for key, value in table.items():
+        if isinstance(value, (dict, list)):
+            inner = value if isinstance(value, dict) else {str(k): v for k, v in enumerate(value)}
+            out += [(f"{key}.{rest}", v) for rest, v in _dotted(f"{name}.{key}", inner)]
+        else:
+            out.append((key, _number(f"{name}.{key}", value)))
+    return out
 
 
 def _prony(table: dict) -> Prony:
@@ -360,6 +387,7 @@ def check_scene(scene: Scene) -> None:
     for k, load in enumerate(scene.traction):
         if not np.all(np.isfinite(np.asarray(load.pressure if load.value is None else load.value, dtype=float))):
             raise InputError(f"traction.{k} is not finite: give numbers in Pa")
+    regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
     if scene.viscosity is not None:
         viscosity.check(scene.viscosity, scene.law)
     if scene.porosity is not None:
@@ -470,7 +498,7 @@ def with_parameters(scene: Scene, values: dict[str, Any]) -> Scene:
         scene: `Scene`.
         values: dotted names as in the scene file -> values: ``law.mu`` (``law.1.mu`` of several laws),
             ``viscosity.relaxation_times``, ``viscosity.ratios.0``, ``body.density``, ``displaced.0.by``, ``solve.dt``,
-            ``mesh.points``; a number of a law may be one an element (E,).
+            ``mesh.points``, ``region.0.law.mu``; a number of a law may be one an element (E,).
 
     Raises:
         InputError: a name that the scene does not have.
@@ -486,6 +514,8 @@ def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
             return tuple(value)
         return jnp.asarray(value, float) if isinstance(thing, jax.Array) else value
     key, rest = path[0], path[1:]
+    if isinstance(thing, dict) and ".".join(path) in thing:
+        return thing | {".".join(path): value}
     if isinstance(thing, TetMesh) and path == ["points"]:
         return with_points(thing, value)
     if isinstance(thing, laws.Continued):

@@ -17,6 +17,7 @@ from liverjax import (
     nodal_volume,
     porosity,
     potential,
+    regions,
     status,
     tangent,
     terms,
@@ -328,6 +329,9 @@ def simulate(
             by `check_scene`, which reading a scene file calls.
     """
     check_choices(scene)
+    if scene.region:
+        per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
+        scene = replace(scene, law=per_element, region=())
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif not jax.config.jax_enable_x64:

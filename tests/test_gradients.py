@@ -95,7 +95,9 @@ def test_every_leaf_of_a_scene(kind):
     for name, value in at.items():
         size = 0.01 if name in ("mesh.points", "start") else 1.0
         spread = 0.003 if name in ("mesh.points", "start") else jnp.abs(value)
-        along[name] = size * spread * jnp.asarray(RNG.choice([-1.0, 1.0], value.shape) * RNG.uniform(0.5, 1, value.shape))
+        along[name] = (
+            size * spread * jnp.asarray(RNG.choice([-1.0, 1.0], value.shape) * RNG.uniform(0.5, 1, value.shape))
+        )
 
     def loss(result):
         return jnp.sum(weight * result.positions) + jnp.sum(sideways * result.reactions)

@@ -43,6 +43,7 @@ __all__ = [
     "VerondaWestmann",
     "Volumetric",
     "Yeoh",
+    "check_value",
     "continued",
     "create",
     "isochoric_part",
@@ -108,7 +109,7 @@ def create(name: str, **values: Any) -> Law:
     for key, value in values.items():
         if value is None and known[key].default is None:
             continue  # an optional coefficient left out
-        _check_value(f"law {name}: {key}", known[key].metadata, value)
+        check_value(f"law {name}: {key}", known[key].metadata, value)
     law = cls(**{k: _sequence(v) if known[k].metadata.get("each") else v for k, v in values.items()})
     if hasattr(law, "check") and not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(law)):
         law.check()
@@ -124,7 +125,8 @@ def _sequence(value: Any) -> Any:
     return jnp.asarray(value) if jnp.ndim(value) > 1 else tuple(value)
 
 
-def _check_value(where: str, metadata: Any, value: Any) -> None:
+def check_value(where: str, metadata: Any, value: Any) -> None:
+    """Refuse a value that a parameter's `metadata` does not allow, in one sentence that begins with `where`."""
     if metadata.get("static"):
         if not isinstance(value, str) or value not in VOLUMETRIC:
             raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")

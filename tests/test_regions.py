@@ -1,0 +1,159 @@
+"""Other numbers in parts of a body: every law, sets of elements from mesh files, scene files, bad regions."""
+
+import jax
+import jax.numpy as jnp
+import meshio
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import regions
+from liverjax.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def _pulled(law: lj.Law, region: tuple = ()) -> lj.Scene:
+    mesh = lj.shapes.box((0.04, 0.02, 0.02), (4, 2, 2))
+    move = lj.Displaced(nodes=mesh.node_sets["x_max"], by=jnp.array([0.004, 0.0, 0.0]))
+    return lj.Scene(
+        mesh=mesh, law=law, region=region, fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),), displaced=(move,)
+    )
+
+
+@pytest.mark.parametrize("name", list(lj.laws.LAWS))
+def test_every_number_of_every_law_may_differ_by_element(name):
+    """A region of all elements is the scene with that number; forces of half a body are those of its own elements."""
+    law = lj.laws.typical(name)
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 1, 1))
+    E = mesh.number_of_elements
+    x = mesh.points + 0.02 * jnp.asarray(np.random.default_rng(1).normal(size=mesh.points.shape))
+    all_of_it, half = jnp.arange(E), jnp.arange(E // 2)
+    for field in lj.laws.parameters(law):
+        value = getattr(law, field.name)
+        if field.name in ("fibre", "sheet") or value is None:
+            continue
+        label = f"{field.name}.0" if isinstance(value, tuple) else field.name
+        base = value[0] if isinstance(value, tuple) else value
+        if label.startswith("alpha") and isinstance(value, tuple):
+            continue  # an exponent's sign is part of how a stretch law is evaluated
+        other = 1.1 * float(base)
+        changed = replace(law, **{field.name: (other, *value[1:]) if isinstance(value, tuple) else other})
+        whole = regions.law_of_elements(law, (lj.Region(elements=all_of_it, law={label: other}),), E)
+        force = lj.mjed.internal_force(mesh, changed, x)
+        scale = float(jnp.abs(force).max())
+        np.testing.assert_allclose(lj.mjed.internal_force(mesh, whole, x), force, atol=1e-13 * scale)
+        mixed = regions.law_of_elements(law, (lj.Region(elements=half, law={label: other}),), E)
+        parts = []
+        for numbers, one in ((np.arange(E // 2), changed), (np.arange(E // 2, E), law)):
+            part = lj.tet_mesh(mesh.points, np.asarray(mesh.tetrahedra)[numbers])
+            parts.append(lj.mjed.internal_force(part, one, x))
+        np.testing.assert_allclose(lj.mjed.internal_force(mesh, mixed, x), parts[0] + parts[1], atol=1e-12 * scale)
+
+
+def test_a_region_runs_as_the_array_it_stands_for_and_has_a_gradient():
+    law = lj.laws.NeoHookean(mu=800.0, bulk=3000.0)
+    inside = jnp.arange(20, 50)
+    scene = _pulled(law, (lj.Region(elements=inside, law={"mu": jnp.asarray(2400.0)}),))
+    mu = jnp.full(scene.mesh.number_of_elements, 800.0).at[inside].set(2400.0)
+    arrays = _pulled(replace(law, mu=mu))
+    lj.check_scene(scene)
+    np.testing.assert_allclose(lj.simulate(scene).check().positions, lj.simulate(arrays).positions, atol=1e-12)
+
+    def work(result):
+        return jnp.sum(result.reactions**2)
+
+    one = lj.value_and_gradient(work, scene, {"region.0.law.mu": 2400.0}).gradient["region.0.law.mu"]
+    each = lj.value_and_gradient(work, arrays, {"law.mu": mu}).gradient["law.mu"]
+    np.testing.assert_allclose(one, each[inside].sum(), rtol=1e-8)
+
+
+def test_a_uniform_scene_pays_nothing():
+    """No array of one number an element stands in the program of a scene without regions, beside the mesh's own."""
+    scene = _pulled(lj.laws.NeoHookean(mu=800.0, bulk=3000.0))
+    assert len(jax.tree.leaves(scene.region)) == 0
+    assert all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.law))
+
+
+def test_sets_of_elements_come_from_the_file(tmp_path):
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+    X, T = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    group = (X[T].mean(axis=1)[:, 0] > 0.5).astype(np.int32) + 3
+    meshio.Mesh(X, [("tetra", T)], cell_data={"medit:ref": [group]}).write(tmp_path / "a.vtu")
+    read = lj.read_mesh(tmp_path / "a.vtu")
+    assert set(read.element_sets) == {"medit:ref=3", "medit:ref=4"}
+    np.testing.assert_array_equal(read.element_sets["medit:ref=4"], np.flatnonzero(group == 4))
+    # Gmsh: triangles of the surface stand before the tetrahedra, and the groups have names.
+    triangles = lj.boundary.boundary_triangles(mesh)
+    tags = [np.full(len(triangles), 7), group]
+    named = meshio.Mesh(
+        X,
+        [("triangle", triangles), ("tetra", T)],
+        cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags},
+        field_data={"lesion": np.array([4, 3]), "skin": np.array([7, 2])},
+    )
+    named.write(tmp_path / "b.msh", file_format="gmsh22", binary=False)
+    read = lj.read_mesh(tmp_path / "b.msh")
+    np.testing.assert_array_equal(np.sort(read.element_sets["lesion"]), np.flatnonzero(group == 4))
+    lj.write_mesh(tmp_path / "c.vtu", read)
+    again = lj.read_mesh(tmp_path / "c.vtu")
+    np.testing.assert_array_equal(np.sort(again.element_sets["lesion"]), np.flatnonzero(group == 4))
+
+
+_SCENE = """
+[mesh]
+shape = "box"
+size = [0.04, 0.02, 0.02]
+cells = [4, 2, 2]
+[law]
+name = "ogden"
+mu = [500.0, 300.0]
+alpha = [2.0, -2.0]
+bulk = 3000.0
+{region}
+[[fixed]]
+where = {{x_max = 0.0}}
+[[displaced]]
+where = {{x_min = 0.04}}
+by = [0.004, 0, 0]
+"""
+
+
+def _load(tmp_path, region: str) -> lj.Scene:
+    (tmp_path / "scene.toml").write_text(_SCENE.format(region=region))
+    return lj.load_scene(tmp_path / "scene.toml")
+
+
+def test_regions_of_a_scene_file(tmp_path):
+    scene = _load(tmp_path, "[[region]]\nwhere = {x_min = 0.02}\nlaw = {mu = [1500.0, 900.0], bulk = 6000.0}")
+    (region,) = scene.region
+    assert set(region.law) == {"mu.0", "mu.1", "bulk"}
+    middle = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)].mean(axis=1)
+    np.testing.assert_array_equal(region.elements, np.flatnonzero(middle[:, 0] > 0.02))
+    softer = lj.with_parameters(scene, {"region.0.law.mu.1": 10.0})
+    assert softer.region[0].law["mu.1"] == 10.0
+    law = regions.law_of_elements(softer.law, softer.region, scene.mesh.number_of_elements)
+    assert float(law.mu[1].min()) == 10.0 and float(law.mu[1].max()) == 300.0
+    assert np.isfinite(np.asarray(lj.simulate(scene).check().positions)).all()
+
+
+@pytest.mark.parametrize(
+    ("region", "words"),
+    [
+        ('[[region]]\nset = "lesion"\nlaw = {bulk = 1.0}', "no element set 'lesion'"),
+        ("[[region]]\nwhere = {x_min = 0.02}", "needs the numbers"),
+        ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {c10 = 3.0}", "no number 'c10'"),
+        ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {mu = 3.0}", "is a list of 2"),
+        ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = -3.0}", "must be above 0"),
+        ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = 'a'}", "is not a number"),
+        ("[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = nan}", "is not a number"),
+        ("[[region]]\nwhere = {x_min = 0.039}\nlaw = {bulk = 1.0}", "no whole element"),
+        ("[[region]]\nwhere = {x_min = 0.1}\nlaw = {bulk = 1.0}", "meets no node"),
+        ("[[region]]\nwhere = 3\nlaw = {bulk = 1.0}", "must be a table"),
+        ("[[region]]\nplace = {x_min = 0.02}\nlaw = {bulk = 1.0}", "unknown key 'place'"),
+    ],
+)
+def test_bad_regions_are_one_sentence(tmp_path, region, words):
+    with pytest.raises(lj.InputError, match=words) as error:
+        _load(tmp_path, region)
+    assert "\n" not in str(error.value)
