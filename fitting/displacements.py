@@ -1,5 +1,6 @@
 """Measured displacements of points of a body: read from CSV, and what a simulation says at the same points."""
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,8 +85,10 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
 
 def _table(path: Path) -> dict[str, np.ndarray]:
     try:
-        data = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, comments="#", dtype=float))
-    except (OSError, ValueError, UnicodeDecodeError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty file
+            data = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, comments="#", dtype=float))
+    except (OSError, ValueError, IndexError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path} cannot be read ({reason}): give a CSV with columns x,y,z,ux,uy,uz") from None
     names = data.dtype.names or ()

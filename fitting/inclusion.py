@@ -22,7 +22,7 @@ NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion"
 def factor(mesh: Any, centre: jax.Array, radius: Any, width: Any) -> jax.Array:
     """How much of each element (E,) is inside: 1 within, 0 without, smooth between."""
     middle = jnp.mean(mesh.points[mesh.tetrahedra], axis=1)
-    distance = jnp.sqrt(jnp.sum((middle - centre) ** 2, axis=1) + 1e-3 * width**2)
+    distance = jnp.sqrt(jnp.sum((middle - centre[None]) ** 2, axis=1) + 1e-3 * width**2)
     return jax.nn.sigmoid((radius - distance) / width)
 
 

@@ -1,0 +1,296 @@
+"""From displacements to stiffness: reading, places, the prior, maps with uncertainty, few numbers, the command."""
+
+import json
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting import displacements, field, inclusion, prior, scenes
+from fitting.__main__ import main
+from liverjax.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+_SCENE = """
+[mesh]
+shape = "box"
+size = [0.06, 0.04, 0.04]
+cells = [4, 3, 3]
+[law]
+name = "neo_hookean"
+mu = {mu}
+bulk = 3000.0
+[body]
+density = 1000.0
+gravity = [{gravity}]
+[[fixed]]
+where = {{z_max = 0.0}}
+"""
+SURFACE = np.arange(80)  # every node of this mesh
+
+
+def _scene(folder, mu=800.0, gravity="4, 0, -3", name="scene.toml"):
+    (folder / name).write_text(_SCENE.format(mu=mu, gravity=gravity))
+    return lj.load_scene(folder / name)
+
+
+def _truth(mesh):
+    """Twice as stiff at one end, smoothly."""
+    middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
+    return 800.0 * np.exp(0.7 / (1 + np.exp((0.03 - middle[:, 0]) / 0.006)))
+
+
+def _write(file, scene, noise, mu=None, seed=0):
+    """Synthetic displacements of the upper nodes, by place, with noise [m]."""
+    X = np.asarray(scene.mesh.points)
+    true = lj.with_parameters(scene, {"law.mu": jnp.asarray(_truth(scene.mesh) if mu is None else mu)})
+    u = np.asarray(lj.simulate(true).check().positions[-1]) - X
+    seen = np.flatnonzero(X[:, 2] > 0.01)
+    rows = np.c_[X[seen], u[seen] + noise * np.random.default_rng(seed).normal(size=(len(seen), 3))]
+    np.savetxt(file, rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
+    return file
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    """Two loads on one block, noise of a hundredth of the largest displacement."""
+    folder = tmp_path_factory.mktemp("field")
+    made, data = [], []
+    for k, gravity in enumerate(("4, 0, -3", "0, 4, -3")):
+        scene = _scene(folder, gravity=gravity, name=f"{k}.toml")
+        made.append(scene)
+        data.append(displacements.read_displacements(_write(folder / f"{k}.csv", scene, 5e-5, seed=k), scene, 5e-5))
+    return scenes.Problem(tuple(made), tuple(data))
+
+
+def test_places_in_a_mesh():
+    """A linear field is met exactly, inside and a little outside."""
+    mesh = lj.shapes.box((0.06, 0.04, 0.04), (4, 3, 3))
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.002, 1.05, (50, 3)) * [0.06, 0.04, 0.04]
+    nodes, weights, outside = displacements.locate(mesh, points)
+    A, b = rng.normal(size=(3, 3)), rng.normal(size=3)
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    values = np.asarray(mesh.points) @ A.T + b
+    np.testing.assert_allclose(np.einsum("nk,nkc->nc", weights, values[nodes]), points @ A.T + b, atol=1e-12)
+    inside = np.all((points >= 0) & (points <= [0.06, 0.04, 0.04]), axis=1)
+    assert np.all(outside[inside] < 1e-9) and np.all(outside[~inside] > 0)
+
+
+_BAD = {
+    "x,y,z,ux,uy\n0,0,0,1,1": "no column uz",
+    "ux,uy,uz\n0,0,0": "either a column node or columns x,y,z",
+    "node,ux,uy,uz\n900,0,0,0": "node 900 is none",
+    "node,ux,uy,uz\n1.5,0,0,0": "node 1.5 is none",
+    "x,y,z,ux,uy,uz\n60,40,40,0,0,0": "is --unit right",
+    "x,y,z,ux,uy,uz\n,0,0,0,0,0": "place x,y,z is not finite",
+    "node,ux,uy,uz\n1,,,": "no displacement is measured",
+    "node,ux,uy,uz\n1,inf,0,0": "row 1 is infinite",
+    "node,ux,uy,uz,sd\n1,0,0,0,0": "sd must be positive",
+    "node,ux,uy,uz,time\n1,0,0,0,1": "has no dt",
+    "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
+    "": "cannot be read",
+}
+
+
+@pytest.mark.parametrize("content", _BAD)
+def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
+    _scene(tmp_path)
+    (tmp_path / "u.csv").write_text(content)
+    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "1e-4"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert _BAD[content] in error and "\n" not in error, error
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--noise", "0"], "--noise 0 must be above 0"),
+        ([], "no column sd"),
+        (["--noise", "1e-4", "--name", "law.nu"], "no number of the scene"),
+        (["--noise", "1e-4", "--parameters", "law.mu,law.x"], "no number of the scene"),
+        (["--noise", "1e-4", "--name", "body.gravity"], "needs one number"),
+        (["--noise", "1e-4", "--unit", "mile"], "--unit 'mile' is not known"),
+        (["--noise", "1e-4", "--length", "-1"], "--length -1 must be above 0"),
+    ],
+)
+def test_bad_options_are_one_sentence(tmp_path, more, words, capsys):
+    scene = _scene(tmp_path)
+    file = tmp_path / "u.csv"
+    np.savetxt(file, [[1, 0, 0, 0]], delimiter=",", header="node,ux,uy,uz", comments="")
+    assert scene.mesh.number_of_nodes == len(SURFACE)
+    assert main(["field", str(tmp_path / "scene.toml"), str(file), *more, "--out", str(tmp_path / "o")]) == 2
+    assert words in capsys.readouterr().err
+    assert main(["field", str(tmp_path / "scene.toml"), "--noise", "1"]) == 2
+
+
+def test_the_prior_has_the_covariance_it_states():
+    """sd^2 exp(-r / length) in the middle of a body that is large beside the length, and a true transpose."""
+    mesh = lj.shapes.box((0.2, 0.2, 0.2), (10, 10, 10))
+    p = prior.prior(mesh, 0.04)
+    n, rng = mesh.number_of_nodes, np.random.default_rng(0)
+    X = np.asarray(mesh.points)
+    z, g = rng.normal(size=n), rng.normal(size=n)
+    assert np.isclose(prior.to_nodes(p, z) @ g, z @ prior.to_whitened(p, g), rtol=1e-12)
+    unit = np.zeros(n)
+    centre = np.argmin(np.linalg.norm(X - 0.1, axis=1))
+    unit[centre] = 1
+    covariance = prior.to_nodes(p, prior.to_whitened(p, unit))
+    near = np.flatnonzero(np.linalg.norm(X - 0.1, axis=1) < 0.05)
+    distance = np.linalg.norm(X[near] - X[centre], axis=1)
+    # Cells of half a length: the kink at distance 0 is cut off by the mesh.
+    np.testing.assert_allclose(covariance[near], np.exp(-distance / 0.04), atol=0.2)
+    V = np.linalg.qr(rng.normal(size=(n, 3)))[0]
+    before, after = prior.variances(p, V, np.array([0.1, 0.5, 0.9]))
+    T = prior.to_nodes(p, np.eye(n))
+    np.testing.assert_allclose(before, np.sum(T**2, axis=1), rtol=1e-9)
+    kept = np.eye(n) - V @ np.diag([0.9, 0.5, 0.1]) @ V.T
+    np.testing.assert_allclose(after, np.diag(T @ kept @ T.T), rtol=1e-8)
+
+
+def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
+    """The map explains the data to their noise and is nearer the truth than any uniform body; its standard deviation
+    is that of the dense Hessian; a fit that was killed goes on where it was."""
+    rows = []
+    file = tmp_path / "progress.h5"
+    found = field.estimate(
+        problem, length=0.02, max_iterations=40, modes=70, file=file, progress=lambda k, c: rows.append((k, c))
+    )
+    mesh = problem.scenes[0].mesh
+    assert found.reached and rows and found.chi2 <= problem.count
+    off, volumes = np.log(found.modulus / _truth(mesh)), np.asarray(mesh.volumes)
+    best = np.log(_truth(mesh)) - np.average(np.log(_truth(mesh)), weights=volumes)
+    assert np.sqrt(np.average(off**2, weights=volumes)) < 0.5 * np.sqrt(np.average(best**2, weights=volumes))
+
+    # Standard deviations against the dense Hessian of all directions.
+    p, base = prior.prior(mesh, 0.02), field.start_of(problem, "law.mu")
+    T = found.deviation * prior.to_nodes(p, np.eye(mesh.number_of_nodes))
+    J = np.asarray(
+        jax.jit(jax.jacfwd(lambda m: scenes.misfit(problem, field.values_at(problem, "law.mu", base, m))[0]))(
+            jnp.asarray(found.log_factor)
+        )
+    )
+    covariance = T @ np.linalg.inv(np.eye(len(T)) + (J @ T).T @ (J @ T)) @ T.T
+    # Lanczos leaves out directions of which the data tell least; with 70 of 80 that is nearly nothing.
+    np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance)), rtol=0.02)
+    assert np.all(found.sd < found.prior_sd)
+
+    # What was written is the point reached: going on from it takes no iteration to speak of.
+    with h5py.File(file) as f:
+        np.testing.assert_allclose(found.deviation * prior.to_nodes(p, f["z"][:]), found.log_factor, rtol=1e-12)
+    again = field.estimate(problem, length=0.02, max_iterations=40, modes=5, file=file, resume=True)
+    assert again.chi2 <= found.chi2 * 1.001 and again.deviation == found.deviation
+    with pytest.raises(lj.InputError, match="of another fit"):
+        field.estimate(problem, name="law.bulk", length=0.02, file=file, resume=True)
+
+
+def test_the_gradient_of_the_map(problem):
+    """By the whitened field, against central differences."""
+    base = field.start_of(problem, "law.mu")
+    p = prior.prior(problem.scenes[0].mesh, 0.02)
+    sharp = problem._replace(scenes=tuple(replace(s, solve=replace(s.solve, tolerance=1e-12)) for s in problem.scenes))
+    search = field._Search(sharp, "law.mu", base, p, None, lambda *_: None)
+    rng = np.random.default_rng(3)
+    z, d = 0.3 * rng.normal(size=80), rng.normal(size=80)
+    slope = search.cost(z)[1] @ d
+    errors = [abs((search.cost(z + h * d)[0] - search.cost(z - h * d)[0]) / (2 * h) / slope - 1) for h in (1e-3, 1e-4)]
+    assert min(errors) < 1e-7
+
+
+def test_few_numbers_of_several_scenes(problem):
+    """Shear and bulk modulus of a uniform block: within four standard errors, which shrink with the noise."""
+    scene = problem.scenes[0]
+    X = np.asarray(scene.mesh.points)
+    data = []
+    for k, s in enumerate(problem.scenes):
+        u = np.asarray(lj.simulate(s).check().positions[-1]) - X
+        noise = 5e-5 * np.random.default_rng(k).normal(size=u.shape)
+        d = problem.data[k]
+        placed = np.einsum("nk,nkc->nc", d.weights, (u + noise)[d.nodes])
+        data.append(d._replace(measured=placed))
+    wrong = [lj.with_parameters(s, {"law.mu": 500.0, "law.bulk": 5000.0}) for s in problem.scenes]
+    found = scenes.fit_numbers(scenes.Problem(tuple(wrong), tuple(data)), ["law.mu", "law.bulk"])
+    assert found.converged and found.names == ("law.mu", "law.bulk")
+    assert np.all(np.abs(found.values - [800.0, 3000.0]) < 4 * found.standard_errors)
+    assert 0.5 < found.chi2 / found.count < 1.5
+    assert found.standard_errors[0] < 20
+
+
+def test_viscosity_from_a_time_series(tmp_path):
+    """A block that creeps under its weight: ratio and relaxation time from a few nodes over time."""
+    text = _SCENE.format(mu=800.0, gravity="4, 0, -3")
+    text += "[viscosity]\nratios = [0.4]\nrelaxation_times = [0.3]\n[solve]\ndt = 0.1\nsteps = 10\n"
+    (tmp_path / "creep.toml").write_text(text)
+    scene = lj.load_scene(tmp_path / "creep.toml")
+    run = lj.simulate(scene).check()
+    X = np.asarray(scene.mesh.points)
+    top = np.flatnonzero(X[:, 2] > 0.039)
+    rng, rows = np.random.default_rng(0), []
+    for k in range(10):
+        u = np.asarray(run.positions[k])[top] - X[top]
+        rows.append(np.c_[np.full(len(top), float(run.times[k])), top, u + 2e-5 * rng.normal(size=u.shape)])
+    np.savetxt(tmp_path / "u.csv", np.vstack(rows), delimiter=",", header="time,node,ux,uy,uz", comments="")
+    (tmp_path / "start.toml").write_text(text.replace("[0.4]", "[0.2]").replace("[0.3]", "[0.6]"))
+    names = "law.mu,viscosity.ratios,viscosity.relaxation_times"
+    command = ["field", str(tmp_path / "start.toml"), str(tmp_path / "u.csv"), "--parameters", names]
+    assert main([*command, "--noise", "2e-5", "--out", str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "field.json").read_text())
+    for name, true in (("law.mu", 800.0), ("viscosity.ratios.0", 0.4), ("viscosity.relaxation_times.0", 0.3)):
+        assert abs(found["values"][name] - true) < 4 * found["standard_errors"][name], found
+        assert found["standard_errors"][name] < 0.1 * true
+
+
+def test_the_command_maps_and_goes_on(tmp_path, capsys):
+    """Map and sphere from files; everything written; --resume."""
+    scene = _scene(tmp_path, mu=1000.0)
+    _write(tmp_path / "u.csv", scene, 5e-5)
+    out = tmp_path / "out"
+    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "5e-5", "--out", str(out)]
+    assert main([*command, "--length", "0.02", "--iterations", "15"]) in (0, 1)
+    said = capsys.readouterr()
+    assert "gradients keep and work with" in said.err and "prior sd" in said.out
+    found = json.loads((out / "field.json").read_text())
+    assert found["map"]["smallest"] < found["map"]["largest"]
+    for name in ("field.vtu", "field.h5", "field.png", "progress.h5"):
+        assert (out / name).stat().st_size > 0
+    assert main([*command, "--length", "0.02", "--iterations", "5", "--resume"]) in (0, 1)
+
+
+def test_a_sphere_is_found_where_it_is():
+    """Same mesh for data and fit: the estimator itself, from a start that is off."""
+    mesh = lj.shapes.box((0.06, 0.06, 0.05), (6, 6, 5))
+    below = mesh.node_sets["z_min"]
+
+    def scene(gravity, mu):
+        return lj.Scene(
+            mesh=mesh,
+            law=lj.laws.NeoHookean(mu=mu, bulk=jnp.asarray(3000.0)),
+            body=lj.Body(density=1000.0, gravity=jnp.array(gravity)),
+            fixed=(lj.Fixed(nodes=below),),
+        )
+
+    width = inclusion._EDGE * float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
+    centre = jnp.array([0.035, 0.03, 0.03])
+    mu = 800.0 * jnp.exp(np.log(3.0) * inclusion.factor(mesh, centre, 0.016, width))
+    loads = ([5.0, 0.0, 0.0], [0.0, 5.0, -3.0])
+    X = np.asarray(mesh.points)
+    seen = np.flatnonzero(X[:, 2] > 0.04)
+    rng, data = np.random.default_rng(0), []
+    for gravity in loads:
+        u = np.asarray(lj.simulate(scene(gravity, mu)).check().positions[-1] - mesh.points)[seen]
+        weights = np.tile([1.0, 0, 0, 0], (len(seen), 1))
+        nodes = np.repeat(seen[:, None], 4, axis=1)
+        noise, sd = 2e-6 * rng.normal(size=u.shape), np.full(u.shape, 2e-6)
+        data.append(displacements.Displacements(np.zeros(len(seen), np.int32), nodes, weights, u + noise, sd))
+    made = tuple(scene(g, jnp.asarray(900.0)) for g in loads)
+    start = np.array([0.030, 0.033, 0.027, np.log(0.013), 0.0, 0.7])
+    found = inclusion.estimate(scenes.Problem(made, tuple(data)), "law.mu", start, max_iterations=30)
+    values = dict(zip(found.names, found.values, strict=True))
+    true = [*np.asarray(centre), 0.016, 800.0, 2400.0]
+    assert np.all(np.abs(found.values - true) < 5 * found.standard_errors), (values, found.standard_errors)
+    assert 0.5 < found.chi2 / found.count < 1.5
