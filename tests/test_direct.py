@@ -104,7 +104,7 @@ def test_a_tangent_goes_from_step_to_step():
     scene = replace(POROUS, porosity=None, solve=replace(POROUS.solve, dt=0.002, steps=10, tolerance=1e-8))
     tangent.stiffness = counted
     try:
-        result = simulation._run.__wrapped__(scene, None, None)
+        result = simulation._run.__wrapped__(scene, None, None, "all")
     finally:
         tangent.stiffness = original
     result.check()
