@@ -4,6 +4,7 @@ import json
 import os
 import platform
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,9 @@ import matplotlib.pyplot as plt
 
 from liverjax.versions import versions
 
-RESULTS = Path(__file__).parent / "results"
+#: Fewer cases and smaller ones, for a look at whether everything runs; published results stay as they are.
+QUICK = "--quick" in sys.argv[1:]
+RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
 plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.grid": True, "grid.alpha": 0.3, "savefig.dpi": 150})
 
 
@@ -43,6 +46,11 @@ def timed(function: Callable, *arguments: Any, rounds: int = 5) -> tuple[Any, Ti
     return result, Timing(compiling, statistics.median(seconds))
 
 
+def either(full: Any, quick: Any) -> Any:
+    """The second with --quick on the command line."""
+    return quick if QUICK else full
+
+
 def environment() -> dict[str, Any]:
     """Where the numbers come from, without naming a machine."""
     return versions() | {"cores": os.cpu_count(), "architecture": platform.machine(), "backend": jax.default_backend()}
@@ -58,7 +66,7 @@ def plain_ticks(*axes: Any) -> None:
 
 def save(name: str, content: dict[str, Any], figure: Any = None) -> None:
     """Write results/NAME.json and, with a figure, results/NAME.png."""
-    RESULTS.mkdir(exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     text = json.dumps(content | {"environment": environment()}, indent=1, allow_nan=False)
     (RESULTS / f"{name}.json").write_text(text + "\n")
     if figure is not None:

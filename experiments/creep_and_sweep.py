@@ -68,16 +68,15 @@ def main(quick: bool) -> None:
                 "parameters": dict(zip(found.names, found.values.tolist(), strict=True)),
                 "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
                 "off_in_standard_errors": ((found.values - true) / found.standard_errors).tolist(),
-                "chi2_per_reading": found.chi2 / found.count,
-                "readings": found.count,
+                "chi2_per_reading": found.chi2 / found.components,
+                "readings": found.components,
                 "iterations": found.iterations,
                 "converged": found.converged,
                 "seconds": found.seconds,
             }
         )
         print(rows[-1], flush=True)
-    if not quick:
-        save("creep_and_sweep", {"noise": NOISE, "true": true.tolist(), "rows": rows}, figure(rows, true))
+    save("creep_and_sweep", {"noise": NOISE, "true": true.tolist(), "rows": rows}, figure(rows, true))
 
 
 def figure(rows: list[dict], true: np.ndarray) -> plt.Figure:
@@ -90,7 +89,7 @@ def figure(rows: list[dict], true: np.ndarray) -> plt.Figure:
         axis.bar(np.arange(len(true)) + 0.2 * (k - 1.5), height, 0.2, color=colour, label=label)
     names = ["G0", "g (30 s)", "g (1 s)", "g (0.05 s)", "30 s", "1 s", "0.05 s"]
     axis.set_xticks(np.arange(len(true)), names)
-    axis.set(ylabel="standard error / true value [1]", yscale="log")
+    axis.set(ylabel="standard error / true value [1] (1: not determined)", yscale="log")
     axis.legend(fontsize=8)
     return fig
 

@@ -13,7 +13,7 @@ import assembly_rivals
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import plain_ticks, plt, save
+from common import either, plain_ticks, plt, save
 
 import liverjax as lj
 from liverjax import laws, mjed, tangent
@@ -86,8 +86,9 @@ def errors(made: dict) -> dict[str, float | None]:
 def main() -> None:
     """All laws, the table and the figure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--laws", nargs="*", default=list(laws.LAWS))
+    parser.add_argument("--rounds", type=int, default=either(15, 3))
+    parser.add_argument("--laws", nargs="*", default=either(list(laws.LAWS), ["neo_hookean", "ogden", "costa"]))
+    parser.add_argument("--quick", action="store_true", help="three laws, three rounds")
     options = parser.parse_args()
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (15, 15, 15))
     x = mesh.points + 0.01 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))

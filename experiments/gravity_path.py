@@ -8,7 +8,7 @@ body the organ is held all around; here it hangs by two patches.
 
 import jax.numpy as jnp
 import numpy as np
-from common import plt, save
+from common import either, plt, save
 from liver import models, timed_run
 
 import liverjax as lj
@@ -17,7 +17,7 @@ from liverjax.colours import COLOURS
 from liverjax.kinematics import deformation_gradient, determinant
 from liverjax.struct import replace
 
-STEPS = 20
+STEPS = either(20, 10)
 RELAXED = 1 - 0.235 - 0.333
 
 

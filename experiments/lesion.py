@@ -23,6 +23,7 @@ from fitting import field, inclusion, scenes
 from fitting.displacements import read_displacements
 from fitting.field_report import section
 from liverjax.boundary import boundary_triangles
+from liverjax.colours import ORANGE
 
 MESH = Path(__file__).parent.parent / "data" / "liver_phantom.vtu"
 CENTRE, RADIUS, MU, STIFFER = np.array([0.06, 0.005, 0.008]), 0.025, 770.0, 3.0
@@ -111,7 +112,7 @@ def mapped(problem: scenes.Problem, noise: float, length: float, iterations: int
         "noise_of_largest": noise,
         "length_m": length,
         "prior_deviation": found.deviation,
-        "chi2_per_component": found.chi2 / found.count,
+        "chi2_per_component": found.chi2 / found.components,
         "history": found.history,
         "seconds": found.seconds,
         "rms_error_of_log_modulus": off(found.modulus),
@@ -133,7 +134,7 @@ def sphere_in(problem: scenes.Problem, start: np.ndarray) -> dict:
         "radius_off": values["radius"] / RADIUS - 1,
         "modulus_off": values["inclusion"] / (STIFFER * MU) - 1,
         "background_off": values["background"] / MU - 1,
-        "chi2_per_component": found.chi2 / found.count,
+        "chi2_per_component": found.chi2 / found.components,
         "iterations": found.iterations,
         "converged": found.converged,
         "seconds": found.seconds,
@@ -166,39 +167,57 @@ def main(quick: bool) -> None:
             row["sphere"] = sphere_in(problem_of(fine, seen, u, off["fine"], noise, seed=k), start)
             print("   sphere", row["sphere"], flush=True)
         rows.append(row)
-        if not quick:
-            meshes = {"map": coarse, "sphere": fine, "truth": truest}
-            content = {
-                "missed_m": off,
-                "tetrahedra": {n: m.number_of_elements for n, m in meshes.items()},
-                "rows": rows,
-            }
-            save("lesion", content, figure(coarse, {n: f for (n, length), f in found.items() if length == 0.03}))
+        meshes = {"map": coarse, "sphere": fine, "truth": truest}
+        content = {
+            "missed_m": off,
+            "tetrahedra": {n: m.number_of_elements for n, m in meshes.items()},
+            "rows": rows,
+        }
+        maps = {n: f for (n, length), f in found.items() if length == 0.03}
+        spheres = {r["noise_of_largest"]: r["sphere"] for r in rows if "sphere" in r}
+        save("lesion", content, figure(coarse, maps, spheres))
 
 
-def figure(mesh: lj.TetMesh, found: dict) -> plt.Figure:
-    """Sections through the lesion's middle: truth, estimates and their uncertainty."""
-    fig, axes = plt.subplots(2, 4, figsize=(12, 4.6), layout="constrained")
-    inside = np.linalg.norm(np.asarray(mesh.points) - CENTRE, axis=1) < RADIUS
-    real, extent = section(mesh, np.where(inside, STIFFER * MU, MU), CENTRE, 2)
-    shown = dict(origin="lower", extent=extent, vmin=0.5, vmax=STIFFER * MU / 1e3, cmap="viridis")
-    picture = axes[0, 0].imshow(real / 1e3, **shown)
-    axes[0, 0].set(title="truth", ylabel="y [cm]")
+def circle(axis: plt.Axes, centre: np.ndarray, radius: float, style: str, colour: str) -> None:
+    """A sphere's outline on the section through the lesion's middle, if it meets that."""
+    squared = radius**2 - (centre[2] - CENTRE[2]) ** 2
+    turn = np.linspace(0, 2 * np.pi, 100)
+    outline = centre[:2, None] + np.sqrt(max(squared, 0.0)) * np.array([np.cos(turn), np.sin(turn)])
+    axis.plot(*(100 * outline), style, color=colour, lw=1)
+
+
+def figure(mesh: lj.TetMesh, found: dict[float, field.Field], spheres: dict[float, dict]) -> plt.Figure:
+    """Sections through the lesion's middle: truth, maps and their uncertainty, outlines of the spheres."""
+    fig, axes = plt.subplots(2, 4, figsize=(11, 3.8), layout="constrained", sharex=True, sharey=True)
+    body, extent = section(mesh, np.full(mesh.number_of_nodes, MU), CENTRE, 2)
+    x, y = np.meshgrid(*(np.linspace(extent[2 * k], extent[2 * k + 1], body.shape[1 - k]) / 100 for k in (0, 1)))
+    inside = np.hypot(x - CENTRE[0], y - CENTRE[1]) < RADIUS
+    shown = dict(origin="lower", extent=extent, vmin=0.4, vmax=STIFFER * MU / 1e3, cmap="viridis")
+    picture = axes[0, 0].imshow(np.where(inside, STIFFER, 1.0) * body / 1e3, **shown)
+    axes[0, 0].set(title="truth", ylabel="y [cm]", xlabel="x [cm]")
+    axes[0, 0].xaxis.set_tick_params(labelbottom=True)
     axes[1, 0].axis("off")
+    lines = [plt.Line2D([], [], color=c, ls=s) for c, s in (("grey", "--"), (ORANGE, "-"))]
+    axes[1, 0].legend(lines, ["true outline", "outline of the fitted sphere"], loc="center", frameon=False)
+    widest = max(float(f.sd.max()) for f in found.values())
     for k, (noise, f) in enumerate(found.items(), start=1):
         modulus, _ = section(mesh, 1.3 * MU * np.exp(f.log_factor), CENTRE, 2)
         axes[0, k].imshow(modulus / 1e3, **shown)
-        axes[0, k].set_title(f"map, noise {100 * noise:g} %")
+        axes[0, k].set_title(f"map, noise {100 * noise:g} %, {f.seconds:.0f} s")
         sd, _ = section(mesh, f.sd, CENTRE, 2)
-        spread = axes[1, k].imshow(sd, origin="lower", extent=extent, vmin=0, cmap="magma")
-        fig.colorbar(spread, ax=axes[1, k], label="sd of ln(modulus)", shrink=0.8)
+        spread = axes[1, k].imshow(sd, origin="lower", extent=extent, vmin=0, vmax=widest, cmap="magma")
         axes[1, k].set_xlabel("x [cm]")
         for axis in axes[:, k]:
-            turn = np.linspace(0, 2 * np.pi, 100)
-            axis.plot(
-                100 * (CENTRE[0] + RADIUS * np.cos(turn)), 100 * (CENTRE[1] + RADIUS * np.sin(turn)), "w--", lw=0.8
-            )
-    fig.colorbar(picture, ax=axes[0, :], label="shear modulus [kPa]", shrink=0.8)
+            circle(axis, CENTRE, RADIUS, "--", "white")
+        if noise in spheres:
+            v = spheres[noise]["values"]
+            at = np.array([v["centre.x"], v["centre.y"], v["centre.z"]])
+            circle(axes[0, k], at, v["radius"], "-", ORANGE)
+    for axis in axes.flat:
+        axis.grid(False)
+    axes[1, 1].set_ylabel("y [cm]")
+    fig.colorbar(picture, ax=axes[0, :], label="shear modulus [kPa]", pad=0.01)
+    fig.colorbar(spread, ax=axes[1, :], label="standard deviation\nof ln(modulus) [1]", pad=0.01)
     return fig
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
-from common import save
+from common import either, save
 from liver import models, with_solve
 from tqdm import tqdm
 
@@ -24,7 +24,7 @@ from fitting.rheometer import read_sweep
 from liverjax import status
 
 SWEEP = "data/porcine_liver_frequency_sweep.csv"
-NOISE, SEED, DRAWS, SOBOL, SECONDS, DT, LANES = 0.05, 3, 256, 64, 1.0, 0.05, 32
+NOISE, SEED, DRAWS, SOBOL, SECONDS, DT, LANES = 0.05, 3, either(256, 16), either(64, 4), 1.0, 0.05, either(32, 4)
 NAMES = ("G0", "g1", "g2", "tau1", "tau2")
 LABELS = {"G0": "$G_0$", "g1": "$g_1$", "g2": "$g_2$", "tau1": r"$\tau_1$", "tau2": r"$\tau_2$"}
 GROUND_STATE = 770.0 / 715.0  # shear modulus over mu of the scene's Arruda-Boyce law

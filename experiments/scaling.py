@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from assembly_rivals import contracted
-from common import plain_ticks, plt, save
+from common import either, plain_ticks, plt, save
 
 import liverjax as lj
 from liverjax import status
 from liverjax.colours import BLUE, GREEN, ORANGE
 
-CELLS = (6, 9, 15, 25, 44, 55)
+CELLS = either((6, 9, 15, 25, 44, 55), (6, 9))
 SIZE = 0.1
 
 
@@ -86,6 +86,7 @@ def main() -> None:
     """All sizes, the exponents, the figure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--cells", type=int, nargs="*", default=list(CELLS))
+    parser.add_argument("--quick", action="store_true", help="two small sizes")
     rows = []
     for cells in parser.parse_args().cells:
         rows.append(measure(cells))

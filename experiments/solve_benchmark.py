@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import plain_ticks, plt, save
+from common import either, plain_ticks, plt, save
 from liver import models, with_solve
 
 import liverjax as lj
@@ -21,7 +21,7 @@ from liverjax.colours import BLUE, GREY, ORANGE
 from liverjax.linear import conjugate_gradients
 from liverjax.struct import replace
 
-ROUNDS = 5
+ROUNDS = either(5, 1)
 SIZE = 0.1
 
 

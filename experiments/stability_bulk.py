@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from common import plain_ticks, save
+from common import either, plain_ticks, save
 
 import liverjax as lj
 from liverjax import boundary, shapes, status
@@ -19,8 +19,8 @@ from liverjax.colours import COLOURS
 from liverjax.kinematics import deformation_gradient, determinant
 
 MU = 770.0
-RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4, 1e5)
-COOK, FINEST, COLUMN, TURN = (4, 8, 16), 24, (2, 3), np.pi / 4
+RATIOS = either((1.0, 10.0, 100.0, 1e3, 1e4, 1e5), (1.0, 1e3))
+COOK, FINEST, COLUMN, TURN = either((4, 8, 16), (2, 4, 8)), either(24, 12), (2, 3), np.pi / 4
 
 
 def membrane(n: int, ratio: float, **solve) -> tuple[lj.Scene, np.ndarray]:

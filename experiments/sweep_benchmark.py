@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import jax
 import numpy as np
-from common import save
+from common import either, save
 
 import liverjax as lj
 from liverjax.__main__ import main as command
@@ -37,7 +37,7 @@ by = [0.01, 0.0, 0.02]
 [solve]
 steps = 2
 """
-FEW, MANY, MOST = 200, 2000, 10000
+FEW, MANY, MOST = either((200, 2000, 10000), (20, 100, 200))
 CHUNK = 50
 
 

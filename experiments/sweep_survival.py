@@ -16,10 +16,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from common import save
+from common import either, save
 from sweep_benchmark import SCENE
 
-ROWS, CHUNK, KILLS, SEED = 4096, 32, 20, 7
+ROWS, CHUNK, KILLS, SEED = either(4096, 512), 32, either(20, 2), 7
 
 
 class Case:

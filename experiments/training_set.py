@@ -16,7 +16,7 @@ import h5py
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
-from common import save
+from common import either, save
 from liver import SCENE
 
 import liverjax as lj
@@ -30,7 +30,7 @@ RANGES = {
     "body.gravity.1": (-2.0, 2.0),
     "body.gravity.2": (-2.0, 2.0),
 }
-ROWS, TRAINED, DEGREE, MODES = 1000, 800, 3, (1, 2, 5, 10, 20, 40)
+ROWS, TRAINED, DEGREE, MODES = either(1000, 80), either(800, 60), either(3, 2), either((1, 2, 5, 10, 20, 40), (1, 5))
 
 
 def scene_file(folder: Path) -> Path:

@@ -71,7 +71,8 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
     rows = -(-len(curves) // columns)
     size = (max(7.0, 3.4 * columns), 2.8 * rows + 0.26 * len(ordered) + 1.3)
     fig = plt.figure(figsize=size, layout="constrained")
-    top, bottom = fig.subfigures(2, 1, height_ratios=(2.8 * rows, 0.26 * len(ordered) + 1.3))
+    halves: Any = fig.subfigures(2, 1, height_ratios=(2.8 * rows, 0.26 * len(ordered) + 1.3))
+    top, bottom = halves
     axes = np.atleast_1d(top.subplots(rows, columns)).ravel()
     for axis, curve in zip(axes, curves, strict=False):
         _curve(axis, curve, shown)

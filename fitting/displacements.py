@@ -28,7 +28,7 @@ class Displacements(NamedTuple):
     sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
 
     @property
-    def count(self) -> int:
+    def components(self) -> int:
         """Number of measured components."""
         return int(np.isfinite(self.sd).sum())
 

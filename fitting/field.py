@@ -45,7 +45,7 @@ class Field(NamedTuple):
     deviation: float  # the prior's, chosen
     length: float  # [m] of correlation
     chi2: float
-    count: int
+    components: int
     reached: bool  # whether chi^2 came down to the number of components
     history: list[dict]  # one row a deviation: chi2, iterations, evaluations, seconds
     eigenvalues: np.ndarray  # of J^T J in whitened z: directions above 1 are known from the data
@@ -98,20 +98,22 @@ class _Search:
         self.best, self.evaluations, self.codes = np.inf, 0, ()
 
     def cost(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """(chi^2 + |z|^2)/2 and its gradient."""
         deviation = DEVIATIONS[self.k]
         m = deviation * smooth.to_nodes(self.p, z)
         (half, codes), g = _cost(self.problem, self.base, jnp.asarray(m), self.name)
         half, g = float(half), np.asarray(g)
         self.evaluations += 1
         if not (np.isfinite(half) and np.all(np.isfinite(g)) and not np.any(np.asarray(codes) == status.NOT_FINITE)):
-            return 1e3 * (1 + z @ z + self.problem.count), z.copy()  # a wall: the line search turns back
+            return 1e3 * (1 + z @ z + self.problem.components), z.copy()  # a wall: the line search turns back
         self.chi2, self.codes = 2 * half, tuple(int(c) for c in codes)
         return half + 0.5 * float(z @ z), deviation * smooth.to_whitened(self.p, g) + z
 
     def iterated(self, z: np.ndarray) -> None:
+        """Told of by L-BFGS after every iteration."""
         self.z = z.copy()
         self.write()
-        self.progress(self.k, self.chi2 / self.problem.count)
+        self.progress(self.k, self.chi2 / self.problem.components)
 
     def write(self) -> None:
         """The point reached, whole or not at all."""
@@ -122,7 +124,7 @@ class _Search:
             f["z"], f["k"] = self.z, self.k
             f["history"] = np.array([[row[c] for c in _HISTORY] for row in self.history]).reshape(-1, len(_HISTORY))
             f.attrs["name"], f.attrs["base"] = self.name, float(jnp.sum(self.base))
-            f.attrs["count"] = self.problem.count
+            f.attrs["count"] = self.problem.components
         part.replace(self.file)
 
     def read(self) -> None:
@@ -134,7 +136,7 @@ class _Search:
         if not self.file.is_file():
             return
         with h5py.File(self.file) as f:
-            same = f.attrs["name"] == self.name and f.attrs["count"] == self.problem.count
+            same = f.attrs["name"] == self.name and f.attrs["count"] == self.problem.components
             if not (same and len(f["z"]) == len(self.z) and np.isclose(f.attrs["base"], float(jnp.sum(self.base)))):
                 raise InputError(f"{self.file} is of another fit: leave out --resume or name another --out")
             self.z, self.k = f["z"][:], int(f["k"][()])
@@ -190,8 +192,8 @@ def estimate(
         deviation=deviation,
         length=length,
         chi2=search.chi2,
-        count=problem.count,
-        reached=search.chi2 <= problem.count,
+        components=problem.components,
+        reached=search.chi2 <= problem.components,
         history=search.history,
         eigenvalues=values,
         codes=search.codes,
@@ -212,14 +214,14 @@ def _weights(search: _Search, max_iterations: int) -> None:
         search.cost(found.x)
         row = (
             DEVIATIONS[search.k],
-            search.chi2 / search.problem.count,
+            search.chi2 / search.problem.components,
             found.nit,
             search.evaluations - before,
             time.perf_counter() - begin,
         )
         search.history.append(dict(zip(_HISTORY, map(float, row), strict=True)))
         search.write()
-        enough = search.chi2 <= search.problem.count
+        enough = search.chi2 <= search.problem.components
         last = [h["chi2_per_component"] for h in search.history[-2:]]
         idle = len(last) == 2 and last[1] > (1 - _WORTH) * last[0]
         if enough or idle or search.k + 1 == len(DEVIATIONS):

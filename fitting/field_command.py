@@ -110,8 +110,8 @@ def _map(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callabl
     content = _files(options) | {"map": field_report.of_field(found)}
     if not found.reached:
         print(
-            f"warning: chi2 stays at {found.chi2 / found.count:.3g} a component: the noise is larger than said, or the "
-            "scene misses something (mesh, supports, loads)",
+            f"warning: chi2 stays at {found.chi2 / found.components:.3g} a component: the noise is larger than said, "
+            "or the scene misses something (mesh, supports, loads)",
             file=sys.stderr,
         )
     if options.sphere:

@@ -26,9 +26,9 @@ def of_numbers(found: Estimate) -> dict[str, Any]:
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
         "correlation": found.correlation.tolist(),
-        "chi2_per_component": found.chi2 / found.count,
+        "chi2_per_component": found.chi2 / found.components,
         "noise_factor": found.noise,
-        "components": found.count,
+        "components": found.components,
         "iterations": found.iterations,
         "converged": found.converged,
         "status": [NAMES[c] for c in found.codes],
@@ -44,9 +44,9 @@ def of_field(found: Field) -> dict[str, Any]:
         "largest": float(found.modulus.max()),
         "prior_deviation": found.deviation,
         "correlation_length_m": found.length,
-        "chi2_per_component": found.chi2 / found.count,
+        "chi2_per_component": found.chi2 / found.components,
         "discrepancy_reached": found.reached,
-        "components": found.count,
+        "components": found.components,
         "directions_known": int(np.sum(found.eigenvalues > 1)),
         "history": found.history,
         "status": [NAMES[c] for c in found.codes],
@@ -111,7 +111,7 @@ def table_of_numbers(found: Estimate) -> str:
     rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}"]
     for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
         rows.append(f"{name:{width}}  {value:11.5g}  {error:14.3g}")
-    rows.append(f"chi2 per component {found.chi2 / found.count:.3f} of {found.count}, {found.seconds:.1f} s")
+    rows.append(f"chi2 per component {found.chi2 / found.components:.3f} of {found.components}, {found.seconds:.1f} s")
     return "\n".join(rows)
 
 

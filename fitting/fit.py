@@ -103,7 +103,8 @@ def _fit(method, sweep, found, storage, loss, extra, running, compiling, details
     if not converged:
         reason = f"the fit did not converge in {int(found.iterations)} iterations; its best point is given"
         sentences = (f"{reason}: {extra[0]}", *sentences)
-    model = Maxwell(*(np.asarray(v) for v in prony.natural(found.u)))
+    G0, ratios, times = (np.asarray(v) for v in prony.natural(found.u))
+    model: Any = Maxwell(G0, ratios, times)  # type: ignore[arg-type]  # arrays of the host
     details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
     return Fit(method, model, found, spread, converged, storage, loss, sentences, running, compiling, details)
 
@@ -148,12 +149,12 @@ def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) 
     decades = np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
     cap = min(max(MAX_MODES, int(decades) + 2), prony.largest_number_of_modes(sweep))
     tried: list[Fit] = []
-    chosen, failures = None, 0
+    chosen, failures = closed_form(sweep, 1, dense, optimizer), 0
     for modes in range(1, cap + 1):
-        fit = closed_form(sweep, modes, dense, optimizer)
+        fit = chosen if modes == 1 else closed_form(sweep, modes, dense, optimizer)
         tried.append(fit)
-        falls = chosen is None or information_criterion(fit) < information_criterion(chosen)
-        if chosen is None or (identifiable(fit) and falls):
+        falls = information_criterion(fit) < information_criterion(chosen)
+        if modes == 1 or (identifiable(fit) and falls):
             chosen, failures = fit, 0
         else:
             failures += 1
@@ -200,7 +201,9 @@ class Simulation(NamedTuple):
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
 
 
-def simulated_moduli(u, rig, law, omega, torque, drive, scheme, part):
+def simulated_moduli(
+    u: jax.Array, rig: torsion.Rig, law: laws.Law, omega: Any, torque: Any, drive: torsion.Drive, scheme: str, part: str
+) -> torsion.Moduli:
     """`torsion.moduli` of unconstrained Maxwell parameters u, the law scaled to their G0."""
     model = prony.natural(u)
     scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
@@ -270,7 +273,7 @@ def through_torsion(
         )
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.max(m.statistics.status))
-    found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
+    found = found._replace(converged=jnp.asarray(bool(found.converged) and worst == status.CONVERGED))
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)

@@ -90,7 +90,8 @@ def fit(
         part: of the stress that relaxes, as of `Prony`.
         max_iterations, progress: as of `levenberg_marquardt_host`.
     """
-    begin, worst = time.perf_counter(), []
+    begin = time.perf_counter()
+    worst: list[int] = []
 
     @jax.jit
     def with_jacobian(u):
@@ -125,7 +126,7 @@ def fit(
         standard_errors=errors,
         correlation=half @ half.T / np.maximum(np.outer(errors, errors), 1e-300),
         chi2=float(r @ r),
-        count=len(r),
+        components=len(r),
         noise=noise,
         iterations=int(found.iterations),
         converged=bool(found.converged) and all(c == status.CONVERGED for c in worst),

@@ -170,4 +170,4 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     s = accept(begin(found.x, r.shape[0]), r, J)
     _, _, left = _steps(J, r, s.damping)
     near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the latter: exact to any data's digits
-    return solution(s._replace(iterations=found.nit, converged=s.converged | near))
+    return solution(s._replace(iterations=jnp.asarray(found.nit), converged=s.converged | near))

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from fitting.fit import Fit
@@ -104,7 +105,7 @@ def _figure(path: Path, sweep: Sweep, fits: list[Fit]) -> None:
     grid = fig.add_gridspec(3, 2, width_ratios=(3, 2), height_ratios=(3, 1, 0.001))
     top, rest = fig.add_subplot(grid[0, 0]), fig.add_subplot(grid[1:, 0])
     fine = np.geomspace(f[0], f[-1], 200)
-    lines = [np.asarray(v) for v in moduli(closed.model, 2 * np.pi * fine)]
+    lines = [np.asarray(v) for v in moduli(closed.model, jnp.asarray(2 * np.pi * fine))]
     rows = (
         ("G'", "storage", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o"),
         ("G''", "loss", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s"),

@@ -9,7 +9,7 @@ import csv
 import os
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class Sweep(NamedTuple):
 
 
 class _Column(NamedTuple):
-    index: int
+    place: int
     name: str
     quantity: str  # frequency, storage, loss, storage_sd, loss_sd
     unit: str | None
@@ -154,7 +154,7 @@ def _header(cells: list[str]) -> list[_Column]:
     """Columns by quantity; the first of known unit comes first, rad/s before Hz, others after it (to compare)."""
     found = [(k, cell, _quantity(cell)) for k, cell in enumerate(cells)]
     columns = [_Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
-    columns.sort(key=lambda c: (not _known_unit(c.quantity.removesuffix("_sd"), c.unit), not _is_angular(c), c.index))
+    columns.sort(key=lambda c: (not _known_unit(c.quantity.removesuffix("_sd"), c.unit), not _is_angular(c), c.place))
     return columns
 
 
@@ -219,10 +219,10 @@ def _with_unit_row(columns: list[_Column], lines: list[str], k: int, delimiter: 
     """Instruments put units in a line of their own, within the next two."""
     for ahead in range(k, min(k + 2, len(lines))):
         cells = _split(lines[ahead], delimiter)
-        units = {c.index: cells[c.index].strip('"[]() ') for c in columns if c.index < len(cells)}
-        moduli = [units.get(c.index) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss")]
+        units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
+        moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss")]
         if any(moduli):
-            return [c._replace(unit=units.get(c.index) or c.unit) for c in columns], ahead + 1
+            return [c._replace(unit=units.get(c.place) or c.unit) for c in columns], ahead + 1
         if any(re.match(r"[-+]?\d", cell) for cell in cells):
             break
     return columns, k
@@ -250,15 +250,15 @@ def _rows(path, columns, lines, k, delimiter, width):
                 break  # the next table of an instrument's export
             continue
         cells = _split(line, delimiter)
-        values = [_number(cells[c.index], delimiter) if c.index < len(cells) else None for c in columns]
-        here = [cells[c.index] for c in columns if c in needed and c.index < len(cells)]
+        values = [_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
+        here = [cells[c.place] for c in columns if c in needed and c.place < len(cells)]
         blank = not any(re.match(r"[-+]?\.?\d|nan|inf", cell.lower()) for cell in here)
         if blank and (not rows or line.startswith("[") or delimiter == "\t"):
             break  # a title taken for a header, or the end of this table
         k += 1
         for column, value in zip(columns, values, strict=True):
             if value is None:
-                shown = repr(cells[column.index]) if column.index < len(cells) else "missing"
+                shown = repr(cells[column.place]) if column.place < len(cells) else "missing"
                 raise InputError(
                     f"{path}: line {k}: {column.name} = {shown} is not a number; correct or remove the line"
                 )
@@ -326,5 +326,7 @@ def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
         notes.append(f"{repeated} frequencies are repeated; each line counts as a measurement of its own")
-    get = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
+    get: dict[str, Any] = {
+        q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")
+    }
     return Sweep(omega[order], **get, source=path, notes=tuple(notes))

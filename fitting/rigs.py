@@ -26,7 +26,7 @@ class Rig:
 
     scene: lj.Scene = param("1", "with a law that `read` replaces")
     nodes: Any = param("1", "node numbers (n,) that are read")
-    reading: str = static("force", "force [N] on the nodes, or their mean displacement [m]")
+    reading: str = static(default="force", about="force [N] on the nodes, or their mean displacement [m]")
 
 
 def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]:

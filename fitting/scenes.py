@@ -24,9 +24,9 @@ class Problem(NamedTuple):
     data: tuple[Displacements, ...]
 
     @property
-    def count(self) -> int:
+    def components(self) -> int:
         """Number of measured components."""
-        return sum(d.count for d in self.data)
+        return sum(d.components for d in self.data)
 
 
 class Estimate(NamedTuple):
@@ -37,7 +37,7 @@ class Estimate(NamedTuple):
     standard_errors: np.ndarray
     correlation: np.ndarray
     chi2: float  # sum of squared residuals over the noise
-    count: int  # measured components
+    components: int  # measured components
     noise: float  # factor on the errors: 1, or what the misfit asks for
     iterations: int
     converged: bool
@@ -89,10 +89,10 @@ def fit(
         return r, J
 
     found = levenberg_marquardt_host(evaluate, jnp.asarray(start, float), max_iterations, progress)
-    codes = tuple(int(c) for c in np.asarray(with_jacobian(problem, found.u)[2]))
+    ended = tuple(int(c) for c in np.asarray(with_jacobian(problem, found.u)[2]))
     r = np.asarray(found.residuals)
     # Components that were not measured have residual 0 and count for nothing.
-    noise = max(1.0, float(np.sqrt(r @ r / max(1, problem.count - len(names)))))
+    noise = max(1.0, float(np.sqrt(r @ r / max(1, problem.components - len(names)))))
     half, _ = spread(np.asarray(found.jacobian), noise, np.asarray(jax.jacfwd(natural_of)(found.u)))
     errors = np.linalg.norm(half, axis=1)
     estimate = Estimate(
@@ -101,11 +101,11 @@ def fit(
         standard_errors=errors,
         correlation=half @ half.T / np.maximum(np.outer(errors, errors), 1e-300),
         chi2=float(r @ r),
-        count=problem.count,
+        components=problem.components,
         noise=noise,
         iterations=int(found.iterations),
-        converged=bool(found.converged) and all(c == status.CONVERGED for c in codes),
-        codes=codes,
+        converged=bool(found.converged) and all(c == status.CONVERGED for c in ended),
+        codes=ended,
         seconds=time.perf_counter() - begin,
     )
     return estimate, found

@@ -37,7 +37,7 @@ class Rig:
     density: Any = param("kg/m^3", "None: no inertia, and no velocity is carried", default=None)
     bottom: int = static(about="number of nodes on the gripped plate")
     top: int = static(about="number of nodes on the turning plate")
-    free_height: bool = static(False, "the top plate may also move along the axis under no axial force")
+    free_height: bool = static(default=False, about="the top plate may also move along the axis under no axial force")
 
 
 class Drive(NamedTuple):

@@ -111,7 +111,7 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Uncertainty, p
 
         return jax.vmap(one)(values)
 
-    intervals = {}
+    intervals: dict[str, list] = {}
     for j, name in enumerate(uncertainty.names):
         center, error = uncertainty.values[j], uncertainty.standard_errors[j]
         if not np.isfinite(error) or error == 0:

@@ -26,7 +26,7 @@ def list_laws() -> None:
     print(f"every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
     print("every law of I1, I2 and J: continued_below = 0.1, finite energy below that J (default off)")
     for name, cls in laws.LAWS.items():
-        print(f"{name}\n    {cls.__doc__.splitlines()[0]}")
+        print(f"{name}\n    {(cls.__doc__ or name).splitlines()[0]}")
         for field in laws.parameters(cls):
             m = field.metadata
             optional = ", optional" if field.default is None else ""
@@ -65,7 +65,7 @@ def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
     labels = [_label(name) for name in names]
     named = {n if labels.count(k) > 1 else k: check.load(n) for k, n in zip(labels, names, strict=True)}
     file = _target(out, "laws.png")
-    figures.curves(named, file, tuple(stretches))
+    figures.curves(named, file, (stretches[0], stretches[1]))
     print(f"written: {file}")
     return 0
 
@@ -128,7 +128,10 @@ def _share(given: list[str]) -> tuple[int, int]:
     if given and int(given[2]) >= int(given[1]):
         raise InputError(f"--distributed {' '.join(given)}: processes are numbered from 0 to {int(given[1]) - 1}")
     try:
-        jax.distributed.initialize(*given[:1], *map(int, given[1:]))
+        if given:
+            jax.distributed.initialize(given[0], int(given[1]), int(given[2]))
+        else:
+            jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
         # Rows need no communication: left at once, so that a process that dies stops no other.
         jax.distributed.shutdown()

@@ -36,7 +36,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     blocks = _written_out(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
-    edge = [[None] * m for _ in range(m)]
+    edge: list[list[Any]] = [[None] * m for _ in range(m)]
     for r in range(m):
         for c in range(m):
             if blocks[PAIRS[0]][r][c] is None:
@@ -47,7 +47,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
                 value = K[r][c] if r == c else jnp.where(swapped[pair], K[c][r], K[r][c])
                 total = total.at[pattern.element_edges[k]].add(value)
             edge[r][c] = total
-    gathered = [[None if e is None else e[pattern.row_edges] for e in row] for row in edge]
+    gathered: list[list[Any]] = [[None if e is None else e[pattern.row_edges] for e in row] for row in edge]
     upward = jnp.arange(mesh.number_of_nodes, dtype=jnp.int32)[None] < pattern.row_nodes
     return tuple(
         tuple(gathered[r][c] if r == c else jnp.where(upward, gathered[r][c], gathered[c][r]) for c in range(m))

@@ -24,8 +24,10 @@ class Batch:
     """Results of many lanes; `result.status` is (N, T), and a lane that failed spoils no other."""
 
     result: Result = param("1", "every field with a leading axis of N lanes")
-    strategy: str = static("map", "map: one lane after another per device; vmap: all lanes of a device at once")
-    devices: int = static(1, "lanes were spread over so many")
+    strategy: str = static(
+        default="map", about="map: one lane after another per device; vmap: all lanes of a device at once"
+    )
+    devices: int = static(default=1, about="lanes were spread over so many")
 
 
 def strategy_for(platform: str) -> str:
@@ -84,4 +86,4 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
             raise InputError(f"{name} has no lanes: give one value a lane, e.g. [700.0, 800.0]")
         if length != lengths[first]:
             raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give as many of each")
-    return lengths[first]
+    return int(lengths[first] or 0)

@@ -19,7 +19,7 @@ class Fixed:
     """Nodes that do not move along some axes."""
 
     nodes: Any = param("1", "node numbers (n,)")
-    axes: str = static("xyz", "held axes")
+    axes: str = static(default="xyz", about="held axes")
 
 
 @struct
@@ -30,7 +30,7 @@ class Displaced:
     by: Any = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
     times: Any = param("s", "times of a history (T,)", default=None)
     history: Any = param("m", "displacements at these times (T, 3), linear in between", default=None)
-    axes: str = static("xyz", "prescribed axes")
+    axes: str = static(default="xyz", about="prescribed axes")
 
 
 @struct
@@ -60,14 +60,14 @@ def select(
         raise InputError(f'{name}: give either where = {{z_max = 0.0}} or set = "name"')
     if set is not None:
         if set not in mesh.node_sets:
-            known = ", ".join(mesh.node_sets) or "none"
-            raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {known}); use one of them or where")
+            there = ", ".join(mesh.node_sets) or "none"
+            raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
         return np.asarray(mesh.node_sets[set])
     points = np.asarray(mesh.points)
     tolerance = 1e-9 * np.linalg.norm(np.ptp(points, axis=0))
     inside = np.ones(len(points), dtype=bool)
     known = [f"{a}_{end}" for a in AXES for end in ("min", "max")]
-    for key, bound in where.items():
+    for key, bound in (where or {}).items():
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
             raise InputError(f"{name}: {key!r} is not known: did you mean {near}?")

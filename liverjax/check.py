@@ -71,12 +71,13 @@ def load(name: str) -> Law:
     sys.modules[spec.name] = module
     sys.path.insert(0, str(Path(file).resolve().parent))
     try:
-        spec.loader.exec_module(module)
+        loader: Any = spec.loader
+        loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise InputError(f"{file} does not run ({_reason(error)}): mend it first") from None
     finally:
         sys.path.pop(0)
-    found = getattr(module, attribute, None)
+    found: Any = getattr(module, attribute, None)
     if found is None:
         own = {n: v if inspect.isclass(v) else type(v) for n, v in vars(module).items() if _is_law(v)}
         offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
@@ -113,7 +114,7 @@ def _is_law(value: Any) -> bool:
     return isinstance(value, Law) or (inspect.isclass(value) and issubclass(value, Law) and value is not Law)
 
 
-def _typical(cls: type[Law], name: str) -> Law:
+def _typical(cls: type, name: str) -> Law:
     if "__dataclass_fields__" not in vars(cls):
         raise InputError(f"{name} is not decorated: write @liverjax.struct above its class")
     values = {f.name: f.metadata.get("typical") for f in laws.parameters(cls)}
@@ -140,8 +141,8 @@ def check(law: Law) -> Check:
     for name, function, exact in (("energy to stress", energy, slope), ("stress to tangent", stress, curved)):
         errors[name] = np.array([_difference(function, F, D, h, exact) for h in STEPS])
         rows.append(_v_shape(name, errors[name]))
-    for name, by_hand, function in (("stress", P, reference.first_piola), ("tangent", A, reference.tangent)):
-        rows.append(_exact(f"{name} by hand against autodiff", by_hand, _numbers(jax.jit(partial(function, law)), F)))
+    for name, by_hand, oracle in (("stress", P, reference.first_piola), ("tangent", A, reference.tangent)):
+        rows.append(_exact(f"{name} by hand against autodiff", by_hand, _numbers(jax.jit(partial(oracle, law)), F)))
     Q = _rotation(4)
     size = np.abs(W).max() + np.abs(P).max()
     rows.append(_exact("objective: W(QF) = W(F)", _numbers(energy, Q @ F), W, size))
@@ -247,7 +248,7 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
         if test == "pure_shear":
             continue
         driven = SHEARS if what == "shear" else STRETCHES
-        F = homogeneous.deformation_gradient(test, driven)
+        F = np.asarray(homogeneous.deformation_gradient(test, driven))
         P = _numbers(jax.jit(partial(homogeneous.nominal_stress, law)), F)
         stable = _work_is_positive(test, driven, P) & (ellipticity(_numbers(tangent, F)) > 0)
         start = int(np.argmin(np.abs(driven - (0.0 if what == "shear" else 1.0))))
@@ -261,7 +262,7 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
     """The nominal stress rises; at the ends by one-sided differences."""
-    stress = np.asarray(homogeneous.measured(test, P))
+    stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0
 

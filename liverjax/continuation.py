@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from liverjax import status
-from liverjax.linear import differentiable_solve, refined
+from liverjax.linear import differentiable_solve
 from liverjax.minimisation import minimise, untangled
 
 #: Name of a step's root among what reverse mode may keep: with it nothing of how it was found is computed again.
@@ -41,7 +41,7 @@ class StepOptions(NamedTuple):
     one_step_tolerance: float = 1e-4  # of the one direction where there is but one iteration
     contraction: float = 0.15  # of |r| in an iteration; a tangent that does worse is made anew
     wear: float = 1.2  # of the preconditioner: iterations a digit over those when it was new
-    adjoint: float = 1e-2  # tolerance of the solves that carry derivatives, over `tolerance`
+    adjoint: float = 0.1  # tolerance of the solves that carry derivatives, over `tolerance`
     max_linear_iterations: int = 3000
     max_halvings: int = 6
     max_cuts: int = 12
@@ -98,8 +98,9 @@ class Method(NamedTuple):
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
-    #: Whether `solve` is of a dr/dq that is exact and symmetric: derivatives are then solved for with it.
-    exact: bool = False
+    #: (tangent, b, tolerance, max_iterations) -> as `solve`, with dr/dq itself, and the residual over |b|: for
+    #: derivatives, where dr/dq is symmetric. None: they are solved for with products of dr/dq.
+    adjoint: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is.
     symmetric: bool = True
     #: Whether r depends on s.
@@ -128,10 +129,12 @@ def solve(
     options: StepOptions = StepOptions(),
     guess: jax.Array | None = None,
     kept: Kept | None = None,
+    near: Any = None,
 ) -> tuple[jax.Array, StepStatistics, Kept]:
     """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative.
 
-    Returns the root, what it took, and the tangent for the next step; `kept` is that of the last.
+    Returns the root, what it took, and the tangent for the next step; `kept` is that of the last, `near` one of which
+    derivatives may take parts.
     """
     start = jax.lax.stop_gradient(start)
     guess = None if guess is None else jax.lax.stop_gradient(guess)
@@ -154,20 +157,15 @@ def solve(
     q, statistics = checkpoint_name((jax.lax.stop_gradient(q), statistics), ROOT)
 
     def tangent_solve(linear, y):
-        K = method.tangent(q, one, jax.lax.stop_gradient(method.residual(q, one)[2]), None)
+        some = None if near is None else (jnp.array(True), near)
+        K = method.tangent(q, one, jax.lax.stop_gradient(method.residual(q, one)[2]), some)
         limits = (jnp.maximum(options.adjoint * options.tolerance, 1e-13), options.max_linear_iterations)
-        solver = None
-        if method.symmetric:
-
-            def nearly(b, tolerance):
-                return method.solve(K, b, tolerance, options.max_linear_iterations)[0]
-
-            solver = (lambda _, b: nearly(b, limits[0])) if method.exact else partial(refined, nearly, limits[0])
+        solver = None if method.adjoint is None else lambda b: method.adjoint(K, b, *limits)
         return differentiable_solve(linear, y, method.preconditioner(K), *limits, method.symmetric, solver)
 
     root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)
-    counts = (n.astype(jnp.int32) for n in statistics[:4])
-    return root, StepStatistics(*counts, statistics.residual), kept
+    code, iterations, linear, cuts = (n.astype(jnp.int32) for n in statistics[:4])
+    return root, StepStatistics(code, iterations, linear, cuts, statistics.residual), kept
 
 
 def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
@@ -181,8 +179,8 @@ def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOp
     r, force, _ = method.residual(q, one)
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
     code = jnp.where(jnp.isfinite(relative), status.CONVERGED, status.NOT_FINITE)
-    counts = (code, one, linear, zero)
-    return q, (StepStatistics(*(jnp.asarray(n, start.dtype) for n in counts), relative), kept)
+    a, b, c, d = (jnp.asarray(n, start.dtype) for n in (code, one, linear, zero))
+    return q, (StepStatistics(a, b, c, d, relative), kept)
 
 
 def _follow(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
@@ -192,13 +190,14 @@ def _follow(method: Method, start: jax.Array, guess: Any, kept: Kept, options: S
     failure = jnp.where(end.indefinite, status.INDEFINITE, stopped)
     failure = jnp.where(jnp.isfinite(end.relative), failure, status.NOT_FINITE)
     code = jnp.where((end.s >= 1) & (end.relative <= options.tolerance), status.CONVERGED, failure)
-    counts = (code, end.total, end.linear, end.cuts)
-    return end.q, (StepStatistics(*(n.astype(start.dtype) for n in counts), end.relative), end.kept)
+    a, b, c, d = (n.astype(start.dtype) for n in (code, end.total, end.linear, end.cuts))
+    return end.q, (StepStatistics(a, b, c, d, end.relative), end.kept)
 
 
 def _robust(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
     """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least."""
     zero = jnp.zeros((), start.dtype)
+    assert method.tangled is not None
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
     begin = start if guess is None else jnp.where(method.tangled(guess, zero + 1), start, guess)
     q, (taken, kept) = jax.lax.cond(
@@ -212,7 +211,8 @@ def _robust(method: Method, start: jax.Array, guess: Any, kept: Kept, options: S
         least = minimise(method, first, options)
         iterations, linear = iterations + least.iterations, linear + least.linear_iterations
         more = (least.code, taken.iterations + iterations, taken.linear_iterations + linear)
-        taken_now = StepStatistics(*(jnp.asarray(n, start.dtype) for n in more), taken.cuts, least.relative)
+        a, b, c = (jnp.asarray(n, start.dtype) for n in more)
+        taken_now = StepStatistics(a, b, c, taken.cuts, least.relative)
         return least.q, (taken_now, kept._replace(made=jnp.array(False)))
 
     return jax.lax.cond(taken.status == status.CONVERGED, lambda: (q, (taken, kept)), again)
@@ -363,7 +363,8 @@ def _direction(
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
     """Solution of dr/dq dq = load to `forcing`, its iterations, the tangent it is of and whether that is positive."""
     near = (kept.made & ~kept.worn, kept.tangent)
-    K = jax.lax.cond(renew, lambda: method.tangent(*at, near), lambda: kept.tangent)
+    q, s, by = at
+    K = jax.lax.cond(renew, lambda: method.tangent(q, s, by, near), lambda: kept.tangent)
     dq, linear, positive = jax.lax.cond(
         wanted,
         lambda: method.solve(K, load, forcing, options.max_linear_iterations),

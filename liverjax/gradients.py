@@ -85,8 +85,8 @@ def _program(loss: Callable[[Result], jax.Array], store: str | int, mode: str) -
     return jax.jit(both)
 
 
-#: Numbers an element that one step's derivative works with, beside its tangent, without and with a sponge; measured.
-_WORK, _WORK_POROUS = 330, 530
+#: Numbers an element that one step's derivative works with, beside tangents; measured.
+_WORK = 440
 
 
 def memory(scene: Scene, store: str | int = "all") -> int:
@@ -101,13 +101,13 @@ def memory(scene: Scene, store: str | int = "all") -> int:
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
     root = _bytes(scene.mesh.points)
-    numbers = _WORK if scene.porosity is None else _WORK_POROUS
-    work = tangent + numbers * scene.mesh.number_of_elements * scene.mesh.points.dtype.itemsize
+    # Tangents of a step, and of the run's beginning.
+    work = 2 * tangent + _WORK * scene.mesh.number_of_elements * scene.mesh.points.dtype.itemsize
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = checkpointing.lengths(steps, kept)
-    # Beside the states, what the run returns: positions and reactions, and their derivatives.
-    return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 4 * steps * root + 2 * work
+    # Beside the states, what the run returns; not all of it at once.
+    return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 
 
 def _bytes(tree: Any) -> int:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-Vector = tuple[Any, Any, Any]
-Matrix = tuple[Vector, Vector, Vector]
+Vector = tuple[Any, ...]
+Matrix = tuple[Vector, ...]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -130,12 +130,12 @@ def pack(A: Matrix) -> jax.Array:
     return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in A], axis=-2)
 
 
-def node_values(x: jax.Array, tetrahedra: jax.Array) -> tuple[Vector, Vector, Vector, Vector]:
+def node_values(x: jax.Array, tetrahedra: jax.Array) -> Matrix:
     """Values (V, 3) at the four nodes of every element."""
     return tuple(tuple(x[:, c][tetrahedra[:, a]] for c in range(3)) for a in range(4))
 
 
-def deformation_gradient(mesh, x: jax.Array) -> Matrix:
+def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, since the shape vectors of an element add up to zero.
 
     Args:

@@ -109,11 +109,11 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
         raise InputError(f"{name}: the position of node {bad} is {points[bad]}; give finite coordinates")
     volumes = np.asarray(mesh.volumes)
     edge = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=-1).max(axis=1)
-    bad = np.flatnonzero(~(volumes > 1e-12 * edge**3))
-    if len(bad):
+    flat = np.flatnonzero(~(volumes > 1e-12 * edge**3))
+    if len(flat):
         raise InputError(
-            f"{name}: {len(bad)} of {len(tets)} tetrahedra are flat or inverted (first: {bad[0]}, volume "
-            f"{volumes[bad[0]]:.3g} m^3); swap two of their nodes or remesh"
+            f"{name}: {len(flat)} of {len(tets)} tetrahedra are flat or inverted (first: {flat[0]}, volume "
+            f"{volumes[flat[0]]:.3g} m^3); swap two of their nodes or remesh"
         )
     _, first, copies = np.unique(np.sort(tets, axis=1), axis=0, return_index=True, return_counts=True)
     if np.any(copies > 1):
@@ -151,8 +151,8 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
         raise InputError(
             f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh"
         ) from None
-    tets = [block.data for block in data.cells if block.type == "tetra"]
-    if not tets:
+    blocks = [block.data for block in data.cells if block.type == "tetra"]
+    if not blocks:
         kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
         raise InputError(f"mesh file {path}: it holds {kinds} but no linear tetrahedra; export 4-node tetrahedra")
     others = sorted({b.type for b in data.cells if b.type != "tetra" and not b.type.startswith(_FLAT_CELLS)})
@@ -161,7 +161,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
             f"mesh file {path}: it holds {', '.join(others)} beside linear tetrahedra; remesh all of the body with "
             "4-node tetrahedra"
         )
-    points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(tets)
+    points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(blocks)
     if points.shape[1] != 3:
         raise InputError(f"mesh file {path}: its points have {points.shape[1]} coordinates; give three")
     if tets.min(initial=0) < 0 or tets.max(initial=0) >= len(points):

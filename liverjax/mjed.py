@@ -36,7 +36,7 @@ def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
     """Sum over elements of V0 P D_a at their nodes: (V, 3) [N] from first Piola-Kirchhoff stresses [Pa]."""
     D, V0 = mesh.shape_vectors, mesh.volumes
-    forces = [[V0 * dot(P[i], D[a]) for i in range(3)] for a in range(3)]
+    forces = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
     forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(3)], *forces]
     columns = []
     for i in range(3):

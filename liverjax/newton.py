@@ -55,8 +55,8 @@ def solve(
         return differentiable_solve(linear, y, precondition, options.adjoint_tolerance, options.max_linear_iterations)
 
     root, statistics = jax.lax.custom_root(residual, jax.lax.stop_gradient(start), iterate, tangent_solve, has_aux=True)
-    counts = (n.astype(jnp.int32) for n in statistics[:3])
-    return root, NewtonStatistics(*counts, statistics.residual)
+    code, iterations, linear = (n.astype(jnp.int32) for n in statistics[:3])
+    return root, NewtonStatistics(code, iterations, linear, statistics.residual)
 
 
 class _Point(NamedTuple):

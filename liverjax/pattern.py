@@ -27,7 +27,7 @@ class Pattern:
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
     patch_functions: jax.Array = param("1", "1 and the place in its patch, about 1 in size, of every node (V, 4)")
     patch_width: jax.Array = param("m", "mean of the patches' widest extents")
-    number_of_patches: int = static(1, "P")
+    number_of_patches: int = static(default=1, about="P")
 
 
 def pattern(tetrahedra: Any, points: jax.Array) -> Pattern:
@@ -88,8 +88,9 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
     # On the host where positions are known: small programs of their own would take a second to compile.
-    xp, points = (jnp, points) if isinstance(points, jax.core.Tracer) else (np, np.asarray(points))
-    members = [points[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
+    xp: Any = jnp if isinstance(points, jax.core.Tracer) else np
+    given: Any = points if xp is jnp else np.asarray(points)
+    members = [given[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
     low, high = (xp.stack([f(m, axis=0) if len(m) else xp.zeros(3) for m in members]) for f in (xp.min, xp.max))
     widest = xp.max(high - low, axis=1)
     half = xp.where(widest > 0, widest / 2, 1.0)

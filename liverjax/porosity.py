@@ -39,8 +39,8 @@ class Porosity:
     fluid_fraction: Any = param("1", "r_w", above=0.0, upper=1.0)
     permeability: Any = param("m^4/(N s)", "kappa", lower=0.0)
     drained: Any = param("1", "nodes where P = 0 (n,); None: sealed", default=None)
-    scheme: str = static("implicit", "implicit or chapter")
-    keep_bulk: bool = static(False, "keep the law's own volumetric energy beside that of the sponge")
+    scheme: str = static(default="implicit", about="implicit or chapter")
+    keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy beside that of the sponge")
 
 
 class Fluid(NamedTuple):
@@ -168,9 +168,14 @@ def _gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
 
 def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
     """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
-    increment = fluid.J - fluid.J_before if porosity.scheme == "chapter" else J_end - fluid.J
+    before: Any = fluid.J_before
+    increment = fluid.J - before if porosity.scheme == "chapter" else J_end - fluid.J
     rate = -_scatter(mesh, mesh.volumes * increment / 4)
-    rhs = flow.mask * (flow.store * fluid.pressure + rate)
+    return solved(mesh, flow, flow.mask * (flow.store * fluid.pressure + rate))
+
+
+def solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
+    """A^-1 b for b (V,), A the matrix of the pressure, to the tolerance of the flow; has derivatives."""
 
     def apply(p):
         # A unit row where drained: adjoint loads need not vanish there.
@@ -183,7 +188,7 @@ def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end:
     def precondition(r):
         return r / diagonal + slow((r,))[0]
 
-    return differentiable_solve(apply, rhs, precondition, flow.tolerance, 2000)
+    return differentiable_solve(apply, b, precondition, flow.tolerance, 2000)
 
 
 def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
@@ -219,16 +224,20 @@ def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
 
 
 def with_flow(
-    mesh: TetMesh, flow: Flow | None, A: assembly.BlockMatrix, both: tuple[jax.Array, ...]
+    mesh: TetMesh, flow: Flow | None, A: assembly.BlockMatrix, both: tuple[jax.Array, ...], exactly: bool = False
 ) -> tuple[jax.Array, ...]:
     """Forces, columns (V,), of a motion that changes pressures too, from `both` = A (dx, 0) of the `coupled` matrix A.
 
-    Without `flow` nothing flows: the matrix of the pressures is diagonal.
+    Without `flow` nothing flows: the matrix of the pressures is diagonal. With it their equation is solved nearly, or
+    `exactly`: to its tolerance.
     """
     *forces, balance = both
-    dP = -balance / A.diagonal[3][3] if flow is None else nearly_solved(mesh, flow, balance)
-    last = [tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal)]
-    pull = assembly.product(assembly.BlockMatrix(*last, A.nodes), (dP,))
+    if flow is None:
+        dP = -balance / A.diagonal[3][3]
+    else:
+        dP = flow.mask * solved(mesh, flow, flow.mask * balance) if exactly else nearly_solved(mesh, flow, balance)
+    rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
+    pull = assembly.product(assembly.BlockMatrix(rows, diagonal, A.nodes), (dP,))
     return tuple(f + p for f, p in zip(forces, pull, strict=True))
 
 
@@ -278,9 +287,9 @@ def coupled(mesh: TetMesh, K: dict, inertia: Any, F: Matrix, pressures: assembly
     q = [scale(mesh.volumes / 4, g) for g in _gradients(mesh, F)]
     bordered = {}
     for (a, b), block in K.items():
-        rows = [(*block[r], -q[a][r]) for r in range(3)]
-        bordered[a, b] = (*rows, (*(-x for x in q[b]), None))
-    rows = assembly.off_diagonal(mesh, bordered)
+        forces = [(*block[r], -q[a][r]) for r in range(3)]
+        bordered[a, b] = (*forces, (*(-x for x in q[b]), None))
+    rows: assembly.Block = assembly.off_diagonal(mesh, bordered)
     rows = (*rows[:3], (*rows[3][:3], -pressures.rows[0][0]))
     sums = assembly.row_sums(rows)
     # No force under translation: the columns of x add up to zero along a row.
@@ -299,7 +308,8 @@ def _scatter(mesh: TetMesh, share: jax.Array) -> jax.Array:
 
 def element_pressure(mesh: TetMesh, P: jax.Array) -> jax.Array:
     """Mean (E,) of the pressure (V,) of the nodes."""
-    return sum(P[mesh.tetrahedra[:, a]] for a in range(4)) / 4
+    corners: Any = sum(P[mesh.tetrahedra[:, a]] for a in range(4))
+    return corners / 4
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:

@@ -60,8 +60,8 @@ def frame(F: Matrix) -> Frame:
     rest = add(f[1], scale(-dot(f[1], u1), u1))
     enough = dot(rest, rest) > 1e-24 * dot(f[0], f[0])
     u2 = _unit(_chosen(enough, rest, aside), (zero, one, zero))
-    u = [u1, u2, cross(u1, u2)]
-    return Frame(transpose(u), tuple(dot(a, b) for a, b in zip(u, f, strict=True)), transpose(n))
+    u: Matrix = (u1, u2, cross(u1, u2))
+    return Frame(transpose(u), tuple(dot(a, b) for a, b in zip(u, f, strict=True)), transpose(tuple(n)))
 
 
 def _chosen(where: Any, a: Vector, b: Vector) -> Vector:
@@ -81,9 +81,11 @@ class _Scalars(NamedTuple):
     invariants: tuple = ("I1", "I2", "J")
 
     def measures(self, F: Matrix) -> Matrix:
+        """What `energy_derivatives` takes."""
         return F
 
     def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
+        """Slopes and curvatures, given beforehand."""
         return self.first, self.second
 
 
@@ -99,7 +101,9 @@ def blocks(
         D: shape vectors of the nodes.
         pairs: which blocks, as indices into D.
     """
-    first, second, stretched, added = {}, {}, [], []
+    first: dict[str, Any] = {}
+    second: dict[tuple[str, str], Any] = {}
+    stretched, added = [], []
     metric = None if S is None else projected(S)
     for weight, law in parts:
         slopes, curvatures = law.energy_derivatives(law.measures(F))

@@ -108,5 +108,5 @@ def _put(law: Law, path: list[str], value: jax.Array) -> Law:
         return replace(law, laws=(*law.laws[:k], _put(law.laws[k], path[1:], value), *law.laws[k + 1 :]))
     if len(path) == 2:
         k, old = int(path[1]), getattr(law, path[0])
-        value = (*old[:k], value, *old[k + 1 :])
+        return replace(law, **{path[0]: (*old[:k], value, *old[k + 1 :])})
     return replace(law, **{path[0]: value})

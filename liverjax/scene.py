@@ -35,15 +35,25 @@ class Solve:
     """How the scene is solved; all but the time step and the tolerance is static."""
 
     dt: Any = param("s", "time step; None: load steps without time", default=None)
-    kind: str = static("static", "static: no inertia; dynamic")
-    steps: int = static(1, "load steps, or time steps of dt")
+    kind: str = static(default="static", about="static: no inertia; dynamic")
+    steps: int = static(default=1, about="load steps, or time steps of dt")
     tolerance: Any = param("1", "of the residual, relative to the forces at work", default=1e-8)
-    newton_iterations: int = static(25, "of a step; 1 is the chapter's linearly implicit scheme (not for derivatives)")
-    integrator: str = static("euler", "dynamic: euler (first order) or newmark (average acceleration, second order)")
-    precision: str = static("float64", "float64 or float32")
-    linear_solver: str = static("cg", "cg, or direct: a factorisation on the host, for what is too stiff to iterate on")
-    volumetric: str = static("element", "element, or nodal: volume changes averaged at nodes, against locking")
-    robust: str = static("off", "projected or regularised: make the energy least where a step cannot be followed")
+    newton_iterations: int = static(
+        default=25, about="of a step; 1 is the chapter's linearly implicit scheme (not for derivatives)"
+    )
+    integrator: str = static(
+        default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
+    )
+    precision: str = static(default="float64", about="float64 or float32")
+    linear_solver: str = static(
+        default="auto", about="cg; direct: factorised on the host; auto: by size and stiffness (`choice`)"
+    )
+    volumetric: str = static(
+        default="element", about="element, or nodal: volume changes averaged at nodes, against locking"
+    )
+    robust: str = static(
+        default="off", about="projected or regularised: make the energy least where a step cannot be followed"
+    )
 
 
 @struct
@@ -182,7 +192,7 @@ def _mesh(table: dict, folder: Path) -> TetMesh:
             if key not in table:
                 raise InputError(f"[mesh] shape = 'box' needs {key}: give three numbers")
         return shapes.box(
-            scale * _numbers("[mesh] size", table["size"], 3), list(_numbers("[mesh] cells", table["cells"], 3))
+            list(scale * _numbers("[mesh] size", table["size"], 3)), list(_numbers("[mesh] cells", table["cells"], 3))
         )
     if table["shape"] == "cylinder":
         for key in ("radius", "height", "cell_size"):
@@ -234,8 +244,8 @@ def _prony(table: dict) -> Prony:
     return Prony(ratios=g, relaxation_times=tau, **{k: table[k] for k in ("part", "scheme") if k in table})
 
 
-def _porosity(mesh: TetMesh, table: dict) -> Porosity:
-    values = {}
+def _porosity(mesh: Any, table: dict) -> Porosity:
+    values: dict[str, Any] = {}
     for key in ("bulk", "limit_bulk", "fluid_fraction", "permeability"):
         if key not in table:
             raise InputError(f"[porosity] needs {key}: give a number")
@@ -246,7 +256,8 @@ def _porosity(mesh: TetMesh, table: dict) -> Porosity:
         given = table["drained"]
         by_set = isinstance(given, dict) and set(given) == {"set"}
         values["drained"] = _nodes(mesh, "porosity.drained", given if by_set else {"where": given})
-    return Porosity(**values, **{k: table[k] for k in ("scheme", "keep_bulk") if k in table})
+    values |= {k: table[k] for k in ("scheme", "keep_bulk") if k in table}
+    return Porosity(**values)
 
 
 def _body(table: dict) -> Body:
@@ -303,7 +314,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     name = f"traction.{k}"
     if ("value" in table) == ("pressure" in table):
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
-    triangles = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
+    triangles: Any = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
     if len(triangles) == 0:
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
     triangles = jnp.asarray(triangles, jnp.int32)
@@ -316,7 +327,7 @@ _CHOICES = {
     "kind": ("static", "dynamic"),
     "integrator": ("euler", "newmark"),
     "precision": ("float64", "float32"),
-    "linear_solver": ("cg", "direct"),
+    "linear_solver": ("auto", "cg", "direct"),
     "volumetric": ("element", "nodal"),
     "robust": ("off", "projected", "regularised"),
 }
@@ -416,7 +427,7 @@ def changed_content(content: dict[str, Any], values: dict[str, Any]) -> dict[str
     content = copy.deepcopy(content)
     for name, value in values.items():
         *path, last = [int(key) if key.isdigit() else key for key in name.split(".")]
-        table = content if path[:1] != ["mesh"] else None  # the mesh is one for all
+        table: Any = content if path[:1] != ["mesh"] else None  # the mesh is one for all
         try:
             for k, key in enumerate(path):
                 if k == 1 and isinstance(key, int) and isinstance(table, dict):

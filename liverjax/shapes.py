@@ -23,15 +23,15 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
     shape = tuple(int(n) + 1 for n in cells)
     grid = np.indices(shape).reshape(3, -1).T
     corner = np.indices(tuple(int(n) for n in cells)).reshape(3, -1).T
-    tets = []
+    sixths = []
     for order in itertools.permutations(range(3)):
         path = np.vstack([np.zeros(3, dtype=int), np.cumsum(np.eye(3, dtype=int)[list(order)], axis=0)])
         if np.linalg.det(np.eye(3)[list(order)]) < 0:
             path = path[[0, 2, 1, 3]]
         nodes = corner[:, None, :] + path[None]
-        tets.append(np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), shape))
+        sixths.append(np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), shape))
     # Tetrahedra of one brick stay together: neighbours in memory share their nodes.
-    tets = np.stack(tets, axis=1).reshape(-1, 4)
+    tets = np.stack(sixths, axis=1).reshape(-1, 4)
     points = grid * np.asarray(size, dtype=float) / np.asarray(cells)
     names = ("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max")
     faces = {names[a][e]: np.flatnonzero(grid[:, a] == (e * cells[a])) for a in range(3) for e in range(2)}

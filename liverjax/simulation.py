@@ -11,6 +11,7 @@ import numpy as np
 from liverjax import (
     boundary,
     checkpointing,
+    choice,
     continuation,
     laws,
     mjed,
@@ -57,8 +58,8 @@ class State(NamedTuple):
     x: jax.Array  # (V, 3) [m]
     velocity: jax.Array | None  # dynamic
     acceleration: jax.Array | None  # Newmark
-    history: viscosity.History | None  # viscosity
-    fluid: porosity.Fluid | None  # porosity
+    history: Any  # `viscosity.History` of a viscous scene
+    fluid: Any  # `porosity.Fluid` of a porous one
 
 
 def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
@@ -67,6 +68,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
     dynamic = scene.solve.kind == "dynamic"
     acceleration = None
     if dynamic and scene.solve.integrator == "newmark":
+        assert scene.body is not None
         # m a = f at rest: Newmark's method keeps its order from the first step.
         mass = scene.body.density * boundary.nodal_volumes(scene.mesh)
         mask = boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced)
@@ -106,7 +108,7 @@ class Equations(NamedTuple):
     loads: jax.Array  # (V, 3) [N] dead
     noise: Any  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
     mass: jax.Array | None  # (V,) [kg]
-    memory: viscosity.Recall | None
+    memory: Any  # `viscosity.Recall`
     flow: porosity.Flow | None  # where a fluid's pressure depends on where the step ends
     pressure: jax.Array | None  # (V,) [Pa] where it does not: solved for once
 
@@ -115,7 +117,9 @@ def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> E
     """The equations of step k = 1 … steps from `state`; `stiff` is `unit_strain_force(scene)`, the same for all."""
     stiff = unit_strain_force(scene) if stiff is None else stiff
     mesh, sponge, dt = scene.mesh, scene.porosity, scene.solve.dt
-    flow = pressure = None
+    flow = pressure = mass = None
+    if state.velocity is not None and scene.body is not None:
+        mass = scene.body.density * boundary.nodal_volumes(mesh)
     if sponge is not None:
         F = deformation_gradient(mesh, state.x)
         flow = porosity.flow(sponge, mesh, state.fluid, F, dt, 1e-2 * jax.lax.stop_gradient(scene.solve.tolerance))
@@ -128,7 +132,7 @@ def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> E
         mask=boundary.free_degrees(mesh, scene.fixed, scene.displaced),
         loads=_loads(scene),
         noise=20 * float(np.finfo(np.float64).eps) / jax.lax.stop_gradient(scene.solve.tolerance) * stiff,
-        mass=None if state.velocity is None else scene.body.density * boundary.nodal_volumes(mesh),
+        mass=mass,
         memory=None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt),
         flow=flow,
         pressure=pressure,
@@ -158,14 +162,17 @@ def _positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
     return e.mask * jnp.stack(columns(q), axis=-1) + (1 - e.mask) * held
 
 
-def _forces(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array | None, jax.Array, jax.Array | None]:
+def _forces(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array | None, jax.Array, Any]:
     """Internal, inertial and outer forces (V, 3), and the fluid's pressure."""
     scene = e.scene
     law = element_law(scene)
     x = _positions(e, q, s)
     F = deformation_gradient(scene.mesh, x)
-    P = terms.first_piola(law, F) if e.memory is None else viscosity.first_piola(scene.viscosity, e.memory, law, F)
-    fluid = e.pressure
+    if scene.viscosity is None:
+        P = terms.first_piola(law, F)
+    else:
+        P = viscosity.first_piola(scene.viscosity, e.memory, law, F)
+    fluid: Any = e.pressure
     if scene.porosity is not None:
         if e.flow is not None:
             fluid = porosity.pressure(scene.porosity, scene.mesh, e.state.fluid, e.flow, determinant(F))
@@ -198,7 +205,7 @@ def _method(e: Equations) -> continuation.Method:
     def made(kind, q, s, fluid, near):
         return tangent.tangent(setting, fluid, _positions(e, q, s), _acting(e, s), near, kind)
 
-    robust = {}
+    robust: dict[str, Any] = {}
     if solve.robust != "off":
         robust = {
             "energy": partial(_energy, e),
@@ -211,7 +218,7 @@ def _method(e: Equations) -> continuation.Method:
         tangent=partial(made, "true"),
         solve=partial(tangent.solve, setting),
         preconditioner=partial(tangent.preconditioner, setting),
-        exact=tangent.exact(setting),
+        adjoint=None if follows else partial(tangent.adjoint, setting),
         symmetric=not follows,
         moved=len(e.scene.displaced) > 0 or e.mass is None,
         **robust,
@@ -236,15 +243,18 @@ def _energy(e: Equations, q: jax.Array) -> jax.Array:
     return potential.total(loaded, x, deformation_gradient(e.scene.mesh, x), acceleration)
 
 
-def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
-    """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step."""
+def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
+    """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step.
+
+    `kept` is the tangent of the last step, `near` one whose coarse space will do for derivatives.
+    """
     scene, state, solve = e.scene, e.state, e.scene.solve
     options = StepOptions(tolerance=jax.lax.stop_gradient(solve.tolerance), max_iterations=solve.newton_iterations)
     guess = None
     if e.mass is not None and not scene.displaced and solve.newton_iterations > 1:
         # Straight on; one iteration starts at x, as printed.
         guess = flat(e.mask * (state.x + solve.dt * state.velocity))
-    q, statistics, kept = continuation.solve(_method(e), flat(e.mask * state.x), options, guess, kept)
+    q, statistics, kept = continuation.solve(_method(e), flat(e.mask * state.x), options, guess, kept, near)
     one = jnp.ones((), state.x.dtype)
     x = _positions(e, q, one)
     internal, inertial, outer, fluid = _forces(e, q, one)
@@ -253,12 +263,12 @@ def step(e: Equations, kept: Kept | None = None) -> tuple[State, jax.Array, Step
     if state.acceleration is None:
         acceleration = None
     history, F = None, deformation_gradient(scene.mesh, x)
-    if e.memory is not None:
+    if scene.viscosity is not None:
         history = viscosity.advance(scene.viscosity, state.history, element_law(scene), F, solve.dt)
-    fluid = None if scene.porosity is None else porosity.advance(scene.porosity, state.fluid, fluid, F)
+    flowed = None if scene.porosity is None else porosity.advance(scene.porosity, state.fluid, fluid, F)
     inverted = (statistics.status == status.CONVERGED) & jnp.any(determinant(F) <= 0)
     statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))
-    return State(x, velocity, acceleration, history, fluid), reactions, statistics, kept
+    return State(x, velocity, acceleration, history, flowed), reactions, statistics, kept
 
 
 def _motion(e: Equations, x: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -282,7 +292,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
 
     def physics(carry, k):
         state, kept = carry
-        new, reactions, statistics, kept = step(equations(scene, state, k, stiff), kept)
+        new, reactions, statistics, kept = step(equations(scene, state, k, stiff), kept, near)
         # A state that is not finite spoils nothing further: the run stays where it last was.
         finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
         good = finite & (statistics.status != status.NOT_FINITE)
@@ -300,7 +310,10 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
-    kept = continuation.nothing_kept(_method(equations(scene, start, numbers[0], stiff)), flat(start.x))
+    method, q = _method(equations(scene, start, numbers[0], stiff)), flat(start.x)
+    kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
+    # Derivatives take their coarse space from the run's beginning: made once. A run without them does not make it.
+    near = method.tangent(q, one, method.residual(q, one)[2], None)
     x, reactions, P, statistics = checkpointing.scan(advance, (start, kept), numbers, store)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status
@@ -329,6 +342,8 @@ def simulate(
             by `check_scene`, which reading a scene file calls.
     """
     check_choices(scene)
+    if scene.solve.linear_solver == "auto":
+        scene = replace(scene, solve=replace(scene.solve, linear_solver=choice.linear_solver(scene)))
     if scene.region:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
         scene = replace(scene, law=per_element, region=())

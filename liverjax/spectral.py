@@ -206,7 +206,8 @@ def _sinhc(x: Any) -> Any:
     """sinh(x)/x; its series (last term 1/19!) below 1."""
     square = x * x
     near = square < 1
-    small, series = jnp.where(near, square, 0.0), 0.0
+    small: Any = jnp.where(near, square, 0.0)
+    series: Any = 0.0
     for k in range(9, -1, -1):
         series = series * small + 1 / math.factorial(2 * k + 1)
     safe = jnp.where(near, 1.0, x)

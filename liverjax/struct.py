@@ -52,12 +52,15 @@ def param(
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(static, param))
 def struct(cls: type[T]) -> type[T]:
     """Make `cls` a frozen, keyword-only dataclass registered as a pytree; `static` fields are not leaves."""
-    cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    fields = dataclasses.fields(cls)
+    made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+    fields = dataclasses.fields(made)
     meta = [f.name for f in fields if f.metadata.get("static")]
     data = [f.name for f in fields if not f.metadata.get("static")]
-    jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=meta)
-    return cls
+    jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=meta)
+    return made
 
 
-replace = dataclasses.replace
+def replace(of: T, **changes: Any) -> T:
+    """A copy with other values in some fields."""
+    whole: Any = of
+    return dataclasses.replace(whole, **changes)

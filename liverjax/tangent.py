@@ -15,7 +15,7 @@ from liverjax import assembly, boundary, direct, mjed, nodal_volume, porosity, p
 from liverjax.assembly import BlockMatrix
 from liverjax.coarse import Coarse, coarse, corrected, worthwhile
 from liverjax.kinematics import Matrix, Vector, add_matrices, deformation_gradient, determinant, scale_matrix
-from liverjax.linear import conjugate_gradients, stabilised_biconjugate_gradients
+from liverjax.linear import conjugate_gradients, refined, stabilised_biconjugate_gradients, true_residual
 from liverjax.pattern import PAIRS
 from liverjax.scene import Scene, element_law
 
@@ -35,7 +35,7 @@ def element_blocks(
     D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
     if kind != "true":
         K = _definite(scene, memory, pressure, law, F, D, kind)
-    elif memory is None:
+    elif memory is None or scene.viscosity is None:
         K = terms.blocks(terms.state(law, F), D, _OWN)
     else:
         K = viscosity.blocks(scene.viscosity, memory, law, F, D, _OWN)
@@ -63,7 +63,7 @@ def _definite(
 ) -> list[Matrix]:
     """Blocks that stand for the true ones where those have negative eigenvalues."""
     parts, S = [(1.0, law)], None
-    if memory is not None:
+    if memory is not None and scene.viscosity is not None:
         parts, S = viscosity.summands(scene.viscosity, memory, law)
     volume = _volume(scene, pressure, F)
     if volume is not None:
@@ -153,15 +153,15 @@ def preconditioner(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Ar
     return lambda r: free.ravel() * jnp.concatenate(both(assembly.columns(r)))
 
 
-def product(setting: Setting, K: Tangent) -> Callable[[jax.Array], jax.Array]:
-    """K as a function of flat vectors (3 V,); where pressure depends on motion, that of a nearly solved pressure."""
+def product(setting: Setting, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
+    """K as a function of flat vectors (3 V,); pressure that depends on motion is nearly solved for, or `exactly`."""
     A, free, loads = K.matrix, setting.mask.T, setting.scene.traction
 
     def apply(v):
         motion = [m * c for m, c in zip(free, assembly.columns(v), strict=True)]
         force = assembly.product(A, motion)
         if _coupled(setting):
-            force = porosity.with_flow(setting.scene.mesh, setting.flow, A, force)
+            force = porosity.with_flow(setting.scene.mesh, setting.flow, A, force, exactly)
         force = jnp.concatenate(force)
         if K.x is not None:
             dx = jnp.stack(motion, axis=-1)
@@ -195,7 +195,18 @@ def _factorised(setting: Setting, K: Tangent, b: jax.Array) -> jax.Array:
     return direct.solve(K.matrix, free, load)[:3].ravel()
 
 
-def exact(setting: Setting) -> bool:
-    """Whether `solve` is that of the symmetric derivative of the forces, and not of something near it."""
-    whole = setting.flow is None or setting.scene.solve.linear_solver == "direct"
-    return whole and not boundary.follows(setting.scene.traction)
+def adjoint(
+    setting: Setting, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
+) -> tuple[jax.Array, jax.Array]:
+    """Solution of K x = b with pressures solved for, for derivatives, and its residual over |b|; no load follows."""
+    if setting.scene.solve.linear_solver == "direct":
+        x = _factorised(setting, K, b)
+        return x, true_residual(product(setting, K, exactly=True), b, x)
+    if setting.flow is None:
+        x, s = conjugate_gradients(product(setting, K), b, preconditioner(setting, K), tolerance, max_iterations)
+        return x, s.residual
+
+    def nearly(r, tolerance):
+        return solve(setting, K, r, tolerance, max_iterations)[0]
+
+    return refined(nearly, tolerance, product(setting, K, exactly=True), b)

@@ -87,6 +87,7 @@ def stress(s: State) -> Stress:
     tensors += [green_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "green_energy")]
     if W2 is not None:
         diagonal = 2 * (W1 + s.I1 * W2)
+        assert s.C is not None
         C = scale_matrix(-2 * W2, s.C)
         tensors.append(tuple(tuple(C[i][j] + (diagonal if i == j else 0.0) for j in range(3)) for i in range(3)))
     if not tensors:

@@ -31,8 +31,10 @@ class Prony:
 
     ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,)", lower=0.0, upper=1.0)
     relaxation_times: Any = param("s", "tau_k (N,)", above=0.0)
-    part: str = static("all", "all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)")
-    scheme: str = static("exponential", "exponential or chapter")
+    part: str = static(
+        default="all", about="all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)"
+    )
+    scheme: str = static(default="exponential", about="exponential or chapter")
 
 
 class History(NamedTuple):
@@ -124,7 +126,7 @@ def initial_history(prony: Prony, number_of_elements: int, dtype: Any = float) -
 def recall(prony: Prony, history: History, dt: Any) -> Recall:
     """The constant part of the next step's stress, from the memory at its beginning."""
     a, b, c = coefficients(prony, dt)
-    past = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
+    past: Any = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
     if history.stress is not None:
         past = past + jnp.sum(c) * history.stress
     return Recall(symmetric(tuple(past)), 1 - jnp.sum(a))

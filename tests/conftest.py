@@ -1,5 +1,6 @@
 """Strict numerics for every test: 64 bit, no silent rank promotion; data of other programs where it is present."""
 
+import json
 import os
 import shutil
 import tempfile
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.versions import versions
 
 matplotlib.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -20,10 +22,47 @@ ROOT = Path(__file__).parent.parent
 SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
 
 
+def pytest_addoption(parser):
+    """The page of known answers."""
+    text = "run the tests that have a known answer, slow ones too, and write their rows to a JSON file"
+    parser.addoption("--verification", metavar="FILE", type=Path, help=text)
+
+
+def pytest_collection_modifyitems(config, items):
+    """With --verification only tests of known answers run."""
+    if config.getoption("--verification"):
+        items[:] = [item for item in items if "verified" in item.fixturenames]
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """Rows of the tests that passed, in the order of their names."""
+    file = config.getoption("--verification")
+    if file:
+        passed = sorted(terminalreporter.stats.get("passed", []), key=lambda report: report.nodeid)
+        rows = [dict(row, test=r.nodeid) for r in passed for name, row in r.user_properties if name == "verified"]
+        content = {"rows": rows, "environment": versions()}
+        file.write_text(json.dumps(content, indent=1) + "\n")
+
+
+@pytest.fixture
+def verified(record_property):
+    """Puts a row on the page of known answers, if the test passes: what, whose, largest difference [1], order."""
+
+    def row(benchmark: str, source: str, difference: float, allowed: float, order: float | None = None, **values):
+        numbers = {"difference": float(difference), "allowed": float(allowed)}
+        numbers |= {name: float(value) for name, value in values.items()}
+        order = None if order is None else float(order)
+        record_property("verified", {"benchmark": benchmark, "source": source, "order": order} | numbers)
+
+    return row
+
+
 def pytest_configure(config):
     """Programs compiled once are found again by the other worker and by commands that tests start."""
     config.addinivalue_line("markers", "slow: run by python -m pytest -m slow, not by default")
     config.addinivalue_line("markers", "quick_to_compile: few optimisations, where compiling takes longer than running")
+    if config.getoption("--verification"):
+        config.option.markexpr = ""
     if not hasattr(config, "workerinput"):
         config.compiled = tempfile.mkdtemp()
         os.environ["JAX_COMPILATION_CACHE_DIR"] = config.compiled

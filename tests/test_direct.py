@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import boundary, direct, simulation, status, tangent
+from liverjax import boundary, choice, direct, simulation, status, tangent
 from liverjax.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
@@ -59,6 +59,22 @@ def test_its_gradient_against_differences():
     assert np.isclose(difference, force(770.0)[1], rtol=1e-7)
 
 
+def test_auto_decides_by_size_and_stiffness():
+    static = lj.Scene(mesh=MESH, law=LAW, fixed=HELD)
+    stiff = replace(static, law=replace(LAW, bulk=2000 * float(LAW.mu)))
+    assert static.solve.linear_solver == "auto" and choice.linear_solver(static) == "cg"
+    assert choice.linear_solver(stiff) == "direct"
+    assert choice.linear_solver(replace(stiff, solve=replace(stiff.solve, kind="dynamic", dt=0.1))) == "cg"
+    load = lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(MESH, MESH.node_sets["z_max"])), pressure=4.0)
+    assert choice.linear_solver(replace(stiff, traction=(load,))) == "cg"
+    points = np.asarray(MESH.points) * np.array([1.0, 1.0, 1e-4])
+    assert choice.linear_solver(replace(static, mesh=lj.tet_mesh(points, MESH.tetrahedra))) == "direct"
+    assert abs(choice.thinnest(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]]), np.array([1 / 6])) - 0.77) < 0.01
+    seen = []
+    jax.eval_shape(lambda s: seen.append(choice.linear_solver(s)), stiff)
+    assert seen == ["cg"]  # traced numbers are not known
+
+
 def test_a_matrix_without_an_inverse_is_told():
     loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # nothing holds it
     A = jax.jit(lambda: tangent.stiffness(loose, None, None, None, MESH.points))()
@@ -104,7 +120,7 @@ def test_a_tangent_goes_from_step_to_step():
     scene = replace(POROUS, porosity=None, solve=replace(POROUS.solve, dt=0.002, steps=10, tolerance=1e-8))
     tangent.stiffness = counted
     try:
-        result = simulation._run.__wrapped__(scene, None, None, "all")
+        result = simulation._run.__wrapped__(scene, None, None, scene.solve.steps)
     finally:
         tangent.stiffness = original
     result.check()

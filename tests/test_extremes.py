@@ -156,6 +156,7 @@ def rise(scene: lj.Scene) -> float:
     return float(np.mean(np.asarray(moved)[np.asarray(scene.mesh.node_sets["x_max"]), 1]))
 
 
+@pytest.mark.slow
 def test_averaged_volumes_do_not_lock():
     # Averaged, refinement lets the edge rise on; element by element it does not move (3.6e-5 m/Pa on every mesh).
     coarse, fine = (rise(membrane(n, 1e5, "nodal")) for n in (8, 16))

@@ -153,6 +153,7 @@ def test_the_prior_has_the_covariance_it_states():
     np.testing.assert_allclose(after, np.diag(T @ kept @ T.T), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
     """The map explains the data to their noise and is nearer the truth than any uniform body; its standard deviation
     is that of the dense Hessian; a fit that was killed goes on where it was."""
@@ -162,7 +163,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
         problem, length=0.02, max_iterations=40, modes=70, file=file, progress=lambda k, c: rows.append((k, c))
     )
     mesh = problem.scenes[0].mesh
-    assert found.reached and rows and found.chi2 <= problem.count
+    assert found.reached and rows and found.chi2 <= problem.components
     off, volumes = np.log(found.modulus / _truth(mesh)), np.asarray(mesh.volumes)
     best = np.log(_truth(mesh)) - np.average(np.log(_truth(mesh)), weights=volumes)
     assert np.sqrt(np.average(off**2, weights=volumes)) < 0.5 * np.sqrt(np.average(best**2, weights=volumes))
@@ -217,10 +218,11 @@ def test_few_numbers_of_several_scenes(problem):
     found = scenes.fit_numbers(scenes.Problem(tuple(wrong), tuple(data)), ["law.mu", "law.bulk"])
     assert found.converged and found.names == ("law.mu", "law.bulk")
     assert np.all(np.abs(found.values - [800.0, 3000.0]) < 4 * found.standard_errors)
-    assert 0.5 < found.chi2 / found.count < 1.5
+    assert 0.5 < found.chi2 / found.components < 1.5
     assert found.standard_errors[0] < 20
 
 
+@pytest.mark.slow
 def test_viscosity_from_a_time_series(tmp_path):
     """A block that creeps under its weight: ratio and relaxation time from a few nodes over time."""
     text = _SCENE.format(mu=800.0, gravity="4, 0, -3")
@@ -261,6 +263,7 @@ def test_the_command_maps_and_goes_on(tmp_path, capsys):
     assert main([*command, "--length", "0.02", "--iterations", "5", "--resume"]) in (0, 1)
 
 
+@pytest.mark.slow
 def test_a_sphere_is_found_where_it_is():
     """Same mesh for data and fit: the estimator itself, from a start that is off."""
     mesh = lj.shapes.box((0.06, 0.06, 0.05), (6, 6, 5))
@@ -293,4 +296,4 @@ def test_a_sphere_is_found_where_it_is():
     values = dict(zip(found.names, found.values, strict=True))
     true = [*np.asarray(centre), 0.016, 800.0, 2400.0]
     assert np.all(np.abs(found.values - true) < 5 * found.standard_errors), (values, found.standard_errors)
-    assert 0.5 < found.chi2 / found.count < 1.5
+    assert 0.5 < found.chi2 / found.components < 1.5

@@ -36,6 +36,11 @@ def test_import_turns_on_64_bits_unless_the_user_chose(setting, expected, monkey
     assert run.stdout.strip() == expected
 
 
+def test_types_are_checked():
+    run = subprocess.run([sys.executable, "-m", "mypy"], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout
+
+
 def test_code_is_formatted_and_linted():
     for command in (["check"], ["format", "--check"]):
         run = subprocess.run([sys.executable, "-m", "ruff", *command, "."], cwd=ROOT, capture_output=True, text=True)

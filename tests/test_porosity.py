@@ -59,7 +59,7 @@ def column(layers: int, steps: int, duration: float, scheme: str = "implicit", *
 
 
 @pytest.mark.slow
-def test_terzaghis_consolidation():
+def test_terzaghis_consolidation(verified):
     at = np.array([0.05, 0.1, 0.197, 0.5, 0.848, 1.0])
     settled = np.array([0.2523, 0.3568, 0.5003, 0.7640, 0.9000, 0.9313])
     base = np.array([0.9969, 0.9493, 0.7777, 0.3708, 0.1571, 0.1080])
@@ -72,6 +72,8 @@ def test_terzaghis_consolidation():
         top = np.asarray(result.positions)[k, :, 2].max(axis=1) - HEIGHT
         U, p = (top - at_once) / (at_last - at_once), np.asarray(result.pressure)[k, 0] / p0
         errors.append(max(np.abs(U - settled).max(), np.abs(p - base).max()))
+    order, source = np.log2(errors[0] / errors[1]), "Terzaghi's series, six times"
+    verified("consolidation: settlement and pressure, 500 steps", source, errors[1], 0.01, order)
     assert errors[1] < 0.01
     assert errors[0] / errors[1] > 1.6  # first order in the step, which is halved with the layers
 
@@ -113,6 +115,7 @@ def test_sealed_and_tight_keeps_all_fluid():
     assert np.isclose(float(jnp.mean(result.pressure[-1])), -2200 * (J - 1), rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_gradient_by_the_permeability():
     scene = column(2, 2, 0.5)
     scene = replace(scene, solve=replace(scene.solve, tolerance=1e-11))
@@ -149,7 +152,7 @@ def test_unusable_porosity_is_refused(change, sentence):
         column(1, 1, 1.0, **change)
 
 
-def test_confined_compression_of_febio(febio):
+def test_confined_compression_of_febio(febio, verified):
     # FEBio's biphasic material stores no fluid: the chapter's equation with K_lim far above every other stiffness.
     nodes = np.loadtxt(febio / "column_nodes.csv", delimiter=",")
     tets = np.loadtxt(febio / "column_tets.csv", delimiter=",", dtype=int)
@@ -186,5 +189,7 @@ def test_confined_compression_of_febio(febio):
     base = np.asarray(result.pressure)[:, np.flatnonzero(nodes[:, 2] < low[2] + 1e-9)].mean(axis=1)
     # Same elements and steps; what differs is their storage (none) and their integration of the permeability.
     stress, pressure = theirs[1:101, 3], theirs[1:101, 5]
-    assert np.abs(ours - stress).max() < 0.01 * stress.max()
-    assert np.abs(base - pressure).max() < 0.01 * pressure.max()
+    off = np.abs(ours - stress).max() / stress.max(), np.abs(base - pressure).max() / pressure.max()
+    verified("confined compression of a sponge: stress", "FEBio, biphasic", off[0], 0.01)
+    verified("confined compression of a sponge: pressure at the base", "FEBio, biphasic", off[1], 0.01)
+    assert max(off) < 0.01

@@ -21,7 +21,10 @@ def _pulled(law: lj.Law, region: tuple = ()) -> lj.Scene:
     )
 
 
-@pytest.mark.parametrize("name", list(lj.laws.LAWS))
+QUICK = ("neo_hookean", "ogden", "costa")
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in lj.laws.LAWS])
 def test_every_number_of_every_law_may_differ_by_element(name):
     """A region of all elements is the scene with that number; forces of half a body are those of its own elements."""
     law = lj.laws.typical(name)
@@ -51,6 +54,7 @@ def test_every_number_of_every_law_may_differ_by_element(name):
         np.testing.assert_allclose(lj.mjed.internal_force(mesh, mixed, x), parts[0] + parts[1], atol=1e-12 * scale)
 
 
+@pytest.mark.slow
 def test_a_region_runs_as_the_array_it_stands_for_and_has_a_gradient():
     law = lj.laws.NeoHookean(mu=800.0, bulk=3000.0)
     inside = jnp.arange(20, 50)

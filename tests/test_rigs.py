@@ -16,7 +16,7 @@ PRONY = lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.5]))
 R, H = 0.01, 0.01
 
 
-def test_creep_is_that_of_the_standard_linear_solid():
+def test_creep_is_that_of_the_standard_linear_solid(verified):
     """All stress relaxes alike, so a small strain creeps as 1/(1-g) - g/(1-g) exp(-t (1-g)/tau), averaged over the
     first step, in which the load comes up; at second order."""
     errors = []
@@ -29,16 +29,20 @@ def test_creep_is_that_of_the_standard_linear_solid():
         exact = 1 / 0.6 - 0.4 / 0.6 * np.exp(-rate * t) * np.expm1(rate * dt) / (rate * dt)
         assert not np.any(codes)
         errors.append(abs(float(u[-1] / elastic / exact[-1]) - 1))
+    order, source = np.log2(errors[0] / errors[1]), "standard linear solid"
+    verified("creep of a cylinder, steps of 0.05 s", source, errors[1], 1e-3, order)
     assert errors[0] < 1e-3 and errors[0] / errors[1] > 3, errors
 
 
-def test_tension_relaxes_as_the_law_says():
+def test_tension_relaxes_as_the_law_says(verified):
     """Held at a small strain, the force falls to 1 - g (1 - q exp(...)): after many relaxation times to 1 - g."""
     strains = np.full(40, 1e-4)
     force, codes = rigs.read(rigs.tension(R, H, 0.25, strains, cell_size=0.005), LAW, PRONY)
     elastic = rigs.read(rigs.tension(R, H, 0.25, strains[:1], cell_size=0.005), LAW, None)[0][0]
     assert not np.any(codes)
-    assert abs(float(force[-1] / elastic) - 0.6) < 1e-6
+    off = abs(float(force[-1] / elastic) - 0.6)
+    verified("relaxed over elastic force of a cylinder", "1 - sum of ratios", off, 1e-6)
+    assert off < 1e-6
     # Stiffer than a free sample, E pi r^2 strain, softer than one held all around.
     E, M = 9 * 2400 * 800 / (3 * 2400 + 800), 2400 + 4 / 3 * 800
     assert E < float(elastic) / (np.pi * R**2 * 1e-4) < M
@@ -53,7 +57,8 @@ def test_indentation_is_near_that_of_a_half_space():
     assert 1.0 < float(-force[0]) / (4 * 800 * 0.0025 * 1e-5 / (1 - nu)) < 1.6
 
 
-@pytest.mark.parametrize("kind", ["tension", "indentation", "creep"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["creep", "tension", "indentation"])
 def test_derivatives_by_the_parameters(kind):
     """Of the last reading by mu, g and tau: forward and reverse mode, and central differences."""
     strains = 0.1 * np.arange(1, 4) / 3
@@ -86,6 +91,7 @@ def _sweep(model, noise, seed):
     return Sweep(omega, *noisy, noise * storage, noise * loss, "synthetic")
 
 
+@pytest.mark.slow
 def test_two_tests_know_more_than_one():
     """A slow mode outside a sweep's band: creep adds it; every interval of the joint fit is narrower than alone."""
     model = prony.Maxwell(jnp.asarray(800.0), jnp.array([0.3, 0.3]), jnp.array([8.0, 0.1]))

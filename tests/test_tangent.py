@@ -157,6 +157,7 @@ def test_follower_pressure_follows():
     assert np.allclose(force, [-4.0 * 0.01, 0, 0], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_follower_pressure_in_equilibrium_and_its_gradient():
     scene = inflated(150.0, steps=2, tolerance=1e-11)
 

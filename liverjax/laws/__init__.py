@@ -82,7 +82,7 @@ def find(name: str) -> type[Law]:
     return LAWS[name]
 
 
-def parameters(law: type[Law] | Law) -> list[dataclasses.Field]:
+def parameters(law: Any) -> list[dataclasses.Field]:
     """The numeric fields of a law, in order, with their `unit`, bounds and `about` in `metadata`."""
     return [f for f in dataclasses.fields(law) if not f.metadata.get("static")]
 
@@ -97,7 +97,7 @@ def create(name: str, **values: Any) -> Law:
     Raises:
         InputError: unknown law or parameter, missing or out-of-bounds value.
     """
-    cls = find(name)
+    cls: Any = find(name)
     known = {f.name: f for f in dataclasses.fields(cls)}
     for key in values:
         if key not in known:

@@ -19,7 +19,7 @@ class ArrudaBoyce(Law):
     mu: Any = param("Pa", "n k_B Theta", above=0.0, typical=730.0)
     chain_length: Any = param("1", "rigid links of a chain, N", above=0.0, typical=8.0)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):

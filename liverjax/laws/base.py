@@ -13,7 +13,7 @@ differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_de
 written by hand.
 """
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +49,14 @@ class Law:
     """A hyperelastic law per reference volume [Pa]; see the module for what to override."""
 
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
-    bulk: ClassVar[Any] = None
+    bulk: Any = None
+    if TYPE_CHECKING:  # of laws that have them
+        volumetric: Any
+        fibre: Any
+        exponents: Any
+        isochoric_energy: Any
+        stretch_energy: Any
+        green_energy: Any
 
     # -- what a law states -------------------------------------------------------------------------------------------
 
@@ -176,8 +183,8 @@ class Volumetric(Law):
     """
 
     bulk: Any = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
-    below: float | None = static(None, "J below which U is its Taylor parabola there")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
+    below: float | None = static(default=None, about="J below which U is its Taylor parabola there")
     invariants: ClassVar = ("J",)
 
     def strain_energy(self, I):
@@ -262,14 +269,14 @@ def _scalar_derivatives(W: Any, values: dict) -> tuple[First, Second]:
     return first, {(a, b): curvature(a, b) for k, a in enumerate(names) for b in names[k:]}
 
 
-def _isochoric(law: Law) -> Law | None:
+def _isochoric(law: Law) -> Any:
     if hasattr(law, "isochoric"):
         return law.isochoric()
     split = hasattr(law, "isochoric_energy") or hasattr(law, "stretch_energy")
     return replace(law, bulk=None) if split else None
 
 
-def _volumetric(law: Law) -> Law | None:
+def _volumetric(law: Law) -> Any:
     if isinstance(law, Volumetric):
         return law
     if hasattr(law, "volumetric_law"):
@@ -277,7 +284,7 @@ def _volumetric(law: Law) -> Law | None:
     return None if law.bulk is None else Volumetric(bulk=law.bulk, volumetric=law.volumetric)
 
 
-def isochoric_part(law: Law) -> Law | None:
+def isochoric_part(law: Law) -> Any:
     """The law without its volumetric energy, or `None` where an energy has no such split (or is only volumetric)."""
     parts = [_isochoric(s) for s in summands(law)]
     if any(p is None and not isinstance(s, Volumetric) for p, s in zip(parts, summands(law), strict=True)):
@@ -286,7 +293,7 @@ def isochoric_part(law: Law) -> Law | None:
     return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)
 
 
-def volumetric_part(law: Law) -> Law | None:
+def volumetric_part(law: Law) -> Any:
     """U(J) of a split law as a law of its own, or `None` where there is none."""
     kept = tuple(v for v in map(_volumetric, summands(law)) if v is not None)
     return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)

@@ -19,10 +19,10 @@ class Continued(Law):
     """
 
     law: Any = param("1", "the law")
-    below: float = static(0.1, "c")
+    below: float = static(default=0.1, about="c")
 
     @property
-    def invariants(self) -> tuple:
+    def invariants(self) -> tuple:  # type: ignore[override]  # of the law inside
         """Those of the law, and J."""
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 

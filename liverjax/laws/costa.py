@@ -31,7 +31,7 @@ class Costa(Law):
     bulk: Any = param("Pa", "bulk modulus of U(J)", above=0.0, typical=7700.0)
     fibre: Any = param("1", "fibre direction, (3,) or (E, 3)", each=True, default=(1.0, 0.0, 0.0))
     sheet: Any = param("1", "sheet direction, (3,) or (E, 3)", each=True, default=(0.0, 1.0, 0.0))
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("E", "J")
 
     def _weights(self):

@@ -18,7 +18,7 @@ class FungDemiray(Law):
     c1: Any = param("Pa", "ground-state shear modulus", above=0.0, typical=770.0)
     c2: Any = param("1", "exponent", above=0.0, typical=1.0)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):
@@ -45,7 +45,7 @@ class VerondaWestmann(Law):
     c1: Any = param("Pa", "scale of the exponential", above=0.0, typical=350.0)
     c2: Any = param("1", "exponent", above=0.0, typical=2.2)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "I2", "J")
 
     def isochoric_energy(self, I1, I2):

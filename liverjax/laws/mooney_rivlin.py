@@ -39,7 +39,7 @@ class MooneyRivlin(Law):
     c12: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)^2", default=None)
     c03: Any = param("Pa", "coefficient of (Ibar2 - 3)^3", default=None)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "I2", "J")
 
     def terms(self):

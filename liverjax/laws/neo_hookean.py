@@ -17,7 +17,7 @@ class NeoHookean(Law):
 
     mu: Any = param("Pa", "shear modulus", above=0.0, typical=770.0)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 
     def isochoric_energy(self, I1, I2):

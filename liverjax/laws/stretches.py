@@ -24,7 +24,7 @@ class Ogden(Law):
     mu: Any = param("Pa", "mu_k, one a term", each=True, typical=(700.0, -40.0))
     alpha: Any = param("1", "alpha_k, one a term", nonzero=True, each=True, typical=(2.5, -4.0))
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
@@ -59,7 +59,7 @@ class Bogen(Law):
     mu: Any = param("Pa", "mu; of alpha's sign for a stable law", typical=400.0)
     alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
@@ -90,7 +90,7 @@ class Logarithmic(Law):
     c2: Any = param("1", "1 / (largest Xi - 3)", above=0.0, typical=0.05)
     alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
@@ -126,7 +126,7 @@ class Exponential(Law):
     c2: Any = param("1", "exponent's factor", above=0.0, typical=0.25)
     alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
     bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
-    volumetric: str = static("quadratic", "quadratic, log or simo")
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):

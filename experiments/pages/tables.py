@@ -1,28 +1,11 @@
-"""The numbers that README.md quotes, from the JSON of other experiments.
+"""Tables of laws, simulations, speed, many runs and fits."""
 
-``python experiments/readme_numbers.py`` rewrites the parts of README.md between markers; a test compares them.
-"""
-
-import json
-from pathlib import Path
-
-HERE = Path(__file__).parent
-README = HERE.parent / "README.md"
-END = "<!-- end of numbers -->"
-
-
-def begin(part: str) -> str:
-    """The marker before a part."""
-    return f"<!-- {part}: experiments/readme_numbers.py -->"
-
-
-def _results(*names: str) -> list[dict]:
-    return [json.loads((HERE / "results" / f"{n}.json").read_text()) for n in names]
+from experiments.pages.results import error_text, load, percent
 
 
 def laws() -> str:
     """Every law: error and time of its hand-derived terms, and how well it follows brain and rubber."""
-    table, brain, rubber = _results("laws_table", "curves_brain", "curves_rubber")
+    table, brain, rubber = load("laws_table", "curves_brain", "curves_rubber")
     fits = [{f["law"]: f for f in data["laws"]} for data in (brain, rubber)]
 
     def followed(found: dict, name: str) -> str:
@@ -41,18 +24,10 @@ def laws() -> str:
     return "\n".join(rows)
 
 
-def error_text(error: float) -> str:
-    """Roundoff, as a power of ten."""
-    return f"{error:.0e}"
-
-
 def numbers() -> str:
     """The table of error against run time and the paragraph on the chapter's 5 %."""
-    fig5, job = _results("fig5_dma", "main_job")
+    fig5, job = load("fig5_dma", "main_job")
     steps = {(r["scheme"], r["steps"]): r for r in fig5["steps"]}
-
-    def percent(x: float) -> str:
-        return f"{100 * x:.2g} %"
 
     def row(what: str, error: str, run: float, compiling: float) -> str:
         return f"| {what} | {error} | {run:.2g} s | {compiling:.2g} s |"
@@ -88,8 +63,9 @@ def numbers() -> str:
 
 def simulations() -> str:
     """The known answers on their finest meshes, and the liver's three models."""
-    known, liver = _results("known_answers", "fig6_liver")
-    cook, land, rod = (known[name][-1] for name in ("cook", "land", "cantilever"))
+    known, liver = load("known_answers", "fig6_liver")
+    rods = [r for r in known["cantilever"] if r["volumetric"] == "element"]
+    cook, land, rod = known["cook"][-1], known["land"][-1], rods[-1]
     rows = ["| what | result | error | run | compile |", "|---|---|---|---|---|"]
 
     def row(what: str, result: str, error: str, r: dict) -> None:
@@ -107,7 +83,7 @@ def simulations() -> str:
     before = known["land"][-2]
     ratio = (land["cells"] / before["cells"]) ** 2
     limit = land["end_mm"] + (land["end_mm"] - before["end_mm"]) / (ratio - 1)
-    short = [100 * (1 - r["tip_m"][0] / r["mazier_y_m"]) for r in known["cantilever"] if r["tetrahedra"] > 7000]
+    short = [100 * (1 - r["tip_m"][0] / r["mazier_y_m"]) for r in rods if r["tetrahedra"] > 7000]
     rows += [
         "",
         f"Linear tetrahedra are too stiff in bending: Land's beam extrapolates (second order) to {limit:.2f} mm, the",
@@ -128,7 +104,7 @@ def simulations() -> str:
 
 def speed() -> str:
     """Force and stiffness against other ways, solves, growth with the mesh."""
-    fig4, solve, scaling = _results("fig4_assembly", "solve_benchmark", "scaling")
+    fig4, solve, scaling = load("fig4_assembly", "solve_benchmark", "scaling")
     ways = ("chapter, on the fly", "standard FEM", "autodiff 9 x 9", "vmapped Hessian")
     rows = [
         f"Force and stiffness of {fig4['elements']:,} tetrahedra, every way in one run, with the error against the",
@@ -179,9 +155,7 @@ def speed() -> str:
 
 def runs() -> str:
     """Rows a minute, what a sweep survives, a posterior carried through the liver, a training set."""
-    bench, lives, spread, training = _results(
-        "sweep_benchmark", "sweep_survival", "propagate_posterior", "training_set"
-    )
+    bench, lives, spread, training = load("sweep_benchmark", "sweep_survival", "propagate_posterior", "training_set")
     kills, others = lives["kills"], lives["loopback"]
     killed, lost = kills["kills"] + sum(r["killed"] for r in others), kills["finished_chunks_lost"]
     equal = kills["equal_bytes"] and all(r["equal_bytes"] for r in others)
@@ -221,104 +195,4 @@ def runs() -> str:
     return "\n".join(rows)
 
 
-def stability() -> str:
-    """Inverted starts, the liver at any step, locking."""
-    return "\n".join([*_inverted(), "", *_steps(), "", *_cost(), "", *_locking()])
-
-
-def _inverted() -> list[str]:
-    (data,) = _results("stability_inverted")
-    cases = list(next(iter(data["laws"].values()))["plain"])
-    rows = [
-        f"A hanging block of {data['elements']} tetrahedra from {data['seeds']} scrambled starts a column: per cent",
-        "that end at the minimum reached from rest, to 1e-6 of the size (most iterations; time a start):",
-        "",
-        "| law | solver | " + " | ".join(cases) + " |",
-        "|---" * (2 + len(cases)) + "|",
-    ]
-
-    def cell(r: dict) -> str:
-        rate = f"{100 * r['right'] / r['starts']:.0f} %"
-        return rate + (f" ({r['most_iterations']}; {1e3 * r['seconds_a_start']:.2g} ms)" if r["right"] else "")
-
-    for law, tables in data["laws"].items():
-        for solver, table in tables.items():
-            rows.append(f"| `{law}` | {solver} | " + " | ".join(cell(table[case]) for case in cases) + " |")
-    return rows
-
-
-def _steps() -> list[str]:
-    (data,) = _results("stability_steps")
-    sizes, wanted = sorted({r["dt"] for r in data["rows"]}), data["steps"]
-    rows = [
-        f"The liver phantom under its full weight, {wanted} steps of each size: steps in equilibrium (residual below",
-        "1e-6), Newton iterations a step, steps a second:",
-        "",
-        "| model | robust | " + " | ".join(f"{dt:g} s" for dt in sizes) + " |",
-        "|---" * (2 + len(sizes)) + "|",
-    ]
-    for model, robust in dict.fromkeys((r["model"], r["robust"]) for r in data["rows"]):
-        mine = {r["dt"]: r for r in data["rows"] if (r["model"], r["robust"]) == (model, robust)}
-        cells = [
-            f"{mine[dt]['converged']}/{wanted}, {mine[dt]['newton_a_step']:.3g}, {mine[dt]['steps_per_s']:.3g}"
-            for dt in sizes
-        ]
-        rows.append(f"| {model} | {robust} | " + " | ".join(cells) + " |")
-    return rows
-
-
-def _cost() -> list[str]:
-    (data,) = _results("stability_cost")
-    times = [f"{r['model']} {r['time_over_off']:.2f}" for r in data["rows"]]
-    compiles = [f"{r['compile_s']['off']:.0f} to {r['compile_s']['projected']:.0f} s" for r in data["rows"]]
-    apart = max(r["largest_difference_m"] for r in data["rows"])
-    return [
-        "Where it is not needed, under a fifth of gravity, robust takes so many times the run time of a run without:",
-        f"{', '.join(times)} (positions differ by {apart:.0e} m); compiling grows from",
-        f"{', '.join(compiles)}.",
-    ]
-
-
-def _locking() -> list[str]:
-    (data,) = _results("stability_bulk")
-    rows = [
-        "Locking, against a finer mesh with averaged volumes (factorised; Newton iterations, run time):",
-        "",
-        "| body | cells | K/mu | by element | at the nodes |",
-        "|---|---|---|---|---|",
-    ]
-
-    def cell(r: dict) -> str:
-        found = f"{100 * abs(r['error']):.2g} %, {r['newton']} iterations, {r['run_s']:.2g} s"
-        return found if r["code"] == "converged" else r["code"]
-
-    direct = [r for r in data["rows"] if r["linear_solver"] == "direct"]
-    finest = {body: max(r["cells"] for r in direct if r["body"] == body) for body in {r["body"] for r in direct}}
-    for body, ratio in dict.fromkeys((r["body"], r["ratio"]) for r in direct):
-        key = (body, ratio, finest[body])
-        pair = {r["volumetric"]: r for r in direct if (r["body"], r["ratio"], r["cells"]) == key}
-        rows.append(f"| {body} | {key[2]} | {ratio:g} | {cell(pair['element'])} | {cell(pair['nodal'])} |")
-    return rows
-
-
-PARTS = {
-    "numbers": numbers,
-    "laws": laws,
-    "simulations": simulations,
-    "speed": speed,
-    "runs": runs,
-    "stability": stability,
-}
-
-
-def main() -> None:
-    """Rewrite README.md."""
-    page = README.read_text()
-    for part, text in PARTS.items():
-        head, rest = page.split(begin(part))
-        page = head + begin(part) + "\n" + text() + "\n" + END + rest.split(END, 1)[1]
-    README.write_text(page)
-
-
-if __name__ == "__main__":
-    main()
+PARTS = {"numbers": numbers, "laws": laws, "simulations": simulations, "speed": speed, "runs": runs}

@@ -1,0 +1,39 @@
+"""``python -m experiments all | pages | NAME … [--quick]``: run the scripts, and write the pages that quote them."""
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from experiments.pages.overview import ROWS
+from experiments.pages.write import record, write
+
+HERE = Path(__file__).parent
+
+
+def run(script: str, quick: bool) -> bool:
+    """One script in a process of its own; whether it ended well."""
+    begin = time.perf_counter()
+    code = subprocess.run([sys.executable, str(HERE / f"{script}.py"), *(["--quick"] if quick else [])]).returncode
+    seconds = time.perf_counter() - begin
+    print(f"{script}: {'done' if code == 0 else f'exit code {code}'} after {seconds:.0f} s", flush=True)
+    if code == 0:
+        record(script, "quick" if quick else "full", seconds)
+    return code == 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command; 0 if every script ended well."""
+    parser = argparse.ArgumentParser(prog="python -m experiments", description="Run experiments and write the pages.")
+    parser.add_argument("names", nargs="+", choices=["all", "pages", *ROWS], metavar="all | pages | NAME")
+    parser.add_argument("--quick", action="store_true", help="smaller cases, into results/quick: minutes")
+    options = parser.parse_args(arguments)
+    scripts = list(ROWS) if "all" in options.names else [n for n in options.names if n != "pages"]
+    good = [run(script, options.quick) for script in scripts]
+    write()
+    return 0 if all(good) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

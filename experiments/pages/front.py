@@ -1,0 +1,233 @@
+"""What the front page quotes: the main job, what to choose for an error, and one or two numbers of every part."""
+
+from collections.abc import Callable
+from typing import Any
+
+from experiments.pages.results import error_text, load, percent
+
+TARGETS = (0.1, 0.01, 0.001)
+
+
+def job() -> str:
+    """The main job on measured data."""
+    (jobs,) = load("main_job")
+    found = jobs["lions_mane"]
+    kilo, sd = found["shear_modulus"] / 1e3, found["standard_errors"]["shear_modulus"] / 1e3
+    times = ", ".join(f"{t:.2g}" for t in found["relaxation_times"])
+    return (
+        f"Lion's mane jellyfish, 31 measured frequencies: G0 = {kilo:.3g} ± {sd:.2g} kPa, relaxation times {times} s; "
+        f"the fit misses\nthe moduli by {percent(found['mean_relative_error'])} on average. "
+        f"{found['total_s']:.0f} s in all on two cores, {found['compile_time_s']:.0f} s of them compilation."
+    )
+
+
+def cheapest(rows: list[dict[str, Any]], target: float) -> dict[str, Any] | None:
+    """The fastest row within an error."""
+    good = [r for r in rows if r["error"] is not None and r["error"] <= target and r.get("converged", True)]
+    return min(good, key=lambda r: r["run_s"], default=None)
+
+
+def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
+    """Rows with `error` and `run_s` of every choice, and the name of a row."""
+    fig5, liver, known, jobs, cube, ways = load(
+        "fig5_dma", "liver_choices", "known_answers", "main_job", "precision", "fit_methods"
+    )
+    del jobs
+    steps = [r | {"error": r["error"]["mean"]} for r in fig5["steps"]]
+    meshes = [r | {"error": r[kind]["mean"], "kind": kind} for r in fig5["mesh"] for kind in ("raw", "corrected")]
+    cook = [r | {"error": abs(r["rise_mm"] / 14.74 - 1)} for r in known["cook"]]
+
+    def of_liver(title: str) -> list[dict]:
+        return [r | {"name": name} for name, rows in liver[title].items() for r in rows]
+
+    def stepped(r: dict) -> str:
+        return f"{r['name']}, {r['dt']:.2g} s"
+
+    return {
+        "moduli by the torsion simulation: recursion, steps a cycle": (
+            steps,
+            lambda r: f"{r['scheme']}, {r['steps']}",
+        ),
+        "the same: mesh, its linear bias divided out or not": (
+            meshes,
+            lambda r: f"{r['nodes']} nodes, {'divided out' if r['kind'] == 'corrected' else 'not'}",
+        ),
+        "parameters of a sweep without noise: method of the fit": (ways["exact"], lambda r: r["name"]),
+        "liver in motion, elastic: integrator, step": (
+            of_liver("explicit against implicit (hyperelastic)"),
+            stepped,
+        ),
+        "viscous: integrator, recursion, step": (of_liver("time step, integrator, recursion (viscous)"), stepped),
+        "complete: porous scheme, step": (of_liver("porous scheme (complete)"), stepped),
+        "one step size: Newton's tolerance": (
+            of_liver("Newton's tolerance (viscous, 0.05 s)"),
+            lambda r: "one iteration" if r["name"] == "one iteration" else f"{r['tolerance']:.0e}",
+        ),
+        "static cube pulled by 20 %: precision, tolerance": (
+            cube["cube"],
+            lambda r: f"{r['precision']}, {r['tolerance']:.0e}",
+        ),
+        "Cook's membrane: mesh": (cook, lambda r: f"{r['tetrahedra']:,} tetrahedra"),
+    }
+
+
+def choices() -> str:
+    """For an error of 10, 1 and 0.1 %: the cheapest choice, its error and its run time."""
+    rows = ["| what | 10 % | 1 % | 0.1 % |", "|---|---|---|---|"]
+    for what, (found, name) in questions().items():
+        cells = []
+        for target in TARGETS:
+            r = cheapest(found, target)
+            cells.append("none measured" if r is None else f"{name(r)}: {percent(r['error'])}, {r['run_s']:.2g} s")
+        rows.append(f"| {what} | " + " | ".join(cells) + " |")
+    (fig4,) = load("fig4_assembly")
+    r = fig4["laws"]["neo_hookean"]
+    slower = {w: r["times_faster"][w] for w in ("chapter, on the fly", "standard FEM", "vmapped Hessian")}
+    error = r["errors"]["contracted"]
+    rows += [
+        "",
+        f"Assembly needs no choice: all ways agree to {error_text(error)}, and for {fig4['elements']:,} neo-Hookean",
+        f"tetrahedra the contracted terms take {1e3 * r['seconds']['contracted']:.2g} ms, the chapter's six "
+        f"{slower['chapter, on the fly']:.2g} times as long, standard",
+        f"finite elements in the same layout {slower['standard FEM']:.2g} times, a vmapped `jax.hessian` "
+        f"{slower['vmapped Hessian']:.2g} times.",
+    ]
+    return "\n".join(rows)
+
+
+def simulation() -> str:
+    """The liver at real time, and the cube."""
+    liver, solve = load("fig6_liver", "solve_benchmark")
+    cube = solve["static_cube"]
+    rows = {(r["model"], r["dt"], r["newton"]): r for r in liver["rows"]}
+    lines = [
+        f"The liver phantom, {liver['tetrahedra']:,} tetrahedra, in steps of 0.05 s with Newton to 1e-6:",
+        "",
+        "| model | steps a second | simulated over run time | error of positions |",
+        "|---|---|---|---|",
+    ]
+    for model in ("hyperelastic", "viscous", "complete"):
+        r = next(v for (m, dt, newton), v in rows.items() if m == model and dt == 0.05 and newton != 1)
+        speed = r["steps_per_s"]
+        lines.append(f"| {model} | {speed:.3g} | {speed * r['dt']:.2g} | {percent(r['error'])} |")
+    return "\n".join(
+        [
+            *lines,
+            "",
+            'The error is implicit Euler\'s, which damps; `integrator = "newmark"` does not. A cube of '
+            f"{cube['tetrahedra']:,} tetrahedra",
+            f"pulled by 20 % in one load step takes {cube['seconds']:.2g} s (residual {cube['residual']:.0e}).",
+        ]
+    )
+
+
+def runs() -> str:
+    """One line of the sweeps."""
+    bench, lives = load("sweep_benchmark", "sweep_survival")
+    kills = lives["kills"]["kills"] + sum(r["killed"] for r in lives["loopback"])
+    lost = lives["kills"]["finished_chunks_lost"]
+    return (
+        f"A block of 384 tetrahedra: {bench['rows_a_minute']['1']:,.0f} rows a minute on one core, "
+        f"{bench['two_devices_over_one']:.3g} times that on two, residuals\n"
+        f"to {bench['largest_residual']:.0e}; after {kills} kills {lost} finished chunks were lost."
+    )
+
+
+def gradients() -> str:
+    """What a gradient costs, on the liver."""
+    (cost,) = load("gradient_cost")
+    liver = {(r["model"], r["steps"], r["store"]): r for r in cost["rows"]}
+    rows = [
+        "| the complete liver, 5,351 tetrahedra | store | gradient over run | memory | predicted |",
+        "|---|---|---|---|---|",
+    ]
+    for (model, steps, store), r in liver.items():
+        if model == "complete":
+            memory = f"{r['planned_bytes'] / 1e6:,.0f} MB | {r['predicted_bytes'] / 1e6:,.0f} MB"
+            rows.append(f"| {steps:,} steps | `{store}` | {r['ratio']:.3g} | {memory} |")
+    small = [r for r in cost["rows"] if "differences" in r]
+    forward = max(r["against_forward_mode"] for r in small)
+    central = max(min(r["differences"].values()) for r in small)
+    return "\n".join(
+        [
+            *rows,
+            "",
+            f"Error of the derivative by mu (complete model, 162 tetrahedra, up to 100 steps): {error_text(forward)} "
+            "against forward mode,",
+            f"{error_text(central)} against the best central difference.",
+        ]
+    )
+
+
+def maps() -> str:
+    """The lesion."""
+    (found,) = load("lesion")
+    rows = [
+        "| noise | map: centre off | time | sphere: centre off | radius off | modulus off | standard error | time |",
+        "|---" * 8 + "|",
+    ]
+    for r in found["rows"]:
+        if "sphere" in r:
+            s = r["sphere"]
+            sd = s["standard_errors"]["inclusion"] / s["values"]["inclusion"]
+            cells = (
+                f"{100 * r['noise_of_largest']:g} %",
+                f"{r['centre_off_mm']:.2g} mm",
+                f"{r['seconds']:.0f} s",
+                f"{s['centre_off_mm']:.2g} mm",
+                f"{100 * s['radius_off']:+.2g} %",
+                f"{100 * s['modulus_off']:+.2g} %",
+                percent(sd),
+                f"{s['seconds']:.0f} s",
+            )
+            rows.append("| " + " | ".join(cells) + " |")
+    return "\n".join(rows)
+
+
+def together() -> str:
+    """Intervals of the slowest mode, by tests."""
+    (found,) = load("creep_and_sweep")
+    rows = ["| fitted (synthetic, 2 % noise) | G0 | slow ratio | slow time | run, compile included |", "|---" * 5 + "|"]
+    for r in found["rows"]:
+        if r["tests"] == "creep":
+            continue
+
+        def interval(name: str, unit: str, r: dict = r) -> str:
+            value, sd = r["parameters"][name], r["standard_errors"][name]
+            return f"{value:.3g}{unit} ± {sd:.2g}" if sd < abs(value) else "not determined"
+
+        cells = (interval("shear_modulus", " Pa"), interval("ratios[0]", ""), interval("relaxation_times[0]", " s"))
+        rows.append(f"| {r['tests']} | " + " | ".join(cells) + f" | {r['seconds']:.0f} s |")
+    true = found["true"]
+    rows.append(f"| truth | {true[0]:g} Pa | {true[1]:g} | {true[4]:g} s | |")
+    return "\n".join(rows)
+
+
+def extremes() -> str:
+    """The robust solver, in two lines."""
+    inverted, cost = load("stability_inverted", "stability_cost")
+    tables = inverted["laws"]
+
+    def rate(case: str) -> str:
+        found = [t["projected"][case] for t in tables.values()]
+        return f"{100 * min(r['right'] / r['starts'] for r in found):.0f} %"
+
+    over = max(r["time_over_off"] for r in cost["rows"])
+    return (
+        f"Of {inverted['seeds']} scrambled starts a law with a fifth of the elements inverted, {rate('20 % inverted')} "
+        f"come back to the minimum with `projected`,\nof starts half inverted at least {rate('50 % inverted')}. Where "
+        f"it is not needed it costs {100 * max(over - 1, 0):.0f} % of run time at most, and compiling takes three "
+        "times as long."
+    )
+
+
+PARTS = {
+    "job": job,
+    "choices": choices,
+    "simulation": simulation,
+    "runs": runs,
+    "gradients": gradients,
+    "maps": maps,
+    "together": together,
+    "extremes": extremes,
+}

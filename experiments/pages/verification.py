@@ -1,0 +1,42 @@
+"""Known answers: rows that the tests wrote, and meshes of `known_answers.py`."""
+
+from experiments.pages.results import load
+
+
+def tests() -> str:
+    """A row a benchmark of the tests."""
+    (found,) = load("verification")
+    rows = ["| benchmark | known from | difference | allowed | observed order | test |", "|---" * 6 + "|"]
+    for r in found["rows"]:
+        order = "" if r["order"] is None else f"{r['order']:.2f}"
+        file, name = r["test"].split("::")
+        cells = (r["benchmark"], r["source"], f"{r['difference']:.1e}", f"{r['allowed']:.0e}", order)
+        rows.append("| " + " | ".join(cells) + f" | `{file.removeprefix('tests/')}` `{name.split('[')[0]}` |")
+    return "\n".join(rows)
+
+
+def meshes() -> str:
+    """Cook, Land and the cantilever, mesh by mesh."""
+    (known,) = load("known_answers")
+    rows = ["| body | tetrahedra | ours | known | difference | run |", "|---" * 6 + "|"]
+
+    def row(body: str, r: dict, ours: float, known: str, exact: float) -> None:
+        off = f"{100 * (ours / exact - 1):+.2g} %"
+        rows.append(f"| {body} | {r['tetrahedra']:,} | {ours:.4g} mm | {known} | {off} | {r['run_s']:.2g} s |")
+
+    for r in known["cook"]:
+        row("Cook's membrane, rise", r, r["rise_mm"], "14.74 mm, Miehe 1994", 14.74)
+    for r in known["land"]:
+        row("Land's beam, end", r, r["end_mm"], "4.0-4.2 mm, Land et al. 2015 (against 4.1)", 4.1)
+    for r in known["cantilever"]:
+        theirs = -1e3 * r["mazier_y_m"]
+        body = "silicone cantilever" + (", volumes at the nodes" if r["volumetric"] == "nodal" else "")
+        row(body, r, -1e3 * r["tip_m"][0], f"{theirs:.1f} mm, Mazier et al. 2021 on as many; measured 116", theirs)
+    land = known["land"]
+    ratio = (land[-1]["cells"] / land[-2]["cells"]) ** 2
+    limit = land[-1]["end_mm"] + (land[-1]["end_mm"] - land[-2]["end_mm"]) / (ratio - 1)
+    rows += ["", f"Extrapolated at second order from its two finest meshes Land's beam ends at {limit:.2f} mm."]
+    return "\n".join(rows)
+
+
+PARTS = {"tests": tests, "meshes": meshes}

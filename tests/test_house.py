@@ -1,0 +1,64 @@
+"""How the code is built: imports point downwards, public names say what they are."""
+
+import ast
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+FILES = sorted([*(ROOT / "liverjax").rglob("*.py"), *(ROOT / "fitting").glob("*.py")])
+
+
+def _module(file: Path) -> str:
+    name = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+    return name.removesuffix(".__init__")
+
+
+TREES = {_module(file): ast.parse(file.read_text()) for file in FILES}
+
+
+def _imported(tree: ast.Module) -> set[str]:
+    """Modules of the project that are imported when a module is (not inside its functions)."""
+    found = set()
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{a.name}" for a in node.names} | {node.module}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+    # `from liverjax import mesh` asks for the module, not for all that the package offers.
+    return {m for m in found & set(TREES) if m != "liverjax"}
+
+
+def test_imports_have_no_circle_and_point_downwards():
+    graph = {name: _imported(tree) for name, tree in TREES.items()}
+    assert not [(a, b) for a, found in graph.items() for b in found if a.startswith("liverjax") and "fitting" in b]
+    done: set[str] = set()
+
+    def visit(module: str, path: list[str]) -> None:
+        assert module not in path, " -> ".join([*path, module])
+        if module not in done:
+            for other in graph[module]:
+                visit(other, [*path, module])
+            done.add(module)
+
+    for module in graph:
+        visit(module, [])
+
+
+def _public(tree: ast.Module) -> list:
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    top = [n for n in tree.body if isinstance(n, kinds) and not n.name.startswith("_")]
+    classes = [n for n in top if isinstance(n, ast.ClassDef)]
+    return top + [n for c in classes for n in c.body if isinstance(n, kinds) and not n.name.startswith("_")]
+
+
+@pytest.mark.parametrize("module", TREES)
+def test_public_names_have_docstrings_and_hints(module):
+    tree = TREES[module]
+    assert ast.get_docstring(tree), "the module has no docstring"
+    for node in _public(tree):
+        assert ast.get_docstring(node), f"{node.name} has no docstring"
+    for node in _public(tree):
+        if isinstance(node, ast.FunctionDef) and node in tree.body:
+            bare = [a.arg for a in node.args.args + node.args.kwonlyargs if a.annotation is None]
+            assert not bare and node.returns is not None, f"{node.name} lacks hints: {bare}"
