@@ -55,12 +55,14 @@ def figure(tables: dict[str, list[dict]]) -> plt.Figure:
         axes.loglog([r["run_s"] for r in rows], [100 * r["error"] for r in rows], marker, color=colour, label=data)
         for r in rows:
             if data == "exact":
-                place = dict(fontsize=7, xytext=(4, 4), textcoords="offset points")
-                axes.annotate(r["name"], (r["run_s"], 100 * r["error"]), **place)
+                left = r["name"].startswith("torsion")
+                place = dict(fontsize=7, xytext=(-6 if left else 6, -3), textcoords="offset points")
+                place["ha"] = "right" if left else "left"
+                axes.annotate(r["name"].removeprefix("torsion, "), (r["run_s"], 100 * r["error"]), **place)
     axes.set(xlabel="run time, compilation apart [s]", ylabel="mean error of the parameters [%]")
-    axes.set_xlim(right=200)
+    axes.set_title("closed form, and the torsion simulation by recursion and steps a cycle")
     plain_ticks(axes.xaxis)
-    axes.legend(title="sweep")
+    axes.legend(title="sweep", loc="center left")
     return fig
 
 

@@ -203,7 +203,7 @@ def figure(mesh: lj.TetMesh, found: dict[float, field.Field], spheres: dict[floa
     for k, (noise, f) in enumerate(found.items(), start=1):
         modulus, _ = section(mesh, 1.3 * MU * np.exp(f.log_factor), CENTRE, 2)
         axes[0, k].imshow(modulus / 1e3, **shown)
-        axes[0, k].set_title(f"map, noise {100 * noise:g} %, {f.seconds:.0f} s")
+        axes[0, k].set_title(f"map, noise {100 * noise:g} %")
         sd, _ = section(mesh, f.sd, CENTRE, 2)
         spread = axes[1, k].imshow(sd, origin="lower", extent=extent, vmin=0, vmax=widest, cmap="magma")
         axes[1, k].set_xlabel("x [cm]")

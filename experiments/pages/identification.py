@@ -1,6 +1,6 @@
 """Tables of precision, gradients and maps."""
 
-from experiments.pages.results import load, percent
+from experiments.pages.results import load, percent, short
 
 
 def precision() -> str:
@@ -27,7 +27,7 @@ def gradients() -> str:
     rows = ["| model | tetrahedra | steps | store | run | gradient | over | memory | predicted |", "|---" * 9 + "|"]
     for r in data["rows"]:
         memory = f"{r['planned_bytes'] / 1e6:.3g} MB | {r['predicted_bytes'] / 1e6:.3g} MB"
-        times = f"{r['forward_s']:.2g} s | {r['gradient_s']:.2g} s | {r['ratio']:.3g}"
+        times = f"{short(r['forward_s'])} s | {short(r['gradient_s'])} s | {r['ratio']:.3g}"
         rows.append(f"| {r['model']} | {r['tetrahedra']:,} | {r['steps']:,} | `{r['store']}` | {times} | {memory} |")
     return "\n".join(rows)
 

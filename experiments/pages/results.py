@@ -17,5 +17,10 @@ def error_text(error: float) -> str:
 
 
 def percent(x: float) -> str:
-    """Two digits."""
-    return f"{100 * x:.2g} %"
+    """Two digits, or all before the point."""
+    return f"{short(100 * x)} %"
+
+
+def short(x: float) -> str:
+    """The same without a unit."""
+    return f"{x:.2g}" if abs(x) < 99.5 else f"{x:,.0f}"
