@@ -1,7 +1,7 @@
 """float32 beside float64: force and stiffness of every law, a static cube, the liver's steps; error and floor.
 
 The error of force and stiffness is that against float64 at the same positions, over the largest entry. The floor is the
-least residual (over the forces at work) that Newton still meets; asked for less it says that it cannot.
+least residual (over the forces at work) that Newton still meets; asked for less it says that it has stalled.
 
     python experiments/precision.py [--quick]
 """

@@ -397,6 +397,17 @@ def test_one_newton_iteration_is_the_chapters_scheme():
     assert 0 < np.abs(np.asarray(one.positions - full.positions)).max() < 0.05 * moved
 
 
+def test_a_tolerance_below_roundoff_stalls_at_the_answer():
+    """In float32 no residual of 1e-8 can be met: the step says so, is not cut to pieces, and is near the root."""
+    mesh = box()
+    scene = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, by=jnp.array([0.01, 0.0, 0.02])),))
+    exact = lj.simulate(scene).check()
+    single = lj.simulate(replace(scene, solve=replace(scene.solve, precision="float32")))
+    assert int(single.status[0]) == status.STALLED and int(single.statistics.cuts[0]) == 0
+    # The residual's roundoff, some 1e-5 of the forces, is as much of the displacements.
+    assert np.abs(np.asarray(single.positions, float) - np.asarray(exact.positions)).max() < 1e-4 * 0.02
+
+
 @pytest.mark.slow
 def test_single_precision_says_so():
     mesh = box(1)
