@@ -105,7 +105,9 @@ def test_planted_mistakes_are_caught(mistake, tmp_path, capsys):
     assert "FAILED" in output.out
 
 
-@pytest.mark.parametrize("name", ["neo_hookean", "costa", "saint_venant_kirchhoff"])
+@pytest.mark.parametrize(
+    "name", ["saint_venant_kirchhoff", *(pytest.param(n, marks=pytest.mark.slow) for n in ("neo_hookean", "costa"))]
+)
 def test_shipped_laws_pass(name, tmp_path, capsys):
     assert main(["check", name, "--out", str(tmp_path)]) == 0
     assert (tmp_path / f"check_{name}.png").stat().st_size > 10_000

@@ -190,6 +190,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
         field.estimate(problem, name="law.bulk", length=0.02, file=file, resume=True)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_map(problem):
     """By the whitened field, against central differences."""
     base = field.start_of(problem, "law.mu")
@@ -203,6 +204,7 @@ def test_the_gradient_of_the_map(problem):
     assert min(errors) < 1e-7
 
 
+@pytest.mark.slow
 def test_few_numbers_of_several_scenes(problem):
     """Shear and bulk modulus of a uniform block: within four standard errors, which shrink with the noise."""
     scene = problem.scenes[0]

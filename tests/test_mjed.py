@@ -13,8 +13,13 @@ from liverjax.kinematics import deformation_gradient
 LAWS = list(lj.laws.LAWS)
 
 
-#: One of the stretch-based laws stands for all: they differ in scalars that tests/test_laws.py checks.
-@pytest.mark.parametrize("name", [n for n in LAWS if n not in ("ogden", "logarithmic", "exponential")])
+#: One law of every kind by default; the others differ in scalars that tests/test_laws.py checks, all but the
+#: stretch-based ones (of which one stands for all) run with -m slow.
+KINDS = ("neo_hookean", "mooney_rivlin", "saint_venant_kirchhoff", "costa")
+OTHERS = [n for n in LAWS if n not in (*KINDS, "ogden", "logarithmic", "exponential")]
+
+
+@pytest.mark.parametrize("name", [*KINDS, *(pytest.param(n, marks=pytest.mark.slow) for n in OTHERS)])
 def test_force_and_stiffness_against_both_references(name, distorted_box):
     mesh, x = distorted_box
     law = lj.laws.typical(name)

@@ -34,6 +34,7 @@ def test_creep_is_that_of_the_standard_linear_solid(verified):
     assert errors[0] < 1e-3 and errors[0] / errors[1] > 3, errors
 
 
+@pytest.mark.slow
 def test_tension_relaxes_as_the_law_says(verified):
     """Held at a small strain, the force falls to 1 - g (1 - q exp(...)): after many relaxation times to 1 - g."""
     strains = np.full(40, 1e-4)
@@ -113,6 +114,7 @@ def test_two_tests_know_more_than_one():
         joint.through("creep", rig, noisy[:5], sd)
 
 
+@pytest.mark.slow
 def test_a_free_height_serves_as_a_test():
     """The torsion rig whose plate may rise: at small strain the moduli are those of the fixed one."""
     model = prony.Maxwell(jnp.asarray(800.0), jnp.array([0.4]), jnp.array([0.5]))

@@ -77,6 +77,7 @@ def test_lanes_go_one_after_another_on_a_cpu_only():
     assert strategy_for("cpu") == "map" and strategy_for("cuda") == "vmap"
 
 
+@pytest.mark.slow
 def test_gradient_of_a_batch_mean(files):
     scene = lj.with_parameters(lj.load_scene(files / "scene.toml"), {"solve.tolerance": 1e-11})
 
