@@ -7,6 +7,7 @@ modulus by more than a thousand, or whose worst element is a sliver, and where n
 import jax
 import numpy as np
 
+from liverjax.errors import InputError
 from liverjax.scene import Scene
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
@@ -18,14 +19,16 @@ def linear_solver(scene: Scene) -> str:
     small = mesh.number_of_elements <= LARGEST
     if solve.kind != "static" or not small or any(load.pressure is not None for load in scene.traction):
         return "cg"
-    law = scene.law
-    shear = law.shear_modulus()
-    bulk = law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
+    try:
+        shear = scene.law.shear_modulus()
+        bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
+    except InputError:  # a law need not state its moduli: how stiff it is in bulk is then not known
+        shear, bulk = 1.0, 0.0
     numbers = (shear, bulk, mesh.points, mesh.volumes)
     if any(isinstance(a, jax.core.Tracer) for a in numbers):
         return "cg"
     shear, bulk, points, volumes = (np.asarray(a, float) for a in numbers)
-    stiff = np.max(bulk / shear) > STIFFEST
+    stiff = bool(np.any(bulk > STIFFEST * shear))
     return "direct" if stiff or thinnest(points, np.asarray(mesh.tetrahedra), volumes) < THINNEST else "cg"
 
 

@@ -342,11 +342,11 @@ def simulate(
             by `check_scene`, which reading a scene file calls.
     """
     check_choices(scene)
-    if scene.solve.linear_solver == "auto":
-        scene = replace(scene, solve=replace(scene.solve, linear_solver=choice.linear_solver(scene)))
     if scene.region:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
         scene = replace(scene, law=per_element, region=())
+    if scene.solve.linear_solver == "auto":
+        scene = replace(scene, solve=replace(scene.solve, linear_solver=choice.linear_solver(scene)))
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif not jax.config.jax_enable_x64:

@@ -74,6 +74,18 @@ def test_auto_decides_by_size_and_stiffness():
     jax.eval_shape(lambda s: seen.append(choice.linear_solver(s)), stiff)
     assert seen == ["cg"]  # traced numbers are not known
 
+    @lj.struct
+    class Bare(lj.Law):
+        mu: float = lj.param("Pa")
+        invariants = ("I1", "J")
+
+        def strain_energy(self, I):
+            return self.mu / 2 * (I.I1 - 3 - 2 * jnp.log(I.J)) + self.mu * (I.J - 1) ** 2
+
+    # A law need not state its moduli.
+    assert choice.linear_solver(replace(static, law=Bare(mu=770.0))) == "cg"
+    lj.simulate(replace(PULLED, law=Bare(mu=770.0))).check()
+
 
 def test_a_matrix_without_an_inverse_is_told():
     loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # nothing holds it
