@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from liverjax import chapter_terms, green_terms, mjed, stretch_terms
+from liverjax import chapter_terms, green_terms, mjed, stretch_terms, terms
 from liverjax.axes_terms import SIX, six_of, symmetric
 from liverjax.kinematics import (
     Matrix,
@@ -21,6 +21,7 @@ from liverjax.kinematics import (
     matvec,
     right_cauchy_green,
     scale_matrix,
+    stored,
     transpose,
 )
 from liverjax.mesh import TetMesh
@@ -41,8 +42,10 @@ def _entries(mesh: TetMesh, blocks: list) -> list:
 
 def contracted(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
     """The way of `liverjax`: all terms of the energy at once."""
-    K = mjed.element_stiffness(mesh, law, x)
-    return mjed.internal_force(mesh, law, x), [K[a + 1, b + 1][r][c] for k, r, c in ENTRIES for a, b in [PAIRS[k]]]
+    F = stored(deformation_gradient(mesh, x))
+    shared = terms.state(law, F)
+    force = mjed.nodal_force(mesh, terms.piola(F, shared.cof, terms.stress(shared)))
+    return force, _entries(mesh, terms.blocks(shared, _shape_vectors(mesh), PAIRS))
 
 
 def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None) -> tuple:

@@ -15,7 +15,7 @@ from fitting.scenes import Problem
 from liverjax import gradients, status
 from liverjax.errors import InputError
 from liverjax.folders import writable
-from liverjax.scene import load_scene
+from liverjax.scene_file import load_scene
 
 
 def parser() -> argparse.ArgumentParser:

@@ -24,7 +24,9 @@ from liverjax.laws import Law
 from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
 from liverjax.porosity import Porosity
 from liverjax.regions import Region
-from liverjax.scene import Body, Scene, Solve, check_scene, load_scene, with_parameters
+from liverjax.scene import Body, Scene, Solve, with_parameters
+from liverjax.scene_checks import check_scene
+from liverjax.scene_file import load_scene
 from liverjax.simulation import Result, simulate
 from liverjax.struct import param, static, struct
 from liverjax.viscosity import Prony

@@ -79,11 +79,11 @@ def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
     import numpy as np
     from tqdm import tqdm
 
-    from liverjax import output, porosity, scene, status
+    from liverjax import output, porosity, scene_file, status
     from liverjax.simulation import simulate
     from liverjax.versions import versions
 
-    read = scene.load_scene(file)
+    read = scene_file.load_scene(file)
     target = _target(out, "result.h5")
     bar = tqdm(total=read.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
     begin = time.perf_counter()

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from liverjax.kinematics import cofactor, dot
+from liverjax.kinematics import cofactor, dot, stored
 from liverjax.mesh import TetMesh
 from liverjax.pattern import PAIRS, Pattern
 
@@ -33,7 +33,8 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     """
     pattern: Pattern = mesh.pattern
     m = len(blocks[PAIRS[0]])
-    blocks = _written_out(blocks)
+    # Without that XLA:CPU computes every entry again in each of its scatters.
+    blocks = stored(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
     edge: list[list[Any]] = [[None] * m for _ in range(m)]
@@ -53,12 +54,6 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
         tuple(gathered[r][c] if r == c else jnp.where(upward, gathered[r][c], gathered[c][r]) for c in range(m))
         for r in range(m)
     )
-
-
-def _written_out(blocks: dict) -> dict:
-    """The same: a branch keeps XLA:CPU from computing every entry again in each of its scatters."""
-    always = jax.tree.leaves(blocks)[0].ravel()[0] != -jnp.inf  # not known when compiling
-    return jax.lax.cond(always, lambda b: b, lambda b: jax.tree.map(jnp.zeros_like, b), blocks)
 
 
 def row_sums(rows: Block) -> Block:

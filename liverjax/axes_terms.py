@@ -5,7 +5,7 @@ With f_m = F a_m and D' = A^T D the material part of the stiffness of two nodes 
 
 from typing import Any
 
-from liverjax.kinematics import Matrix, Vector, dot, matmul, transpose
+from liverjax.kinematics import Matrix, Vector, dot, matmul, stored, transpose
 
 #: Pairs of different axes, and where the six components of a symmetric matrix stand.
 PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -68,4 +68,4 @@ def _is_zero(c: Any) -> bool:
 
 def pushed(FA: Matrix, kappa: Matrix) -> Matrix:
     """sum_mn kappa_mn f_m (x) f_n."""
-    return matmul(matmul(FA, kappa), transpose(FA))
+    return matmul(stored(matmul(FA, kappa)), transpose(FA))

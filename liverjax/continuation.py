@@ -117,6 +117,8 @@ class Method(NamedTuple):
     tangled: Callable[[jax.Array, Any], jax.Array] | None = None
     #: The same of a body whose energy is finite where elements are inverted; None where it is already.
     surrogate: Any = None
+    #: Where the loads are followed from if the start is a guess, and whether it is; None where a start is a state.
+    rest: tuple[jax.Array, jax.Array] | None = None
 
 
 def nothing_kept(method: Method, start: jax.Array) -> Kept:
@@ -153,7 +155,8 @@ def solve(
             return _one_iteration(method, start, kept, options)
         if method.energy is not None:
             return _robust(method, start, guess, kept, options)
-        return _follow(method, start, guess, kept, options)
+        guessing = jnp.array(guess is not None)
+        return _follow(method, start, start if guess is None else guess, guessing, kept, options)
 
     # Two rules: how the root was found has no derivative, and the root's own is by the tangent there.
     q, aux = jax.lax.custom_root(at_end, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
@@ -187,8 +190,10 @@ def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOp
     return q, (StepStatistics(a, b, c, d, relative), kept)
 
 
-def _follow(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
-    begin = _first_point(start, guess, kept)
+def _follow(
+    method: Method, start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: Kept, options: StepOptions
+) -> tuple[jax.Array, Any]:
+    begin = _first_point(start, guess, guessing, kept)
     end = jax.lax.while_loop(lambda c: ~c.done, partial(_iterate, method, options, start), begin)
     stopped = jnp.where(end.cuts > options.max_cuts, status.STEP_CUT, status.STALLED)
     failure = jnp.where(end.indefinite, status.INDEFINITE, stopped)
@@ -199,15 +204,24 @@ def _follow(method: Method, start: jax.Array, guess: Any, kept: Kept, options: S
 
 
 def _robust(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
-    """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least."""
+    """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least.
+
+    At rest a start is but a guess: where it leads nowhere, the load is followed from the reference shape.
+    """
     zero = jnp.zeros((), start.dtype)
     assert method.tangled is not None
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
-    begin = start if guess is None else jnp.where(method.tangled(guess, zero + 1), start, guess)
+    guessing = jnp.array(guess is not None)
+    if method.rest is not None:
+        shape, guessing = method.rest
+        guess, start = start, jnp.where(guessing, shape, start)
+    guess = start if guess is None else guess
+    guessing = guessing & ~method.tangled(guess, zero + 1)
+    begin = start if method.rest is not None else jnp.where(guessing, guess, start)
     q, (taken, kept) = jax.lax.cond(
         method.tangled(start, zero),
         lambda: (start, (nothing, kept)),
-        lambda: _follow(method, start, guess, kept, options),
+        lambda: _follow(method, start, guess, guessing, kept, options),
     )
 
     def again():
@@ -222,9 +236,9 @@ def _robust(method: Method, start: jax.Array, guess: Any, kept: Kept, options: S
     return jax.lax.cond(taken.status == status.CONVERGED, lambda: (q, (taken, kept)), again)
 
 
-def _first_point(start: jax.Array, guess: Any, kept: Kept) -> _Point:
+def _first_point(start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: Kept) -> _Point:
     zero, none, one, no = jnp.zeros((), start.dtype), jnp.zeros((), jnp.int32), jnp.ones((), start.dtype), False
-    first = start if guess is None else guess
+    first = jnp.where(guessing, guess, start)
     return _Point(
         q=first,
         size=one * jnp.inf,
@@ -237,7 +251,7 @@ def _first_point(start: jax.Array, guess: Any, kept: Kept) -> _Point:
         t=one,
         s=zero,
         q_begin=first,
-        guessing=jnp.array(guess is not None),
+        guessing=guessing,
         unbalanced=jnp.zeros_like(start),
         s_begin=zero,
         ds=one,

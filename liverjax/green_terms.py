@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.axes_terms import SIX, anisotropic, half_contracted, orthotropic, pushed, rotated, six_of, symmetric
+from liverjax.errors import InputError
 from liverjax.kinematics import (
     IDENTITY,
     Matrix,
@@ -19,6 +20,7 @@ from liverjax.kinematics import (
     matvec,
     outer,
     scale,
+    stored,
     transpose,
     unit,
 )
@@ -35,6 +37,9 @@ class Moduli(NamedTuple):
 def components(direction: Any, like: Any) -> Vector:
     """A direction (3,), or one an element (E, 3), as a unit vector of components in the precision of `like`."""
     direction = jnp.asarray(direction, jnp.result_type(like))
+    shape, elements = direction.shape, jnp.shape(like)
+    if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[:-1] != elements):
+        raise InputError(f"a direction has shape {shape}: give (3,) or one row of 3 an element, {(*elements, 3)}")
     return unit(tuple(direction[..., i] for i in range(3)))
 
 
@@ -61,8 +66,8 @@ def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     if not hasattr(law, "green_derivatives"):
         half = [half_contracted(_autodiff_moduli(law, E), d) for d in turned]
         return [pushed(FA, anisotropic(half[j], turned[i])) for i, j in pairs]
-    S, moduli = law.green_derivatives(E)
-    r = [matvec(FA, matvec(S, d)) for d in turned]
+    S, moduli = stored(law.green_derivatives(E))
+    r = stored([matvec(FA, matvec(S, d)) for d in turned])
     return [
         add_matrices(
             pushed(FA, orthotropic(moduli.normal, moduli.shear, turned[i], turned[j])),

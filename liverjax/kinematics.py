@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.errors import InputError
+
 Vector = tuple[Any, ...]
 Matrix = tuple[Vector, ...]
 
@@ -130,6 +132,16 @@ def pack(A: Matrix) -> jax.Array:
     return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in A], axis=-2)
 
 
+def stored(values: Any) -> Any:
+    """The same pytree, written to memory: a branch keeps XLA:CPU from computing it again for every use.
+
+    Its leaves are one number, or arrays of which the first has numbers.
+    """
+    values = jax.tree.map(jnp.asarray, values)
+    always = max(jax.tree.leaves(values), key=jnp.size).ravel()[0] != -jnp.inf  # not known when compiling
+    return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+
+
 def node_values(x: jax.Array, tetrahedra: jax.Array) -> Matrix:
     """Values (V, 3) at the four nodes of every element."""
     return tuple(tuple(x[:, c][tetrahedra[:, a]] for c in range(3)) for a in range(4))
@@ -141,7 +153,12 @@ def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     Args:
         mesh: `TetMesh`.
         x: current positions (V, 3) [m]. A difference of displacements works as well (the gradient of a field).
+
+    Raises:
+        InputError: x of another shape (an index beyond its end would be the last node's, silently).
     """
+    if jnp.shape(x) != mesh.points.shape:
+        raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 a node, {mesh.points.shape}")
     x0, *others = node_values(x, mesh.tetrahedra)
     edges = [tuple(a - b for a, b in zip(node, x0, strict=True)) for node in others]
     D = mesh.shape_vectors

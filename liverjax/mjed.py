@@ -19,7 +19,7 @@ import scipy.sparse
 
 from liverjax import chapter_terms
 from liverjax.errors import InputError
-from liverjax.kinematics import Matrix, deformation_gradient, dot, transpose
+from liverjax.kinematics import Matrix, deformation_gradient, dot, stored, transpose
 from liverjax.laws.base import Law
 from liverjax.mesh import TetMesh
 from liverjax.terms import blocks, first_piola, state
@@ -68,7 +68,7 @@ def element_stiffness(
     `terms` is "contracted", or "chapter" for its six terms a product (`liverjax.chapter_terms`).
     The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
-    F, pairs = deformation_gradient(mesh, x), tuple((a - 1, b - 1) for a, b in _PAIRS)
+    F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
     D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
     if terms not in ("contracted", "chapter"):
         raise InputError(f"terms = {terms!r} is not known: use contracted or chapter")

@@ -28,7 +28,8 @@ from liverjax.assembly import columns, flat
 from liverjax.continuation import Kept, StepOptions, StepStatistics
 from liverjax.errors import InputError
 from liverjax.kinematics import add_matrices, cofactor, deformation_gradient, determinant, scale_matrix
-from liverjax.scene import Scene, check_choices, element_law
+from liverjax.scene import Scene, element_law
+from liverjax.scene_checks import check_choices
 from liverjax.struct import param, replace, struct
 
 
@@ -212,6 +213,7 @@ def _method(e: Equations) -> continuation.Method:
             "definite": partial(made, solve.robust),
             "tangled": lambda q, s: jnp.any(determinant(deformation_gradient(e.scene.mesh, _positions(e, q, s))) <= 0),
             "surrogate": None if isinstance(e.scene.law, laws.StableNeoHookean) else _method(_finite(e)),
+            "rest": _rest(e) if e.state.velocity is None else None,
         }
     return continuation.Method(
         residual=partial(_residual, e),
@@ -223,6 +225,12 @@ def _method(e: Equations) -> continuation.Method:
         moved=len(e.scene.displaced) > 0 or e.mass is None,
         **robust,
     )
+
+
+def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
+    """The reference shape, and whether the first step begins at another one, which without inertia is a guess."""
+    points = e.scene.mesh.points
+    return flat(e.mask * points), (e.k == 1) & jnp.any(e.mask * (e.state.x - points) != 0)
 
 
 def _finite(e: Equations) -> Equations:
@@ -312,8 +320,8 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     start = initial_state(scene, begin)
     method, q = _method(equations(scene, start, numbers[0], stiff)), flat(start.x)
     kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
-    # Derivatives take their coarse space from the run's beginning: made once. A run without them does not make it.
-    near = method.tangent(q, one, method.residual(q, one)[2], None)
+    # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
+    near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
     x, reactions, P, statistics = checkpointing.scan(advance, (start, kept), numbers, store)
     times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
     code = statistics.status
@@ -331,7 +339,8 @@ def simulate(
     Args:
         scene: `Scene`.
         start: positions (V, 3) [m] to begin at, at rest, with the pressure and memory of the reference; None: the
-            reference positions. Inverted elements need robust = "projected".
+            reference positions. Inverted elements need robust = "projected", which takes the start of a static scene
+            for a guess: where it is inverted or leads nowhere, the load is followed from the reference positions.
         report: called on the host with the number of every finished step, for progress.
         store: of a derivative in reverse mode: "all" keeps what every step ended with; "sqrt", or a number, keeps as
             many states (the root of the number of steps) and runs what lies between a second time. Without a

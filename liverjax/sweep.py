@@ -28,7 +28,8 @@ import numpy as np
 from liverjax import status
 from liverjax.batch import simulate_batch
 from liverjax.errors import InputError
-from liverjax.scene import Scene, changed_content, check_numbers, load_scene, with_parameters
+from liverjax.scene import Scene, with_parameters
+from liverjax.scene_file import changed_content, check_numbers, load_scene
 from liverjax.versions import versions
 
 #: What may be stored of every row, from its result and the reference positions.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from liverjax import assembly, boundary, direct, mjed, nodal_volume, porosity, projection, terms, viscosity
 from liverjax.assembly import BlockMatrix
 from liverjax.coarse import Coarse, coarse, corrected, worthwhile
-from liverjax.kinematics import Matrix, Vector, add_matrices, deformation_gradient, determinant, scale_matrix
+from liverjax.kinematics import Matrix, Vector, add_matrices, deformation_gradient, determinant, scale_matrix, stored
 from liverjax.linear import conjugate_gradients, refined, stabilised_biconjugate_gradients, true_residual
 from liverjax.pattern import PAIRS
 from liverjax.scene import Scene, element_law
@@ -31,7 +31,7 @@ def element_blocks(
 ) -> dict[tuple[int, int], Matrix]:
     """K_ab [N/m] of `PAIRS` of every element: law, memory of the step and sponge at a given pressure."""
     mesh = scene.mesh
-    law = element_law(scene)
+    law, F = element_law(scene), stored(F)
     D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
     if kind != "true":
         K = _definite(scene, memory, pressure, law, F, D, kind)

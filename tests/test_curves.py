@@ -13,6 +13,8 @@ from fitting import curves, stress_stretch
 from fitting.__main__ import main
 from liverjax import homogeneous
 
+pytestmark = pytest.mark.quick_to_compile
+
 DATA = Path(__file__).parent.parent / "data"
 
 

@@ -40,6 +40,7 @@ def directly(scene: lj.Scene) -> lj.Scene:
     return replace(scene, solve=replace(scene.solve, linear_solver="direct"))
 
 
+@pytest.mark.slow
 def test_a_factorisation_finds_the_same():
     one, other = lj.simulate(POROUS).check(), lj.simulate(directly(POROUS)).check()
     assert np.abs(np.asarray(one.positions - other.positions)).max() < 1e-9 * 0.1

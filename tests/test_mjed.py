@@ -10,6 +10,8 @@ import liverjax as lj
 from liverjax import chapter_terms, kinematics, mjed, reference, terms
 from liverjax.kinematics import deformation_gradient
 
+pytestmark = pytest.mark.quick_to_compile
+
 LAWS = list(lj.laws.LAWS)
 
 
@@ -87,6 +89,13 @@ def test_a_law_that_is_no_product_is_refused_in_the_chapters_form(distorted_box)
         mjed.stiffness_matrix(mesh, lj.laws.typical("ogden"), x, terms="chapter")
     with pytest.raises(lj.InputError, match="use contracted or chapter"):
         mjed.stiffness_matrix(mesh, lj.laws.typical("yeoh"), x, terms="six")
+
+
+def test_positions_of_another_shape_are_refused(distorted_box):
+    mesh, x = distorted_box
+    for wrong in (x[1:], x.T):
+        with pytest.raises(lj.InputError, match="positions have shape"):
+            mjed.internal_force(mesh, lj.laws.typical("yeoh"), wrong)
 
 
 #: FEBio's energies (README of its results): lambda = 3080, mu = 770, k = 7700, U = k/2 ln^2 J.

@@ -13,7 +13,7 @@ import liverjax as lj
 from fitting.prony import refuse_impossible
 from fitting.rheometer import read_sweep
 from liverjax import shapes, sweep
-from liverjax.scene import load_scene
+from liverjax.scene_file import load_scene
 
 pytestmark = pytest.mark.quick_to_compile
 

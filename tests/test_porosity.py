@@ -7,7 +7,7 @@ import pytest
 
 import liverjax as lj
 from liverjax import porosity
-from liverjax.scene import scene_from
+from liverjax.scene_file import scene_from
 from liverjax.simulation import initial_state
 from liverjax.struct import replace
 
@@ -90,6 +90,7 @@ def test_the_implicit_scheme_is_stable_at_any_step():
     assert np.isclose(top, at_last, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_the_chapters_scheme_is_not():
     # Nothing flows in a step: the explicit volume change overshoots where K_lim exceeds the sponge's stiffness.
     short = lj.simulate(column(8, 40, 0.004, "chapter"))
@@ -106,6 +107,7 @@ def test_bulk_is_not_counted_twice():
     assert porosity.law_in_force(None, scene.law).bulk == 1.0
 
 
+@pytest.mark.slow
 def test_sealed_and_tight_keeps_all_fluid():
     # Sealed: the pressure's mean follows the mean change of volume, P = -K_lim (J - 1) to first order.
     scene = column(4, 5, 1e-3)

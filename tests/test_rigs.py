@@ -16,6 +16,7 @@ PRONY = lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.5]))
 R, H = 0.01, 0.01
 
 
+@pytest.mark.slow
 def test_creep_is_that_of_the_standard_linear_solid(verified):
     """All stress relaxes alike, so a small strain creeps as 1/(1-g) - g/(1-g) exp(-t (1-g)/tau), averaged over the
     first step, in which the load comes up; at second order."""
@@ -49,6 +50,7 @@ def test_tension_relaxes_as_the_law_says(verified):
     assert E < float(elastic) / (np.pi * R**2 * 1e-4) < M
 
 
+@pytest.mark.slow
 def test_indentation_is_near_that_of_a_half_space():
     """4 G a d / (1 - nu) of a smooth punch on a half-space; glued, and on a block ten times as wide, a little more."""
     rig = rigs.indentation(0.02, 0.02, 0.0025, 1.0, [1e-5], cell_size=0.00125)

@@ -13,7 +13,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
-from liverjax.scene import scene_from
+from liverjax.scene_file import scene_from
 from liverjax.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile

@@ -195,7 +195,7 @@ def test_implicit_euler_only_dissipates():
     assert energies[0] - energies[-1] > 1e-3 * scale
 
 
-@pytest.mark.parametrize("integrator", ["euler", "newmark"])
+@pytest.mark.parametrize("integrator", ["euler", pytest.param("newmark", marks=pytest.mark.slow)])
 def test_momentum_changes_by_the_outer_forces(integrator):
     # Sum of m a = weight + reactions, in every step, whatever happens inside.
     mesh = box()
@@ -224,6 +224,7 @@ def test_momentum_changes_by_the_outer_forces(integrator):
         assert np.abs((m[:, None] * a).sum(axis=0) - outer).max() < 1e-8 * m.sum() * 2.0
 
 
+@pytest.mark.slow
 def test_free_fall_is_exact(verified):
     # A body that nothing holds moves rigidly: no stress, and implicit Euler's own sum of velocities.
     mesh = box()
@@ -241,6 +242,7 @@ def test_free_fall_is_exact(verified):
     assert off < 1e-10
 
 
+@pytest.mark.slow
 def test_long_relaxation_leaves_the_elastic_state_with_less_stress(verified):
     mesh = box()
     parts = dict(mesh=mesh, law=LAW, fixed=(bottom(mesh),), displaced=(top(mesh, by=jnp.array([0.01, 0.0, 0.02])),))
@@ -464,6 +466,7 @@ def test_what_ends_unloaded_has_converged():
     assert int(result.statistics.cuts.sum()) == 0
 
 
+@pytest.mark.slow
 def test_newmark_does_not_swing_where_motion_is_prescribed():
     mesh = box(1)
     scene = lj.Scene(

@@ -134,17 +134,19 @@ def gradients() -> jax.Array:
         ("stress by grad", jax.grad(lambda t, F: ogden(t).energy(F), 1), jax.grad(polynomial, 1), 1e-11),
         ("tangent by jvp", jax.jacfwd(lambda t, F: ogden(t).first_piola(F), 1), jax.hessian(polynomial, 1), 1e-11),
         ("tangent by vjp", jax.jacrev(lambda t, F: ogden(t).first_piola(F), 1), jax.hessian(polynomial, 1), 1e-11),
-        (
+        pytest.param(
             "third derivative",
             jax.jacfwd(lambda t, F: ogden(t).tangent(F), 1),
             jax.jacfwd(jax.hessian(polynomial, 1), 1),
             1e-9,
+            marks=pytest.mark.slow,
         ),
-        (
+        pytest.param(
             "third derivative, forward over reverse",
             jax.jacfwd(jax.jacrev(lambda t, F: ogden(t).first_piola(F), 1), 1),
             jax.jacfwd(jax.hessian(polynomial, 1), 1),
             1e-9,
+            marks=pytest.mark.slow,
         ),
         (
             "stress by parameters",

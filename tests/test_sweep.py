@@ -17,7 +17,7 @@ import liverjax as lj
 from liverjax import design, status, sweep
 from liverjax.__main__ import OUTPUTS, main
 from liverjax.batch import strategy_for
-from liverjax.scene import changed_content
+from liverjax.scene_file import changed_content
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -123,6 +123,7 @@ def test_a_sweep_holds_the_rows_of_single_runs(files):
         assert not (files / "rows.h5.parts").exists()
 
 
+@pytest.mark.slow
 def test_resumed_results_have_the_same_bytes(files):
     assert main(command(files, "--out", str(files / "whole.h5"))) == 0
     table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)

@@ -45,7 +45,10 @@ def _amplitude(rig, by):
     return torsion.torque_for_strain(rig, 500.0, STRAIN) if by == "torque" else STRAIN * rig.height / rig.radius
 
 
-@pytest.mark.parametrize(("scheme", "by"), [("exponential", "torque"), ("chapter", "torque"), ("exponential", "angle")])
+CASES = [pytest.param(*c, marks=pytest.mark.slow) for c in (("chapter", "torque"), ("exponential", "angle"))]
+
+
+@pytest.mark.parametrize(("scheme", "by"), [("exponential", "torque"), *CASES])
 def test_cycle_answers_the_discrete_formula(rig, law, prony, scheme, by, verified):
     prony = replace(prony, scheme=scheme)
     m = torsion.moduli(rig, law, prony, OMEGA, _amplitude(rig, by), Drive(by=by, cycles=3))

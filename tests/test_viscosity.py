@@ -10,6 +10,8 @@ from liverjax import terms, viscosity
 from liverjax.kinematics import unpack
 from liverjax.struct import replace
 
+pytestmark = pytest.mark.quick_to_compile
+
 OMEGA = 2 * np.pi * 4.0
 
 
