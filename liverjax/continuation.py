@@ -22,6 +22,9 @@ from liverjax.minimisation import minimise, untangled
 #: would not help (in float32, 5e-4 of the forces; measured: 1e-4).
 _ROUNDOFF = 4096
 
+#: A guess with elements of less than this part of their volume is not begun with: it may lead to a folded shape.
+_FLAT = 0.1
+
 #: Name of a step's root among what reverse mode may keep: with it nothing of how it was found is computed again.
 ROOT = "root"
 
@@ -113,8 +116,8 @@ class Method(NamedTuple):
     energy: Callable[[jax.Array], jax.Array] | None = None
     #: As `tangent`, of a matrix without negative eigenvalues.
     definite: Callable[[jax.Array, jax.Array, Any, Any], Any] | None = None
-    #: (q, s) -> whether elements are inverted.
-    tangled: Callable[[jax.Array, Any], jax.Array] | None = None
+    #: (q, s) -> the least J of an element: not above 0 where elements are inverted.
+    volume: Callable[[jax.Array, Any], jax.Array] | None = None
     #: The same of a body whose energy is finite where elements are inverted; None where it is already.
     surrogate: Any = None
     #: Where the loads are followed from if the start is a guess, and whether it is; None where a start is a state.
@@ -206,20 +209,22 @@ def _follow(
 def _robust(method: Method, start: jax.Array, guess: Any, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
     """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least.
 
-    At rest a start is but a guess: where it leads nowhere, the load is followed from the reference shape.
+    At rest a start is but a guess: where it is nearly flat or leads nowhere, the load is followed from the reference
+    shape.
     """
     zero = jnp.zeros((), start.dtype)
-    assert method.tangled is not None
+    assert method.volume is not None
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
     guessing = jnp.array(guess is not None)
     if method.rest is not None:
         shape, guessing = method.rest
         guess, start = start, jnp.where(guessing, shape, start)
     guess = start if guess is None else guess
-    guessing = guessing & ~method.tangled(guess, zero + 1)
-    begin = start if method.rest is not None else jnp.where(guessing, guess, start)
+    volume = method.volume(guess, zero + 1)
+    begin = jnp.where(guessing & (volume > 0), guess, start)
+    guessing = guessing & (volume > (0 if method.rest is None else _FLAT))
     q, (taken, kept) = jax.lax.cond(
-        method.tangled(start, zero),
+        method.volume(start, zero) <= 0,
         lambda: (start, (nothing, kept)),
         lambda: _follow(method, start, guess, guessing, kept, options),
     )

@@ -79,7 +79,7 @@ def untangled(method: Any, start: jax.Array, options: Any) -> tuple[jax.Array, j
         least = minimise(method.surrogate, start, options._replace(tolerance=_UNTANGLED))
         return least.q, least.iterations, least.linear_iterations
 
-    return jax.lax.cond(method.tangled(start, jnp.ones((), start.dtype)), away, lambda: (start, zero, zero))
+    return jax.lax.cond(method.volume(start, jnp.ones((), start.dtype)) <= 0, away, lambda: (start, zero, zero))
 
 
 def _evaluated(method: Any, q: jax.Array, definite: Any, patience: Any, indefinite: Any, *counts: Any) -> _Point:

@@ -211,7 +211,7 @@ def _method(e: Equations) -> continuation.Method:
         robust = {
             "energy": partial(_energy, e),
             "definite": partial(made, solve.robust),
-            "tangled": lambda q, s: jnp.any(determinant(deformation_gradient(e.scene.mesh, _positions(e, q, s))) <= 0),
+            "volume": lambda q, s: jnp.min(determinant(deformation_gradient(e.scene.mesh, _positions(e, q, s)))),
             "surrogate": None if isinstance(e.scene.law, laws.StableNeoHookean) else _method(_finite(e)),
             "rest": _rest(e) if e.state.velocity is None else None,
         }
