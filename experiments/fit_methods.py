@@ -48,21 +48,28 @@ def ways(sweep: Sweep, quick: bool) -> list[dict]:
     return rows
 
 
+MARKERS = {"closed form": "D", "torsion, exponential": "o", "torsion, chapter": "s"}
+
+
 def figure(tables: dict[str, list[dict]]) -> plt.Figure:
-    """Error against run time."""
-    fig, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    for (data, rows), colour, marker in zip(tables.items(), (BLUE, ORANGE), "os", strict=True):
-        axes.loglog([r["run_s"] for r in rows], [100 * r["error"] for r in rows], marker, color=colour, label=data)
-        for r in rows:
-            if data == "exact":
-                left = r["name"].startswith("torsion")
-                place = dict(fontsize=7, xytext=(-6 if left else 6, -3), textcoords="offset points")
-                place["ha"] = "right" if left else "left"
-                axes.annotate(r["name"].removeprefix("torsion, "), (r["run_s"], 100 * r["error"]), **place)
+    """Error against run time; beside a point the steps a cycle, or the method."""
+    fig, axes = plt.subplots(figsize=(7.5, 4), layout="constrained")
+    for (data, rows), colour in zip(tables.items(), (BLUE, ORANGE), strict=True):
+        for way, marker in MARKERS.items():
+            mine = [r for r in rows if r["name"].startswith(way)]
+            x, y = [r["run_s"] for r in mine], [100 * r["error"] for r in mine]
+            line = "-" if way != "closed form" else "none"
+            axes.loglog(x, y, marker, ls=line, lw=0.8, color=colour, label=f"{way}, {data}")
+            for r in mine if data == "exact" else ():
+                text = r["name"].removeprefix("closed form, ").split(" recursion, ")[-1].removesuffix(" steps")
+                at = (r["run_s"], 100 * r["error"])
+                place = dict(xytext=(8, -3)) if way == "closed form" else dict(xytext=(-4, -12), ha="center")
+                axes.annotate(text, at, fontsize=8, textcoords="offset points", **place)
     axes.set(xlabel="run time, compilation apart [s]", ylabel="mean error of the parameters [%]")
-    axes.set_title("closed form, and the torsion simulation by recursion and steps a cycle")
+    axes.set_title("a sweep fitted in closed form, and through the torsion simulation (numbers: its steps a cycle)")
+    axes.title.set_fontsize(9)
     plain_ticks(axes.xaxis)
-    axes.legend(title="sweep", loc="center left")
+    axes.legend(fontsize=7, loc="center")
     return fig
 
 
