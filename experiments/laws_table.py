@@ -38,7 +38,7 @@ def error(ours: jax.Array, exact: jax.Array, size: float) -> float:
 def main() -> None:
     """The table and its figure."""
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (15, 15, 15))
-    x = mesh.points + 0.01 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
+    x = mesh.points + 0.004 * jnp.asarray(np.random.default_rng(0).standard_normal(mesh.points.shape))
     F = gradients(2000)
     programs = {"force": mjed.internal_force, "force and stiffness": force_and_stiffness}
     rows, compiled = {}, {}

@@ -22,6 +22,8 @@ from liverjax.linear import conjugate_gradients
 from liverjax.struct import replace
 
 ROUNDS = either(5, 1)
+CELLS, RATIOS, STIFFER = either((15, (10.0, 50.0, 500.0), (1e1, 1e3, 1e5)), (8, (50.0,), (1e1,)))
+STEPS = either(((0.01, 60), (0.05, 40), (0.3, 20)), ((0.05, 10),))  # of which size, and how many
 SIZE = 0.1
 
 
@@ -43,7 +45,7 @@ def finite(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
-def cube(cells: int = 15, bulk: float = 10000.0, **solve: Any) -> lj.Scene:
+def cube(cells: int = CELLS, bulk: float = 10000.0, **solve: Any) -> lj.Scene:
     """Both ends held, the upper one moved by 20 %."""
     mesh = lj.shapes.box((SIZE, SIZE, SIZE), (cells, cells, cells))
     return lj.Scene(
@@ -91,7 +93,7 @@ def liver_steps() -> list[dict]:
     for load, part in (("mild", 0.2), ("full", 1.0)):
         gravity = part * 9.81 / jnp.linalg.norm(base.body.gravity) * base.body.gravity
         heavy = replace(base, body=replace(base.body, gravity=gravity))
-        for dt, steps in ((0.01, 60), (0.05, 40), (0.3, 20)):
+        for dt, steps in STEPS:
             for iterations in (1, 25):
                 scene = with_solve(heavy, dt * steps, dt, newton_iterations=iterations, tolerance=1e-8)
                 scenes[load, dt, iterations] = scene
@@ -125,9 +127,9 @@ def preconditioners() -> list[dict]:
     mask = boundary.free_degrees(base.mesh, base.fixed, ())
     mass = base.body.density * boundary.nodal_volumes(base.mesh)
     b = (mask * jnp.asarray(base.body.gravity)[None] * mass[:, None]).T.ravel()
-    for ratio in (10.0, 50.0, 500.0):
+    for ratio in RATIOS:
         law = replace(base.law, bulk=ratio * float(base.law.shear_modulus()))
-        for dt in (0.01, 0.05, 0.3):
+        for dt, _ in STEPS:
 
             def solved(law, dt, coarse):
                 setting = tangent.Setting(replace(base, law=law), None, None, mass / dt**2, mask)
@@ -147,7 +149,7 @@ def preconditioners() -> list[dict]:
 def factorisation() -> list[dict]:
     """A smaller cube, ever stiffer in volume: conjugate gradients against a factorisation on the host."""
     rows = []
-    for ratio in (1e1, 1e3, 1e5):
+    for ratio in STIFFER:
         results, seconds = medians(
             {n: (lj.simulate, cube(8, 1000.0 * ratio, linear_solver=n, tolerance=1e-7)) for n in ("cg", "direct")}, 3
         )
@@ -179,10 +181,10 @@ def draw(steps: list[dict], ways: list[dict]):
                 text = f"{100 * r['error_of_positions']:.2g} %" if newton == "one" else f"{r['largest_residual']:.0e}"
                 text = f"failed steps: {r['failed_steps']}" if r["failed_steps"] else text
                 left.annotate(text, (r["dt"], r["steps_per_s"]), fontsize=6, xytext=(4, 4), textcoords="offset points")
-    left.plot([0.01, 0.05, 0.3], [100, 20, 1 / 0.3], ":", color=GREY, label="real time")
+    left.plot([dt for dt, _ in STEPS], [1 / dt for dt, _ in STEPS], ":", color=GREY, label="real time")
     left.set(xscale="log", yscale="log", xlabel="time step [s]", ylabel="steps a second")
     left.set_title("beside: error of positions (one), residual (to 1e-8)")
-    for ratio, marker in ((10.0, "o"), (50.0, "s"), (500.0, "^")):
+    for ratio, marker in zip(RATIOS, "os^", strict=False):
         rows = [r for r in ways if r["bulk_over_mu"] == ratio]
         for n, colour in (("block-Jacobi", ORANGE), ("two-level", BLUE)):
             counts = [r[n]["iterations"] for r in rows]
