@@ -115,7 +115,7 @@ def figure(rows: dict) -> plt.Figure:
 
 def main(quick: bool) -> None:
     """Three tables, one figure."""
-    names = ["neo_hookean", "ogden"] if quick else list(lj.laws.LAWS)
+    names = ["neo_hookean", "costa"] if quick else list(lj.laws.LAWS)
     cells = 6 if quick else 15
     rows = {"laws": laws(cells, names), "cube": static(cells), "liver": liver(4 if quick else 40)}
     save("precision", rows, figure(rows))

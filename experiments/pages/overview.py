@@ -231,7 +231,7 @@ def _gradient() -> str:
 def _inverted() -> str:
     (data,) = load("stability_inverted")
     found = [t["projected"] for t in data["laws"].values()]
-    moved = [t["projected, in motion"]["50 % inverted"] for t in data["laws"].values() if len(t) > 3]
+    moved = [t["projected, in motion"]["50 % inverted"] for t in data["laws"].values() if "projected, in motion" in t]
     least = min(r["right"] / r["starts"] for t in found for r in t.values())
     most = {c: max(t[c]["most_iterations"] or 0 for t in found) for c in ("20 % inverted", "50 % inverted")}
     return (
