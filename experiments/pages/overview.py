@@ -233,11 +233,12 @@ def _inverted() -> str:
     found = [t["projected"] for t in data["laws"].values()]
     moved = [t["projected, in motion"]["50 % inverted"] for t in data["laws"].values() if "projected, in motion" in t]
     least = min(r["right"] / r["starts"] for t in found for r in t.values())
+    part = "all" if least == 1 else f"at least {percent(least)} of a law's"
     most = {c: max(t[c]["most_iterations"] or 0 for t in found) for c in ("20 % inverted", "50 % inverted")}
     return (
-        f"at rest at least {percent(least)} of a law's starts return with the projected stiffness, within "
-        f"{most['20 % inverted']} iterations with 20 % inverted and {most['50 % inverted']} with 50 %; in motion, from "
-        f"the start itself, {percent(min(r['right'] / r['starts'] for r in moved))} of those half inverted: the others "
+        f"at rest {part} starts return with the projected stiffness, within {most['20 % inverted']} iterations with "
+        f"20 % inverted and {most['50 % inverted']} with 50 %: inverted ones are left for the reference shape; in motion, "
+        f"from the start itself, {percent(min(r['right'] / r['starts'] for r in moved))} of those half inverted: the others "
         "end folded, in equilibrium"
     )
 
