@@ -237,8 +237,9 @@ def _inverted() -> str:
     most = {c: max(t[c]["most_iterations"] or 0 for t in found) for c in ("20 % inverted", "50 % inverted")}
     return (
         f"at rest {part} starts return with the projected stiffness, within {most['20 % inverted']} iterations with "
-        f"20 % inverted and {most['50 % inverted']} with 50 %: inverted ones are left for the reference shape; in motion, "
-        f"from the start itself, {percent(min(r['right'] / r['starts'] for r in moved))} of those half inverted: the others "
+        f"20 % inverted and {most['50 % inverted']} with 50 %: inverted ones are left for the reference shape; in "
+        f"motion, from the start itself, {percent(min(r['right'] / r['starts'] for r in moved))} of those half "
+        "inverted: the others "
         "end folded, in equilibrium"
     )
 
