@@ -1,7 +1,7 @@
 """Other ways to the same numbers, for comparison: force and the 45 entries of every element's stiffness.
 
-All in the layout of `liverjax.mjed` (the element index last, every scalar written out), except the vmapped Hessian. Only
-the contracted way writes its parts to memory (`liverjax.kinematics.stored`); the others are as they stand in books.
+All in the layout of `liverjax.mjed` (the element index last, every scalar written out), except the vmapped Hessian.
+Only the contracted way writes its parts to memory (`liverjax.kinematics.stored`); the others are as books have them.
 """
 
 from typing import Any
