@@ -1,6 +1,6 @@
 """The chapter's Fig. 4: force and stiffness of a cube of 20,250 tetrahedra, every law, every way.
 
-``python experiments/fig4_assembly.py`` (8 minutes) writes results/fig4_assembly.json and .png: medians of interleaved
+``python experiments/fig4_assembly.py`` (12 minutes) writes results/fig4_assembly.json and .png: medians of interleaved
 rounds of each way, its error against the vmapped Hessian, its compile time, and the floor: the 45 rows written and
 nothing else, and the time to copy as many bytes as the chapter's full matrices have.
 """

@@ -138,7 +138,8 @@ def stored(values: Any) -> Any:
     Its leaves are one number, or arrays of which the first has numbers.
     """
     values = jax.tree.map(jnp.asarray, values)
-    always = max(jax.tree.leaves(values), key=jnp.size).ravel()[0] != -jnp.inf  # not known when compiling
+    number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]
+    always = (number != -jnp.inf) | (number < 0)  # of any number, NaN too; not known when compiling
     return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 

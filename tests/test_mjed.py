@@ -2,13 +2,14 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import liverjax as lj
 from liverjax import chapter_terms, kinematics, mjed, reference, terms
-from liverjax.kinematics import deformation_gradient
+from liverjax.kinematics import deformation_gradient, stored
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -89,6 +90,13 @@ def test_a_law_that_is_no_product_is_refused_in_the_chapters_form(distorted_box)
         mjed.stiffness_matrix(mesh, lj.laws.typical("ogden"), x, terms="chapter")
     with pytest.raises(lj.InputError, match="use contracted or chapter"):
         mjed.stiffness_matrix(mesh, lj.laws.typical("yeoh"), x, terms="six")
+
+
+@pytest.mark.parametrize("value", [-np.inf, np.inf, np.nan, -1.0])
+def test_what_is_stored_is_the_same(value):
+    values = {"a": jnp.array([value, 2.0]), "b": 3.0}
+    same = jax.tree.map(lambda a, b: np.array_equal(a, b, equal_nan=True), values, jax.jit(stored)(values))
+    assert all(same.values())
 
 
 def test_positions_of_another_shape_are_refused(distorted_box):

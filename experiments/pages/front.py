@@ -212,7 +212,7 @@ def extremes() -> str:
     moved = " to ".join(f"{100 * f(r['right'] / r['starts'] for r in half):.0f} %" for f in (min, max))
     over = max(r["time_over_off"] for r in cost["rows"])
     return (
-        f"Of {inverted['seeds']} scrambled starts a law and kind (up to half of the elements inverted, or nearly all "
+        f"Of {inverted['seeds']} scrambled starts a law and kind (up to half of the elements inverted, or pressed "
         f"flat) {least} come back\nto the equilibrium at rest with `projected`, which leaves them for the reference "
         f"shape; in motion it may not, and of starts half inverted\n{moved} come back, the others fold. Where it is "
         "not needed it costs "
