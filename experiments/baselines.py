@@ -15,7 +15,7 @@ from liverjax.pattern import PAIRS
 
 def _mass_and_weight(scene: lj.Scene) -> tuple[jax.Array, jax.Array]:
     mass = (scene.body.density * boundary.nodal_volumes(scene.mesh))[:, None]
-    return mass, mass * jnp.asarray(scene.body.gravity)
+    return mass, mass * jnp.asarray(scene.body.gravity)[None]
 
 
 @jax.jit

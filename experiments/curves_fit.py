@@ -6,19 +6,21 @@ in these data: the chapter's liver curves exist in print only as pictures.
 
 from pathlib import Path
 
-from common import save
+from common import either, save
 
 from fitting import curves, curves_report, stress_stretch
 from fitting.report import numbers
 
 DATA = Path(__file__).parent.parent / "data"
+LAWS = either(("all",), ("neo_hookean", "veronda_westmann"))
 
 
 def main() -> None:
     """Both materials, every law."""
     for name, file in (("brain", "brain_cortex_curves.csv"), ("rubber", "rubber_curves.csv")):
         found, _ = curves.read_curves([DATA / file])
-        fits = curves_report.best_first([stress_stretch.fit(c, found) for c in stress_stretch.candidates("all")])
+        candidates = [candidate for law in LAWS for candidate in stress_stretch.candidates(law)]
+        fits = curves_report.best_first([stress_stretch.fit(candidate, found) for candidate in candidates])
         print(f"{name}\n{curves_report.table(fits)}")
         content = {"laws": [curves_report.summary(f) for f in fits]}
         save(f"curves_{name}", numbers(content), curves_report.figure(found, fits))

@@ -135,18 +135,18 @@ MAZIER = {7675: (-0.1039, 0.1438), 12724: (-0.1067, 0.1415), 23665: (-0.1116, 0.
 def main(quick: bool) -> None:
     """Three tables and a figure."""
     out: dict[str, list] = {"cook": [], "land": [], "cantilever": []}
-    for n in (4, 8, 16) if quick else (4, 8, 16, 32, 64):
+    for n in (4, 8) if quick else (4, 8, 16, 32, 64):
         scene = cook(n)
         x, row = solved(scene)
         out["cook"].append(row | {"cells": n, "rise_mm": cook_rise(scene, x)})
         print("cook", out["cook"][-1], flush=True)
-    for n in (1, 2) if quick else (2, 4, 6, 8, 10):
+    for n in (1,) if quick else (2, 4, 6, 8, 10):
         scene = land(n)
         x, row = solved(scene)
         out["land"].append(row | {"cells": n, "end_mm": land_end(scene, x)})
         print("land", out["land"][-1], flush=True)
     rods = [(cell, "element") for cell in (2.19, 1.86, 1.52, 1.165)] + [(cell, "nodal") for cell in (2.19, 1.86)]
-    for cell, volumetric in [(3.5, "element"), (3.5, "nodal")] if quick else rods:
+    for cell, volumetric in [(3.5, "element")] if quick else rods:
         scene = cantilever(cell, volumetric)
         x, row = solved(scene)
         y = float(np.interp(np.log(row["tetrahedra"]), np.log(list(MAZIER)), [y for y, _ in MAZIER.values()]))

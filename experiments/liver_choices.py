@@ -42,7 +42,7 @@ def fine_run(scene, dt):
 
 def time_steps(scene) -> Table:
     """Viscous: implicit Euler and Newmark, and the chapter's recursion."""
-    table = Table(scene, fine_run(scene, 0.0025))
+    table = Table(scene, fine_run(scene, either(0.0025, 0.01)))
     chapter = replace(scene, viscosity=replace(scene.viscosity, scheme="chapter"))
     for dt in either((0.3, 0.15, 0.05, 0.02, 0.01), (0.05,)):
         table.add("implicit Euler", with_solve(scene, SECONDS, dt))
@@ -64,7 +64,7 @@ def newton(scene) -> Table:
 
 def porous(scene) -> Table:
     """Complete: the implicit pressure and the chapter's."""
-    table = Table(scene, fine_run(scene, 0.005))
+    table = Table(scene, fine_run(scene, either(0.005, 0.02)))
     chapter = replace(scene, porosity=replace(scene.porosity, scheme="chapter"))
     for dt in either((0.15, 0.05, 0.02), (0.05,)):
         table.add("implicit", with_solve(scene, SECONDS, dt))

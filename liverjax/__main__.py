@@ -70,45 +70,47 @@ def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
     return 0
 
 
-def run_scene(file: Path, out: Path, vtu: bool, png: bool) -> int:
+def run_scene(options: argparse.Namespace) -> int:
     """Simulate a scene file and write its results; 1 if a step failed, with what was computed kept."""
-    import time
-    from functools import partial
-
-    import jax
     import numpy as np
     from tqdm import tqdm
 
-    from liverjax import output, porosity, scene_file, status
-    from liverjax.simulation import simulate
+    from liverjax import long_run, output, parts, porosity, scene_file, status
     from liverjax.versions import versions
 
-    read = scene_file.load_scene(file)
+    file, out = options.scene, options.out
+    read, text = scene_file.load_scene(file), file.read_text(encoding="utf-8")
     target = _target(out, "result.h5")
     bar = tqdm(total=read.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
-    begin = time.perf_counter()
-    program = jax.jit(partial(simulate, report=None if bar.disable else lambda _: bar.update())).lower(read).compile()
-    compiled = time.perf_counter()
-    result = jax.block_until_ready(program(read))
-    bar.close()
-    run_time, compile_time = time.perf_counter() - compiled, compiled - begin
-    codes = np.asarray(result.status)
-    attributes = {"scene": file.read_text(encoding="utf-8"), "run_time_s": run_time, "compile_time_s": compile_time}
+    report = None if bar.disable else lambda _: bar.update()
+    try:
+        ran = long_run.run(read, text, target, options.every, options.resume, report)
+    except OSError as error:
+        print(f"stopped: {target}: {error.strerror}; go on with --resume when there is space", file=sys.stderr)
+        return 1
+    finally:
+        bar.close()
+    result, codes = ran.result, np.asarray(ran.result.status)
+    attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
     if read.porosity is not None:
         attributes["bulk"] = porosity.bulk_in_force(read.porosity, read.law)
         print(attributes["bulk"])
     output.write_hdf5(target, read, result, attributes | {"versions": versions()})
+    if parts.beside(target).exists():
+        parts.remove(parts.beside(target))
     s = result.statistics
     print(
         f"{read.mesh.number_of_nodes} nodes, {read.mesh.number_of_elements} tetrahedra, {len(codes)} steps: "
         f"{int(np.sum(s.iterations))} Newton and {int(np.sum(s.linear_iterations))} linear iterations, "
         f"largest residual {float(np.max(np.asarray(s.residual))):.1e} of the forces\n"
-        f"run {run_time:.3g} s ({len(codes) / run_time:.3g} steps a second), compile {compile_time:.3g} s"
+        + (f"run {ran.run_time:.3g} s ({ran.steps / ran.run_time:.3g} steps a second), " if ran.steps else "")
+        + f"compile {ran.compile_time:.3g} s"
+        + (f"; {len(codes) - ran.steps} steps found on disk" if ran.steps < len(codes) else "")
     )
     written = [str(target)]
-    if vtu:
+    if options.vtu:
         written.append(str(output.write_vtu(out / "vtu", read, result)))
-    if png:
+    if options.png:
         output.picture(out / "result.png", read, result)
         written.append(str(out / "result.png"))
     print(f"written: {', '.join(written)}")
@@ -222,6 +224,8 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("scene", type=Path, metavar="SCENE.toml")
     simulate.add_argument("--vtu", action="store_true", help="write a ParaView series as well")
     simulate.add_argument("--png", action="store_true", help="draw the last state as well")
+    simulate.add_argument("--every", type=int, default=50, metavar="N", help="steps between two writes (50)")
+    simulate.add_argument("--resume", action="store_true", help="go on where a run was stopped")
     sweep = commands.add_parser("sweep", help="run a scene for every row of a table", description=_SWEEP)
     sweep.add_argument("scene", type=Path, metavar="SCENE.toml")
     sweep.add_argument(
@@ -267,7 +271,7 @@ def _run(options: argparse.Namespace) -> int:
         if options.command == "check":
             return check_law(options.law, options.out)
         if options.command == "simulate":
-            return run_scene(options.scene, options.out, options.vtu, options.png)
+            return run_scene(options)
         if options.command == "sweep":
             return run_sweep(options)
         if options.command == "design":

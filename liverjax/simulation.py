@@ -293,10 +293,8 @@ def _motion(e: Equations, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return velocity, acceleration
 
 
-@partial(jax.jit, static_argnames=("report", "store"))
-def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None, store: Any) -> Result:
-    steps, dtype = scene.solve.steps, scene.mesh.points.dtype
-    stiff = unit_strain_force(scene)
+def _step_by_step(scene: Scene, stiff: jax.Array, report: Callable[[int], None] | None, near: Any) -> Callable:
+    """(state and tangent, k) -> those after step k, and what `_result` takes."""
 
     def physics(carry, k):
         state, kept = carry
@@ -316,16 +314,43 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
             jax.debug.callback(report, k)
         return new
 
+    return advance
+
+
+def _result(scene: Scene, numbers: jax.Array, out: Any) -> Result:
+    x, reactions, P, statistics = out
+    times, code = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt), statistics.status
+    return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
+
+
+@partial(jax.jit, static_argnames=("report", "store"))
+def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None, store: Any) -> Result:
+    steps, dtype = scene.solve.steps, scene.mesh.points.dtype
+    stiff = unit_strain_force(scene)
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     method, q = _method(equations(scene, start, numbers[0], stiff)), flat(start.x)
     kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
     # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
     near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
-    x, reactions, P, statistics = checkpointing.scan(advance, (start, kept), numbers, store)
-    times = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt)
-    code = statistics.status
-    return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
+    advance = _step_by_step(scene, stiff, report, near)
+    return _result(scene, numbers, checkpointing.scan(advance, (start, kept), numbers, store))
+
+
+@partial(jax.jit, static_argnames="report")
+def _run_part(
+    scene: Scene, state: State, numbers: jax.Array, report: Callable[[int], None] | None
+) -> tuple[Result, State]:
+    stiff = unit_strain_force(scene)
+    kept = continuation.nothing_kept(_method(equations(scene, state, numbers[0], stiff)), flat(state.x))
+    advance = _step_by_step(scene, stiff, report, None)
+
+    def unless_over(carry, k):
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(advance, carry, k)[1])
+        return jax.lax.cond(k <= scene.solve.steps, advance, lambda carry, _: (carry, nothing), carry, k)
+
+    (state, _), out = jax.lax.scan(unless_over, (state, kept), numbers)
+    return _result(scene, numbers, out), state
 
 
 def simulate(
@@ -350,6 +375,48 @@ def simulate(
         InputError: choices that mean nothing; precision "float64" where JAX's 64-bit mode is off. Numbers are checked
             by `check_scene`, which reading a scene file calls.
     """
+    scene = prepared(scene)
+    if start is not None:
+        start = jnp.asarray(start, scene.mesh.points.dtype)
+        if start.shape != scene.mesh.points.shape:
+            raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
+    return _run(scene, start, report, checkpointing.number_kept(store, scene.solve.steps))
+
+
+def simulate_part(
+    scene: Scene,
+    state: State,
+    first: Any,
+    count: int,
+    report: Callable[[int], None] | None = None,
+) -> tuple[Result, State]:
+    """Some steps of a run, and the state to go on from, so that a long run can be kept in parts. Not differentiable.
+
+    Args:
+        scene: `Scene`.
+        state: what the steps before left; `initial_state(prepared(scene))` at the beginning.
+        first: number of the first step, from 1; may be traced.
+        count: how many steps. Those beyond the last of the scene are skipped; their rows are zeros.
+        report: as of `simulate`.
+
+    A part begins with a tangent of its own, so that going on from a state that was stored changes no bit.
+
+    Raises:
+        InputError: as `simulate`.
+    """
+    scene = prepared(scene)
+    numbers = first + jnp.arange(count, dtype=scene.mesh.points.dtype)
+    return _run_part(scene, state, numbers, report)
+
+
+def prepared(scene: Scene) -> Scene:
+    """The scene as it is run: numbers by element, a linear solver chosen, in its precision. Runs do it themselves.
+
+    Inside `jax.jit` numbers are not known, and `linear_solver = "auto"` iterates: call this before, to let it choose.
+
+    Raises:
+        InputError: as `simulate`.
+    """
     check_choices(scene)
     if scene.region:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
@@ -360,11 +427,7 @@ def simulate(
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif not jax.config.jax_enable_x64:
         raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
-    if start is not None:
-        start = jnp.asarray(start, scene.mesh.points.dtype)
-        if start.shape != scene.mesh.points.shape:
-            raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
-    return _run(scene, start, report, checkpointing.number_kept(store, scene.solve.steps))
+    return scene
 
 
 def _cast(value: Any, dtype: Any) -> Any:

@@ -7,15 +7,11 @@ Several processes may work on one sweep: each takes every n-th chunk, and the la
 
 import csv
 import errno
-import fcntl
-import hashlib
-import io
 import json
 import os
 import shutil
 import tomllib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import status
+from liverjax import parts, status
 from liverjax.batch import simulate_batch
 from liverjax.errors import InputError
 from liverjax.scene import Scene, with_parameters
@@ -108,21 +104,14 @@ def read_sweep(
     chunk = min(chunk, len(numbers))
     identity = {
         "scene": scene_file.read_text(encoding="utf-8"),
-        "mesh": _digest(scene.mesh.points, scene.mesh.tetrahedra),
-        "parameters": _digest(rows) + " " + " ".join(names),
-        "rows": _digest(numbers),
+        "mesh": parts.digest(scene.mesh.points, scene.mesh.tetrahedra),
+        "parameters": parts.digest(rows) + " " + " ".join(names),
+        "rows": parts.digest(numbers),
         "outputs": [*outputs, *(f"probe {p}" for p in probes)],
         "chunk": chunk,
         "versions": versions(),
     }
     return Sweep(scene, names, rows[numbers - 1], numbers, outputs, probes, chunk, identity)
-
-
-def _digest(*arrays: Any) -> str:
-    digest = hashlib.sha256()
-    for a in arrays:
-        digest.update(np.ascontiguousarray(a).tobytes())
-    return digest.hexdigest()
 
 
 def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
@@ -181,22 +170,22 @@ def run(
         InputError: results that are there already, of another sweep, or in use by another process.
         OSError: the disk is full; finished chunks are kept.
     """
-    parts = out.with_name(out.name + ".parts")
+    folder = parts.beside(out)
     if out.exists():
         return _already(sweep, out, resume)
-    if parts.exists() and not resume and process[1] == 1:
-        raise InputError(f"{parts} holds an unfinished sweep: go on with --resume, or remove it")
-    _folder(parts)
-    with _locked(parts / f"lock_{process[0]}"):
-        _same(sweep, parts / "sweep.json")
+    if folder.exists() and not resume and process[1] == 1:
+        raise InputError(f"{folder} holds an unfinished sweep: go on with --resume, or remove it")
+    parts.make_folder(folder)
+    with parts.locked(folder / f"lock_{process[0]}"):
+        parts.same(sweep.identity, folder / "sweep.json")
         program, computed = _program(sweep.outputs, sweep.probes), 0
         for k in list(_chunks(sweep))[process[0] :: process[1]]:
-            file = parts / f"part_{k:06d}.h5"
+            file = parts.part(folder, k)
             if not file.exists():
                 _write_part(file, sweep, k, program)
                 computed += len(_of(sweep, k))
             report(len(_of(sweep, k)))
-    return _joined(sweep, out, parts, computed)
+    return _joined(sweep, out, folder, computed)
 
 
 def _chunks(sweep: Sweep) -> range:
@@ -226,56 +215,7 @@ def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
     filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
     values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
     result = program(sweep.scene, values)
-    # Made in memory: where a disk is full HDF5 takes the process down, a plain write raises OSError.
-    content = io.BytesIO()
-    with h5py.File(content, "w") as part:
-        for name, value in result.items():
-            part[name] = np.asarray(value)[: len(chosen)]
-    temporary = file.with_suffix(f".{os.getpid()}")
-    try:
-        with temporary.open("wb") as out:
-            out.write(content.getbuffer())
-            out.flush()
-            os.fsync(out.fileno())
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    temporary.replace(file)
-
-
-def _folder(parts: Path) -> None:
-    try:
-        parts.mkdir(parents=True, exist_ok=True)
-        probe = parts / f"probe.{os.getpid()}"
-        probe.write_text("")
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"{parts}: {error.strerror}: name an --out that can be written") from None
-
-
-@contextmanager
-def _locked(file: Path) -> Iterator[None]:
-    with file.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InputError(
-                f"{file.parent} is in use by another process: wait for it, or name another --out"
-            ) from None
-        yield
-
-
-def _same(sweep: Sweep, file: Path) -> None:
-    """Record what the sweep is, or refuse to go on with another."""
-    identity = json.loads(json.dumps(sweep.identity))
-    if not file.exists():
-        temporary = file.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps(identity))
-        temporary.replace(file)
-        return
-    for key, value in json.loads(file.read_text()).items():
-        if identity[key] != value:
-            raise InputError(f"{file.parent} is of another sweep (its {key} differ): name another --out, or remove it")
+    parts.write(file, {name: np.asarray(value)[: len(chosen)] for name, value in result.items()})
 
 
 def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
@@ -291,19 +231,17 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
     return Done(out, _failures(sweep, codes), 0)
 
 
-def _joined(sweep: Sweep, out: Path, parts: Path, computed: int) -> Done:
+def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
     """All parts as one file, by whichever process comes last."""
-    files = [parts / f"part_{k:06d}.h5" for k in _chunks(sweep)]
+    files = [parts.part(folder, k) for k in _chunks(sweep)]
     try:
-        with _locked(parts / "lock_join"):
+        with parts.locked(folder / "lock_join"):
             if out.exists() or not all(f.exists() for f in files):
                 return Done(out if out.exists() else None, {}, computed)
             codes = _join(sweep, out, files)
     except (InputError, FileNotFoundError):  # another process joins them at this moment
         return Done(None, {}, computed)
-    for file in parts.iterdir():
-        file.unlink(missing_ok=True)
-    parts.rmdir()
+    parts.remove(folder)
     return Done(out, _failures(sweep, codes), computed)
 
 

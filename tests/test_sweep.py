@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import design, status, sweep
+from liverjax import design, parts, status, sweep
 from liverjax.__main__ import OUTPUTS, main
 from liverjax.batch import strategy_for
 from liverjax.scene_file import changed_content
@@ -194,7 +194,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
     table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
     out = files / "rows.h5"
     sweep.run(table, out, process=(0, 2))
-    with sweep._locked(out.with_name("rows.h5.parts") / "lock_0"):
+    with parts.locked(out.with_name("rows.h5.parts") / "lock_0"):
         assert main(command(files, "--resume")) == 2
     assert "in use by another process" in capsys.readouterr().err
     (files / "rows.csv").write_text(TABLE.replace("700", "701"))

@@ -32,21 +32,24 @@ def _inverted() -> list[str]:
 
 def _steps() -> list[str]:
     (data,) = load("stability_steps")
-    sizes, wanted = sorted({r["dt"] for r in data["rows"]}), data["steps"]
+    sizes, wanted, tolerance = sorted({r["dt"] for r in data["rows"]}), data["steps"], data["tolerance"]
     rows = [
         f"The liver phantom under its full weight, {wanted} steps of each size: steps in equilibrium (residual below",
-        "1e-6), Newton iterations a step, steps a second:",
+        f"{tolerance['float64']:g}, in float32 {tolerance['float32']:g}), Newton iterations a step, steps a second;",
+        "for float32 the largest distance of a node from float64 at the end, over the largest displacement, where all",
+        "steps of both are in equilibrium:",
         "",
-        "| model | robust | " + " | ".join(f"{dt:g} s" for dt in sizes) + " |",
-        "|---" * (2 + len(sizes)) + "|",
+        "| model | robust | precision | " + " | ".join(f"{dt:g} s" for dt in sizes) + " |",
+        "|---" * (3 + len(sizes)) + "|",
     ]
-    for model, robust in dict.fromkeys((r["model"], r["robust"]) for r in data["rows"]):
-        mine = {r["dt"]: r for r in data["rows"] if (r["model"], r["robust"]) == (model, robust)}
-        cells = [
-            f"{mine[dt]['converged']}/{wanted}, {mine[dt]['newton_a_step']:.3g}, {mine[dt]['steps_per_s']:.3g}"
-            for dt in sizes
-        ]
-        rows.append(f"| {model} | {robust} | " + " | ".join(cells) + " |")
+
+    def cell(r: dict) -> str:
+        found = f"{r['converged']}/{wanted}, {r['newton_a_step']:.3g}, {r['steps_per_s']:.3g}"
+        return found if r["precision"] == "float64" or r["error"] is None else f"{found}, {r['error']:.0e}"
+
+    for key in dict.fromkeys((r["model"], r["robust"], r["precision"]) for r in data["rows"]):
+        mine = {r["dt"]: r for r in data["rows"] if (r["model"], r["robust"], r["precision"]) == key}
+        rows.append("| " + " | ".join(key) + " | " + " | ".join(cell(mine[dt]) for dt in sizes) + " |")
     return rows
 
 
@@ -64,11 +67,12 @@ def _cost() -> list[str]:
 
 def _locking() -> list[str]:
     (data,) = load("stability_bulk")
+    kinds = [(v, p) for p in ("float64", "float32") for v in ("element", "nodal")]
     rows = [
-        "Locking, against a finer mesh with averaged volumes (factorised; Newton iterations, run time):",
+        "Locking, against a finer mesh with averaged volumes in float64 (factorised; Newton iterations, run time):",
         "",
-        "| body | cells | K/mu | by element | at the nodes |",
-        "|---|---|---|---|---|",
+        "| body | cells | K/mu | by element | at the nodes | by element, float32 | at the nodes, float32 |",
+        "|---" * 7 + "|",
     ]
 
     def cell(r: dict) -> str:
@@ -78,9 +82,9 @@ def _locking() -> list[str]:
     direct = [r for r in data["rows"] if r["linear_solver"] == "direct"]
     finest = {body: max(r["cells"] for r in direct if r["body"] == body) for body in {r["body"] for r in direct}}
     for body, ratio in dict.fromkeys((r["body"], r["ratio"]) for r in direct):
-        key = (body, ratio, finest[body])
-        pair = {r["volumetric"]: r for r in direct if (r["body"], r["ratio"], r["cells"]) == key}
-        rows.append(f"| {body} | {key[2]} | {ratio:g} | {cell(pair['element'])} | {cell(pair['nodal'])} |")
+        mine = [r for r in direct if (r["body"], r["ratio"], r["cells"]) == (body, ratio, finest[body])]
+        of = {(r["volumetric"], r["precision"]): cell(r) for r in mine}
+        rows.append(f"| {body} | {finest[body]} | {ratio:g} | " + " | ".join(of[kind] for kind in kinds) + " |")
     return rows
 
 

@@ -1,0 +1,59 @@
+"""The solvers that experiments compare with agree with ours where both must: rivals that are wrong prove nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from experiments.baselines import corotational, critical_step, explicit
+
+
+def _bar(gravity: float = 0.05, **solve) -> lj.Scene:
+    """A clamped bar of 72 tetrahedra that begins to hang, its weight small: displacements of 0.1 % of its length."""
+    mesh = lj.shapes.box((0.03, 0.02, 0.02), (3, 2, 2))
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=770.0, bulk=2000.0, volumetric="simo"),
+        body=lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -gravity])),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        solve=lj.Solve(kind="dynamic", tolerance=1e-9, **solve),
+    )
+
+
+def _moved(scene: lj.Scene, x: jax.Array) -> np.ndarray:
+    return np.asarray(x) - np.asarray(scene.mesh.points)
+
+
+def test_explicit_dynamics_agrees_with_newmark():
+    """Both are of second order, so on half the step they come four times as near to each other."""
+    seconds, apart = 0.06, []
+    for steps in (100, 200):
+        dt = seconds / steps
+        scene = _bar(dt=dt, steps=steps, integrator="newmark", newton_iterations=25)
+        ours = _moved(scene, lj.simulate(scene).check().positions[-1])
+        theirs = _moved(scene, explicit(scene, dt, steps, steps)[-1])
+        apart.append(np.abs(ours - theirs).max() / np.abs(ours).max())
+    assert apart[1] < 2e-2
+    assert np.log2(apart[0] / apart[1]) == pytest.approx(2, abs=0.3)
+
+
+def test_explicit_dynamics_is_stable_just_below_its_critical_step():
+    """Ten per cent above it the displacement explodes."""
+    scene = _bar(dt=1.0)
+    limit = float(critical_step(scene))
+    below, above = (_moved(scene, explicit(scene, f * limit, 400, 400)[-1]) for f in (0.95, 1.1))
+    assert np.abs(below).max() < 1e-3
+    assert not np.abs(above).max() < 1.0
+
+
+def test_corotational_agrees_with_implicit_euler_where_strains_are_small():
+    """Both take the same step; what differs is of second order in the strain."""
+    apart = []
+    for gravity in (0.05, 0.1):
+        scene = _bar(gravity, dt=0.02, steps=5)
+        ours = _moved(scene, lj.simulate(scene).check().positions[-1])
+        theirs = _moved(scene, corotational(scene, 0.02, 5)[-1])
+        apart.append(np.abs(ours - theirs).max())
+    assert apart[1] < 2e-2 * np.abs(ours).max()
+    assert np.log2(apart[1] / apart[0]) == pytest.approx(2, abs=0.3)
