@@ -3,7 +3,7 @@
 Cook's membrane (plane strain, mean rise of the right edge in two load steps) and a column twisted by an eighth of a
 turn in five (torque), against a finer mesh with averaged volumes; by a factorisation, and by conjugate gradients;
 the finest meshes in float32 too.
-``python experiments/stability_bulk.py`` (8 minutes) writes results/stability_bulk.json.
+``python experiments/stability_bulk.py`` (5 minutes) writes results/stability_bulk.json.
 """
 
 import time

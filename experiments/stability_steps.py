@@ -3,7 +3,7 @@
 Twenty steps of each size, hyperelastic, viscous and complete, as the solver follows the load and with
 robust = "projected", which makes the energy least where following fails; a code a step, in words. The same in
 float32, with how far its nodes lie from those of float64 after the last step.
-``python experiments/stability_steps.py`` (9 minutes) writes results/stability_steps.json.
+``python experiments/stability_steps.py`` (14 minutes) writes results/stability_steps.json.
 """
 
 import jax.numpy as jnp

@@ -48,7 +48,7 @@ def _curves_parser() -> argparse.ArgumentParser:
         description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves at once.",
         epilog=EXIT_CODES,
     )
-    parser.add_argument("law", metavar="LAW", help="name of a law, or all")
+    parser.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
     parser.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
     parser.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="of Ogden's law (default 1, 2 and 3)")
     parser.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="Pa", help="of stress columns that name none")

@@ -13,7 +13,7 @@ import scipy.stats
 from fitting.curves import Curve
 from fitting.least_squares import Solution, levenberg_marquardt
 from fitting.uncertainty import spread
-from liverjax import homogeneous, laws
+from liverjax import check, homogeneous, laws
 from liverjax.check import ellipticity
 from liverjax.errors import InputError
 from liverjax.laws import Law
@@ -59,7 +59,7 @@ class LawFit(NamedTuple):
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """The law of that name; Ogden's with 1, 2 and 3 terms unless `terms` says how many; `all` for every one.
+    """The law of that name, or of FILE.py:LAW; Ogden's with 1, 2 and 3 terms unless `terms` says; `all` shipped ones.
 
     Raises:
         InputError: unknown law, or one whose energy is no isochoric one plus U(J).
@@ -69,13 +69,13 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
         return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is bogen
-    cls = laws.find(name)
-    if not incompressible_form(name):
+    typical = check.load(name)
+    if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
         raise InputError(f"law {name} is not an isochoric energy plus U(J), so its curves need more: use {usable}")
-    if cls is laws.Ogden:
+    if isinstance(typical, laws.Ogden):
         return [_ogden(k) for k in ((1, 2, 3) if terms is None else (terms,))]
-    return [_bogen() if cls is laws.Bogen else _single(name)]
+    return [_bogen() if isinstance(typical, laws.Bogen) else _single(name.rpartition(":")[2], typical)]
 
 
 def incompressible_form(name: str) -> bool:
@@ -83,15 +83,13 @@ def incompressible_form(name: str) -> bool:
     return laws.isochoric_part(laws.typical(name)) is not None
 
 
-def _single(name: str) -> Candidate:
-    cls = laws.find(name)
-    fields = [f for f in laws.parameters(cls) if f.name != "bulk" and f.default is not None]
+def _single(label: str, typical: Law) -> Candidate:
+    fields = [f for f in laws.parameters(type(typical)) if f.name != "bulk" and f.default is not None]
     names = tuple(f.name for f in fields)
-    typical = laws.typical(name)
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata["above"] == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    middle = middle / np.where(modulus, float(typical.shear_modulus()), 1.0)
+    middle = middle / np.where(modulus, _shear_modulus(typical), 1.0)
 
     def values(u, scale):
         unit = jnp.where(modulus, scale, 1.0)
@@ -105,9 +103,17 @@ def _single(name: str) -> Candidate:
         return np.where(alpha, _exponents(rng, (n, len(names))), u)
 
     def law(p):
-        return cls(**dict(zip(names, p, strict=True)), bulk=None)
+        return laws.replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
 
-    return Candidate(name, names, tuple("Pa" if m else "1" for m in modulus), values, law, random)
+    return Candidate(label, names, tuple("Pa" if m else "1" for m in modulus), values, law, random)
+
+
+def _shear_modulus(law: Law) -> float:
+    """Of the ground state [Pa]; where a law does not state it, dP12/dF12 there."""
+    try:
+        return float(law.shear_modulus())
+    except InputError:
+        return float(law.tangent(jnp.eye(3))[0, 1, 0, 1])
 
 
 def _exponents(rng: np.random.Generator, shape: tuple) -> np.ndarray:
@@ -214,7 +220,7 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
         standard_errors=errors,
         correlation=(half @ half.T) / np.maximum(np.outer(errors, errors), 1e-300),
         law=law,
-        shear_modulus=float(law.shear_modulus()),
+        shear_modulus=_shear_modulus(law),
         cost=float(costs[best]),
         curve_errors={c.label: float(np.sqrt(np.mean(v**2))) for c, v in zip(curves, split, strict=True)},
         mean_relative_error=float(np.sqrt(np.mean(misfit**2))),

@@ -18,9 +18,9 @@ from liverjax import status
 from liverjax.linear import differentiable_solve
 from liverjax.minimisation import minimise, untangled
 
-#: A step that makes no more progress with a residual below so many times the precision is at roundoff: shorter steps
-#: would not help (in float32, 5e-4 of the forces; measured: 1e-4).
-_ROUNDOFF = 4096
+#: A step that makes no more progress with a residual below so many times the precision (in float32, 5e-4 of the
+#: forces; measured: 1e-4), or so many times what rounding positions does, is at roundoff: shorter steps do not help.
+_PRECISIONS, _ROUNDINGS = 4096, 8
 
 #: A guess with elements of less than this part of their volume is not begun with: it may lead to a folded shape.
 _FLAT = 0.1
@@ -112,6 +112,8 @@ class Method(NamedTuple):
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
+    #: |r| that the digits of q leave.
+    roundoff: Any = 0.0
     #: q -> energy of which r(q, 1) is the gradient; with it a step that cannot be followed is minimised.
     energy: Callable[[jax.Array], jax.Array] | None = None
     #: As `tangent`, of a matrix without negative eigenvalues.
@@ -289,7 +291,9 @@ class _Verdict(NamedTuple):
     done: jax.Array
 
 
-def _judge(c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, options: StepOptions) -> _Verdict:
+def _judge(
+    c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, roundoff: Any, options: StepOptions
+) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
     # The first point of a part need not be better, if its direction was that of a tangent made there.
     free = c.first & (~c.stale | (size < c.aim))
@@ -301,7 +305,8 @@ def _judge(c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, option
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
     spent = (c.iterations >= options.max_iterations) | (halvings > options.max_halvings)
     failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))
-    exhausted = failed & ~c.first & (s >= 1) & (c.relative <= _ROUNDOFF * float(jnp.finfo(size.dtype).eps))
+    small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= _ROUNDINGS * roundoff)
+    exhausted = failed & ~c.first & (s >= 1) & small
     lost = c.guessing & (failed | (c.launch & ~finite)) & ~exhausted
     cuts = c.cuts + (failed & ~lost & ~exhausted)
     launch_now = (c.launch & ~lost) | (converged & ~arrived)
@@ -332,7 +337,7 @@ def _iterate(method: Method, options: StepOptions, start: jax.Array, c: _Point) 
     r = r - (1 - s) * unbalanced
     size = jnp.linalg.norm(r)
     relative = size / jnp.where(force > 0, force, 1.0)
-    v = _judge(c, s, size, relative, options)
+    v = _judge(c, s, size, relative, method.roundoff, options)
     longer = jnp.minimum(2 * c.ds, 1 - s)
     longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
     ds = jnp.where(v.converged, longer, jnp.where(v.failed & ~v.lost, 0.5 * c.ds, c.ds))

@@ -91,12 +91,22 @@ def _loads(scene: Scene) -> jax.Array:
     return force + boundary.nodal_tractions(scene.mesh, scene.traction) if scene.traction else force
 
 
-def unit_strain_force(scene: Scene) -> jax.Array:
-    """Size [N] of the nodal forces of a stretch along x, per unit strain, at rest: roundoff is a part of it."""
+class Sizes(NamedTuple):
+    """Of nodal forces at rest, the same for all steps; without derivatives."""
+
+    unit_strain: jax.Array  # [N] of a stretch along x, per unit strain
+    roundoff: jax.Array  # [N] of positions rounded to their digits
+
+
+def force_sizes(scene: Scene) -> Sizes:
+    """What forces are measured against where loads do not say: roundoff is a part of the first, and is the second."""
     mesh, law = scene.mesh, porosity.law_in_force(scene.porosity, scene.law)
-    along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], mesh.points.dtype)
-    force = jax.jvp(lambda x: mjed.internal_force(mesh, law, x), (mesh.points,), (along,))[1]
-    return jax.lax.stop_gradient(jnp.linalg.norm(force))
+    dtype = mesh.points.dtype
+    along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
+    rounded = 0.5 * float(jnp.finfo(dtype).eps) * jnp.abs(mesh.points)
+    rounded = rounded * jax.random.rademacher(jax.random.key(0), mesh.points.shape, dtype)
+    _, forces = jax.linearize(lambda x: mjed.internal_force(mesh, law, x), mesh.points)
+    return Sizes(*(jax.lax.stop_gradient(jnp.linalg.norm(forces(v))) for v in (along, rounded)))
 
 
 class Equations(NamedTuple):
@@ -108,15 +118,16 @@ class Equations(NamedTuple):
     mask: jax.Array  # (V, 3) 1 where free
     loads: jax.Array  # (V, 3) [N] dead
     noise: Any  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
+    roundoff: jax.Array  # [N] of positions rounded to their digits
     mass: jax.Array | None  # (V,) [kg]
     memory: Any  # `viscosity.Recall`
     flow: porosity.Flow | None  # where a fluid's pressure depends on where the step ends
     pressure: jax.Array | None  # (V,) [Pa] where it does not: solved for once
 
 
-def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> Equations:
-    """The equations of step k = 1 … steps from `state`; `stiff` is `unit_strain_force(scene)`, the same for all."""
-    stiff = unit_strain_force(scene) if stiff is None else stiff
+def equations(scene: Scene, state: State, k: Any, sizes: Sizes | None = None) -> Equations:
+    """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all."""
+    sizes = force_sizes(scene) if sizes is None else sizes
     mesh, sponge, dt = scene.mesh, scene.porosity, scene.solve.dt
     flow = pressure = mass = None
     if state.velocity is not None and scene.body is not None:
@@ -132,7 +143,8 @@ def equations(scene: Scene, state: State, k: Any, stiff: Any | None = None) -> E
         k=k,
         mask=boundary.free_degrees(mesh, scene.fixed, scene.displaced),
         loads=_loads(scene),
-        noise=20 * float(np.finfo(np.float64).eps) / jax.lax.stop_gradient(scene.solve.tolerance) * stiff,
+        noise=20 * float(np.finfo(np.float64).eps) / jax.lax.stop_gradient(scene.solve.tolerance) * sizes.unit_strain,
+        roundoff=sizes.roundoff,
         mass=mass,
         memory=None if scene.viscosity is None else viscosity.recall(scene.viscosity, state.history, dt),
         flow=flow,
@@ -223,6 +235,7 @@ def _method(e: Equations) -> continuation.Method:
         adjoint=None if follows else partial(tangent.adjoint, setting),
         symmetric=not follows,
         moved=len(e.scene.displaced) > 0 or e.mass is None,
+        roundoff=e.roundoff,
         **robust,
     )
 
@@ -293,12 +306,12 @@ def _motion(e: Equations, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return velocity, acceleration
 
 
-def _step_by_step(scene: Scene, stiff: jax.Array, report: Callable[[int], None] | None, near: Any) -> Callable:
+def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any) -> Callable:
     """(state and tangent, k) -> those after step k, and what `_result` takes."""
 
     def physics(carry, k):
         state, kept = carry
-        new, reactions, statistics, kept = step(equations(scene, state, k, stiff), kept, near)
+        new, reactions, statistics, kept = step(equations(scene, state, k, sizes), kept, near)
         # A state that is not finite spoils nothing further: the run stays where it last was.
         finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
         good = finite & (statistics.status != status.NOT_FINITE)
@@ -326,14 +339,14 @@ def _result(scene: Scene, numbers: jax.Array, out: Any) -> Result:
 @partial(jax.jit, static_argnames=("report", "store"))
 def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None, store: Any) -> Result:
     steps, dtype = scene.solve.steps, scene.mesh.points.dtype
-    stiff = unit_strain_force(scene)
+    sizes = force_sizes(scene)
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
-    method, q = _method(equations(scene, start, numbers[0], stiff)), flat(start.x)
+    method, q = _method(equations(scene, start, numbers[0], sizes)), flat(start.x)
     kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
     # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
     near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
-    advance = _step_by_step(scene, stiff, report, near)
+    advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, checkpointing.scan(advance, (start, kept), numbers, store))
 
 
@@ -341,9 +354,9 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
 def _run_part(
     scene: Scene, state: State, numbers: jax.Array, report: Callable[[int], None] | None
 ) -> tuple[Result, State]:
-    stiff = unit_strain_force(scene)
-    kept = continuation.nothing_kept(_method(equations(scene, state, numbers[0], stiff)), flat(state.x))
-    advance = _step_by_step(scene, stiff, report, None)
+    sizes = force_sizes(scene)
+    kept = continuation.nothing_kept(_method(equations(scene, state, numbers[0], sizes)), flat(state.x))
+    advance = _step_by_step(scene, sizes, report, None)
 
     def unless_over(carry, k):
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(advance, carry, k)[1])

@@ -11,7 +11,8 @@ ADJOINT_FAILED = 7
 
 ADVICE = {
     CONVERGED: "converged",
-    STALLED: "the residual stopped falling above the tolerance: take smaller steps or a looser tolerance",
+    STALLED: "the residual stopped falling above the tolerance: take a looser one (in float32 digits may allow no "
+    "less), float64, or smaller steps",
     NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
     "continued_below",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles or collapses): "

@@ -57,6 +57,45 @@ def test_noise_free_curves_give_the_parameters_back(name):
     assert np.isclose(found.shear_modulus, float(KNOWN[name].shear_modulus()), rtol=1e-6)
 
 
+OWN = """
+import jax.numpy as jnp
+import liverjax as lj
+
+@lj.struct
+class Gent(lj.Law):
+    mu: float = lj.param("Pa", typical=770.0)
+    limit: float = lj.param("1", above=0.0, typical=20.0)
+    bulk: float = lj.param("Pa", typical=7700.0)
+    volumetric: str = lj.static("quadratic")
+
+    def isochoric_energy(self, I1, I2):
+        return -self.mu * self.limit / 2 * jnp.log1p(-(I1 - 3) / self.limit)
+
+@lj.struct
+class Blatz(lj.Law):
+    mu: float = lj.param("Pa", typical=770.0)
+    invariants = ("I2", "J")
+
+    def strain_energy(self, I):
+        return self.mu / 2 * (I.I2 / I.J**2 + 2 * I.J - 5)
+"""
+
+
+def test_a_law_of_ones_own_is_fitted_from_its_file(tmp_path, capsys):
+    file = tmp_path / "my_law.py"
+    file.write_text(OWN)
+    (candidate,) = stress_stretch.candidates(f"{file}:Gent")
+    exact = candidate.law(jnp.array([500.0, 3.0]))
+    found = stress_stretch.fit(candidate, synthetic(exact))
+    assert (found.label, found.names, found.units) == ("Gent", ("mu", "limit"), ("Pa", "1"))
+    assert np.allclose(found.values, [500.0, 3.0], rtol=1e-5)
+    assert np.isclose(found.shear_modulus, 500.0, rtol=1e-5)  # not stated: from the tangent at rest
+    assert main(["curves", f"{file}:Blatz", str(DATA / "rubber_curves.csv")]) == 2
+    assert "is not an isochoric energy plus U(J)" in capsys.readouterr().err
+    assert main(["curves", f"{file}:Gnt", str(DATA / "rubber_curves.csv")]) == 2
+    assert "has no Gnt: use Gent or Blatz" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_repeated_fits():
     law = lj.laws.FungDemiray(c1=500.0, c2=2.0, bulk=None)

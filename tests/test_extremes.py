@@ -214,3 +214,22 @@ def test_a_hopeless_step_is_told():
     crushed = lj.Displaced(nodes=UNIT.node_sets["z_max"], by=jnp.array([0.0, 0.0, -1.5]))
     code = int(lj.simulate(replace(scene, displaced=(crushed,))).status[-1])
     assert code in (status.STEP_CUT, status.INDEFINITE, status.NOT_FINITE)
+
+
+def test_more_than_float32_can_give_is_told_with_the_best_it_has():
+    """A tolerance below the digits of small displacements: stalled, as near to float64 as positions are rounded."""
+    mesh = lj.shapes.box((0.06, 0.01, 0.01), (6, 2, 2))
+    right = boundary.boundary_triangles(mesh, mesh.node_sets["x_max"])
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=770.0, bulk=2000.0),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        traction=(lj.Traction(triangles=jnp.asarray(right), value=jnp.array([0.0, 0.01, 0.0])),),
+        solve=lj.Solve(tolerance=1e-6),
+    )
+    exact = np.asarray(lj.simulate(scene).check().positions[-1])
+    single = lj.simulate(replace(scene, solve=replace(scene.solve, precision="float32")))
+    moved = np.abs(exact - np.asarray(mesh.points)).max()
+    assert status.NAMES[int(single.status[-1])] == "stalled"
+    assert moved < 1e-4  # of 0.06 m: float32 resolves 4e-9 m
+    assert np.abs(np.asarray(single.positions[-1], float) - exact).max() < 1e-3 * moved

@@ -246,15 +246,25 @@ def _inverted() -> str:
 
 def _steps() -> str:
     (data,) = load("stability_steps")
-    mine = [r for r in data["rows"] if r["model"] == "complete" and r["robust"] == "projected"]
-    good = sum(r["converged"] == data["steps"] for r in mine)
-    return f"with it the complete model converges at {good} of {len(mine)} step sizes from 1 ms to 10 s"
+
+    def good(precision: str) -> str:
+        kind = ("complete", "projected", precision)
+        mine = [r for r in data["rows"] if (r["model"], r["robust"], r["precision"]) == kind]
+        return f"{sum(r['converged'] == data['steps'] for r in mine)} of {len(mine)}"
+
+    return (
+        f"with it the complete model converges at {good('float64')} step sizes from 1 ms to 10 s, in float32 at "
+        f"{good('float32')}"
+    )
 
 
 def _bulk() -> str:
     (data,) = load("stability_bulk")
-    rows = [r for r in data["rows"] if r["body"] == "Cook's membrane" and r["ratio"] == 1e4 and r["cells"] == 16]
-    off = {r["volumetric"]: abs(r["error"]) for r in rows if r["linear_solver"] == "direct"}
+    key = ("Cook's membrane", 1e4, 16, "direct", "float64")
+    rows = [
+        r for r in data["rows"] if tuple(r[k] for k in ("body", "ratio", "cells", "linear_solver", "precision")) == key
+    ]
+    off = {r["volumetric"]: abs(r["error"]) for r in rows}
     return (
         f"Cook at K/mu = 1e4: by element {percent(off['element'])} off, averaged at the nodes {percent(off['nodal'])}"
     )

@@ -77,7 +77,8 @@ def _locking() -> list[str]:
 
     def cell(r: dict) -> str:
         found = f"{100 * abs(r['error']):.2g} %, {r['newton']} iterations, {r['run_s']:.2g} s"
-        return found if r["code"] == "converged" else r["code"]
+        # Stalled: as near as the digits allow, or nearly.
+        return {"converged": found, "stalled": f"stalled: {found}"}.get(r["code"], r["code"])
 
     direct = [r for r in data["rows"] if r["linear_solver"] == "direct"]
     finest = {body: max(r["cells"] for r in direct if r["body"] == body) for body in {r["body"] for r in direct}}
