@@ -73,7 +73,8 @@ def accept(s: State, r: jax.Array, J: jax.Array, gain: float = GAIN) -> State:
     """Go to the trial if it is better, else raise the damping (Nielsen 1999); propose the next trial."""
     first = s.iterations < 0
     cost, cost_new = 0.5 * s.r @ s.r, 0.5 * r @ r
-    better = cost_new < cost  # false for NaN
+    # False for NaN; without its derivatives a point leads nowhere.
+    better = (cost_new < cost) & jnp.all(jnp.isfinite(J))
     rho = jnp.where(first, 0.5, (cost - cost_new) / jnp.where(s.predicted > 0, s.predicted, 1.0))
     easier = jnp.where(first, s.damping, s.damping * jnp.maximum(1 / 9, 1 - (2 * rho - 1) ** 3))
     damping = jnp.where(better, jnp.maximum(easier, 1e-14), s.damping * s.growth)

@@ -56,6 +56,8 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
         noise: standard deviation of a residual.
         to_natural: derivative of the natural parameters by u.
     """
+    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # nothing is known: a fit that could not begin
+        return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.

@@ -283,6 +283,10 @@ def _run(options: argparse.Namespace) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        resumable = options.command in ("simulate", "sweep")
+        print("stopped" + ("; finished parts are kept: go on with --resume" if resumable else ""), file=sys.stderr)
+        return 130  # as shells do
     except BrokenPipeError:  # the reader of a pipe has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

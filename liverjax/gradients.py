@@ -17,8 +17,9 @@ from liverjax import checkpointing, continuation, status
 from liverjax.assembly import flat
 from liverjax.errors import InputError
 from liverjax.scene import Scene, with_parameters
-from liverjax.simulation import Result, _method, equations, initial_state, simulate
+from liverjax.simulation import Result, simulate
 from liverjax.struct import param, struct
+from liverjax.time_step import equations, initial_state, method_of
 
 MODES = ("reverse", "forward")
 #: The scene's positions at the beginning, beside the dotted names of `with_parameters`.
@@ -96,7 +97,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
 
     def carry(scene):
         start = initial_state(scene)
-        method = _method(equations(scene, start, jnp.ones(()), jnp.ones(())))
+        method = method_of(equations(scene, start, jnp.ones(())))
         return start, continuation.nothing_kept(method, flat(start.x))
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))

@@ -18,7 +18,8 @@ from liverjax import parts
 from liverjax.continuation import StepStatistics
 from liverjax.errors import InputError
 from liverjax.scene import Scene
-from liverjax.simulation import Result, initial_state, prepared, simulate_part
+from liverjax.simulation import Result, prepared, simulate_part
+from liverjax.time_step import initial_state
 from liverjax.versions import versions
 
 _ROWS = ("times", "positions", "reactions", "pressure", "status")
@@ -61,7 +62,7 @@ def run(
     if folder.exists() and not resume:
         raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
     scene = prepared(scene)
-    if steps <= every:
+    if steps <= every and not folder.exists():
         return _run(scene, steps, None, report)
     parts.make_folder(folder)
     with parts.locked(folder / "lock_0"):

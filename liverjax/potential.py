@@ -44,7 +44,7 @@ def motion(mass: jax.Array, acceleration: jax.Array, dt: Any, integrator: str) -
 
 
 def total(e: Any, x: jax.Array, F: Matrix, acceleration: Any) -> jax.Array:
-    """Energy [J] of `liverjax.simulation.Equations` at the end of a step, at positions x (V, 3) [m]."""
+    """Energy [J] of `liverjax.time_step.Equations` at the end of a step, at positions x (V, 3) [m]."""
     scene = e.scene
     energy = jnp.sum(scene.mesh.volumes * strain(scene, e.memory, F)) - jnp.vdot(e.loads, x - scene.mesh.points)
     if scene.porosity is not None:

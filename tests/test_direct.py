@@ -1,5 +1,6 @@
 """Factorisation on the host, numbers that change without a new program, and tangents that go from step to step."""
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 import liverjax as lj
 from liverjax import boundary, choice, direct, simulation, status, tangent
+from liverjax.__main__ import main
 from liverjax.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
@@ -139,3 +141,19 @@ def test_a_tangent_goes_from_step_to_step():
     result.check()
     jax.effects_barrier()
     assert 1 <= len(made) < 5 < int(result.statistics.iterations.sum())
+
+
+def test_the_command_chooses_by_the_numbers_of_the_scene(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        """
+        mesh = {shape = "box", size = [0.01, 0.01, 0.01], cells = [2, 2, 2]}
+        law = {name = "neo_hookean", mu = 770.0, bulk = 2e6}
+        fixed = [{set = "z_min"}]
+        displaced = [{set = "z_max", by = [0, 0, 1e-3]}]
+        """
+    )
+    assert main(["simulate", str(scene), "--out", str(tmp_path)]) == 0
+    with h5py.File(tmp_path / "result.h5") as result:
+        assert result.attrs["iterations"].sum() > 0
+        assert result.attrs["linear_iterations"].sum() == 0

@@ -238,3 +238,19 @@ def test_a_plateau_that_is_measured_is_no_fluid():
 def test_parameters_at_a_bound_claim_no_certainty():
     f = fit.closed_form(sweep(0.02, 4, omega=2 * np.pi * np.linspace(1, 1.01, 10)), 1)
     assert np.all(f.uncertainty.standard_errors > 0) and warned(f, "too short")
+
+
+def test_a_point_without_derivatives_is_not_gone_to():
+    """Cost falls towards u = 2, but beyond u = 1 the derivative is not a number: the fit stays before and finite."""
+
+    @jax.custom_jvp
+    def residuals(u):
+        return u - 2
+
+    residuals.defjvp(lambda p, t: (residuals(*p), jnp.where(p[0] > 1, jnp.nan, 0.5) * t[0]))
+    found = levenberg_marquardt(residuals, jnp.zeros(1))
+    assert float(found.u[0]) <= 1 and np.all(np.isfinite(found.jacobian))
+    lost = levenberg_marquardt(residuals, 1.5 * jnp.ones(1))
+    assert not bool(lost.converged)
+    half, _ = uncertainty.spread(np.full((3, 1), np.nan), 1.0, np.ones((1, 1)))
+    assert np.all(np.isinf(half))

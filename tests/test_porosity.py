@@ -8,8 +8,8 @@ import pytest
 import liverjax as lj
 from liverjax import porosity
 from liverjax.scene_file import scene_from
-from liverjax.simulation import initial_state
 from liverjax.struct import replace
+from liverjax.time_step import initial_state
 
 pytestmark = pytest.mark.quick_to_compile
 

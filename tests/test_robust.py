@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import laws, projection, shapes, simulation, status, terms
+from liverjax import laws, projection, shapes, status, terms, time_step
 from liverjax.assembly import flat
 from liverjax.kinematics import pack, unpack
 from liverjax.scene_file import scene_from
@@ -177,15 +177,15 @@ SCENES = {
 def test_the_residual_is_the_gradient_of_the_energy(scene):
     rng = np.random.default_rng(0)
     shaken = [MESH.points + 0.003 * rng.standard_normal(MESH.points.shape) for _ in range(2)]
-    begin = simulation.initial_state(scene)
+    begin = time_step.initial_state(scene)
     # Any state will do, so no step is made: every leaf a little off rest.
     state = jax.tree.map(lambda a: a + 0.01 * (1 + abs(a)) * rng.standard_normal(a.shape), begin)._replace(x=shaken[0])
 
     @jax.jit
     def both(scene, state, x):
-        e = simulation.equations(scene, state, 2.0)
+        e = time_step.equations(scene, state, 2.0)
         q = flat(e.mask * x)
-        return simulation._residual(e, q, 1.0)[0], jax.grad(lambda q: simulation._energy(e, q))(q)
+        return time_step.residual(e, q, 1.0)[0], jax.grad(lambda q: time_step.energy(e, q))(q)
 
     r, slope = both(scene, state, shaken[1])
     # The porous energy holds an iterative solve to a hundredth of the scene's tolerance.

@@ -11,8 +11,8 @@ import liverjax as lj
 from liverjax import boundary, continuation, mjed, status
 from liverjax.continuation import StepOptions
 from liverjax.linear import conjugate_gradients
-from liverjax.simulation import equations, initial_state, step
 from liverjax.struct import replace
+from liverjax.time_step import equations, initial_state, step
 
 pytestmark = pytest.mark.quick_to_compile
 
