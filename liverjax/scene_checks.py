@@ -1,5 +1,7 @@
 """What is refused of a scene, in one sentence each, before anything is compiled."""
 
+import warnings
+
 import numpy as np
 
 from liverjax import boundary, laws, porosity, regions, viscosity
@@ -86,6 +88,12 @@ def check_scene(scene: Scene) -> None:
     if solve.kind == "dynamic" and scene.body is None:
         raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
     _no_contradiction(scene)
+    if not np.any(np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, ()))):
+        warnings.warn(
+            "fixed holds every node along every axis, so nothing can move: a place like where = {z_min = 0} takes all "
+            "nodes at and above it, {z_max = 0} those at and below",
+            stacklevel=2,
+        )
     if solve.kind == "static":
         _held(scene)
 

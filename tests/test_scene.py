@@ -236,3 +236,15 @@ def test_scenes_made_in_python_are_refused_alike():
     ):
         with pytest.raises(lj.InputError, match=re.escape(sentence)):
             lj.simulate(replace(scene, **change))
+
+
+def test_a_body_that_cannot_move_is_pointed_out():
+    """Holding z >= 0 where the lowest face was meant is the likeliest mistake with `where`."""
+    content = {
+        "mesh": {"shape": "box", "size": [0.01, 0.01, 0.01], "cells": [1, 1, 1]},
+        "law": {"name": "neo_hookean", "mu": 770.0, "bulk": 2200.0},
+        "fixed": [{"where": {"z_min": 0.0}}],
+    }
+    with pytest.warns(UserWarning, match="nothing can move"):
+        scene_from(content)
+    scene_from(content | {"fixed": [{"where": {"z_max": 0.0}}]})
