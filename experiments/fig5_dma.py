@@ -9,8 +9,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from common import plt, save, timed
-from matplotlib.ticker import NullFormatter
+from common import plain_ticks, plt, save, timed
 
 import liverjax as lj
 from fitting import fit, prony, torsion
@@ -129,7 +128,8 @@ def figure(sweep, content) -> plt.Figure:
             steps.annotate(str(r["steps"]), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
     steps.axhline(5, color=GREY, ls=":", label="the chapter's 5 %")
     steps.set(xscale="log", yscale="log", xlabel="run time of 16 frequencies [s]", ylabel="mean error of G', G'' [%]")
-    steps.xaxis.set_minor_formatter(NullFormatter())
+    plain_ticks(steps.xaxis)
+    steps.margins(x=0.08)
     steps.set_title("Time step: error against run time (steps a cycle at the points)")
     steps.legend(fontsize=7)
 
@@ -142,6 +142,8 @@ def figure(sweep, content) -> plt.Figure:
             mesh.annotate(str(r["nodes"]), (x, y), textcoords="offset points", xytext=(4, 4), fontsize=7)
     mesh.axhline(5, color=GREY, ls=":", label="the chapter's 5 %")
     mesh.set(xscale="log", yscale="log", xlabel="run time of 16 frequencies [s]", ylabel="mean error of G', G'' [%]")
+    plain_ticks(mesh.xaxis)
+    mesh.margins(x=0.12)
     mesh.set_title("Mesh: error against run time (nodes at the points)")
     mesh.legend(fontsize=7)
 
