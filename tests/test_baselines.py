@@ -8,6 +8,8 @@ import pytest
 import liverjax as lj
 from experiments.baselines import corotational, critical_step, explicit
 
+pytestmark = pytest.mark.quick_to_compile
+
 
 def _bar(gravity: float = 0.05, **solve) -> lj.Scene:
     """A clamped bar of 72 tetrahedra that begins to hang, its weight small: displacements of 0.1 % of its length."""

@@ -15,6 +15,8 @@ import liverjax as lj
 from liverjax import parts
 from liverjax.__main__ import main
 
+pytestmark = pytest.mark.quick_to_compile
+
 SCENE = """
 [mesh]
 shape = "box"
