@@ -66,8 +66,9 @@ def run(
         return _run(scene, steps, None, report)
     parts.make_folder(folder)
     with parts.locked(folder / "lock_0"):
-        mesh = parts.digest(scene.mesh.points, scene.mesh.tetrahedra)
-        parts.same({"scene": text, "mesh": mesh, "every": every, "versions": versions()}, folder / "run.json")
+        # The text names files, of a mesh or a history, that may change behind it: so all numbers count as well.
+        numbers = parts.digest(*jax.tree.leaves(scene))
+        parts.same({"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json")
         return _run(scene, every, folder, report)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import parts
+from liverjax import parts, scene_file
 from liverjax.__main__ import main
 
 pytestmark = pytest.mark.quick_to_compile
@@ -108,6 +108,12 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
     scene.write_text(SCENE.replace("770.0", "700.0"))
     assert main([*command, "--resume"]) == 2
     assert "of another run (its scene differ)" in capsys.readouterr().err
+    scene.write_text(SCENE)
+    load = scene_file.load_scene
+    with monkeypatch.context() as patch:  # the same text, but a file that it names has changed
+        patch.setattr(scene_file, "load_scene", lambda file: lj.with_parameters(load(file), {"body.density": 1000.0}))
+        assert main([*command, "--resume"]) == 2
+    assert "of another run (its numbers differ)" in capsys.readouterr().err
     assert main(["simulate", str(scene), "--every", "0"]) == 2
     assert "--every 0 must be above 0" in capsys.readouterr().err
 
