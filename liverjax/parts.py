@@ -94,7 +94,7 @@ def same(identity: dict[str, Any], file: Path) -> None:
         temporary.replace(file)
         return
     for key, value in json.loads(file.read_text()).items():
-        if identity[key] != value:
+        if identity.get(key) != value:
             raise InputError(
                 f"{file.parent} is of another {file.stem} (its {key} differ): name another --out, or remove it"
             )

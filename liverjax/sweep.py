@@ -104,7 +104,7 @@ def read_sweep(
     chunk = min(chunk, len(numbers))
     identity = {
         "scene": scene_file.read_text(encoding="utf-8"),
-        "mesh": parts.digest(scene.mesh.points, scene.mesh.tetrahedra),
+        "numbers": parts.digest(*jax.tree.leaves(scene)),
         "parameters": parts.digest(rows) + " " + " ".join(names),
         "rows": parts.digest(numbers),
         "outputs": [*outputs, *(f"probe {p}" for p in probes)],
