@@ -211,12 +211,14 @@ def extremes() -> str:
     ]
     moved = " to ".join(f"{100 * f(r['right'] / r['starts'] for r in half):.0f} %" for f in (min, max))
     over = max(r["time_over_off"] for r in cost["rows"])
+    compiling = [r["compile_s"]["projected"] / r["compile_s"]["off"] for r in cost["rows"]]
     return (
         f"Of {inverted['seeds']} scrambled starts a law and kind (up to half of the elements inverted, or pressed "
         f"flat) {least} come back\nto the equilibrium at rest with `projected`, which leaves them for the reference "
         f"shape; in motion it may not, and of starts half inverted\n{moved} come back, the others fold. Where it is "
         "not needed it costs "
-        f"{100 * max(over - 1, 0):.0f} % of run time at most, and compiling takes three times as long."
+        f"{100 * max(over - 1, 0):.0f} % of run time at most, and compiling takes "
+        f"{min(compiling):.2g} to {max(compiling):.2g} times as long."
     )
 
 
