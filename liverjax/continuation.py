@@ -155,7 +155,15 @@ def solve(
     def at_end(q):
         return method.residual(q, one)[0]
 
+    kind = jax.tree.map(lambda a: a.dtype, kept)
+
     def follow(_, start):
+        root, (statistics, kept) = found(start)
+        # Counts and node numbers leave as floating-point numbers: implicit differentiation gives every output a
+        # tangent, and jax 0.10 refuses those of integers.
+        return root, (statistics, jax.tree.map(lambda a: a.astype(start.dtype), kept))
+
+    def found(start):
         if options.max_iterations == 1:
             return _one_iteration(method, start, kept, options)
         if method.energy is not None:
@@ -166,6 +174,7 @@ def solve(
     # Two rules: how the root was found has no derivative, and the root's own is by the tangent there.
     q, aux = jax.lax.custom_root(at_end, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     statistics, kept = jax.lax.stop_gradient(aux)
+    kept = jax.tree.map(lambda a, dtype: a.astype(dtype), kept, kind)
     q, statistics = checkpoint_name((jax.lax.stop_gradient(q), statistics), ROOT)
 
     def tangent_solve(linear, y):

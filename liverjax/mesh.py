@@ -55,12 +55,13 @@ def tet_mesh(
     """
     if isinstance(tetrahedra, jax.core.Tracer):
         raise InputError("tet_mesh: the node numbers are traced: make the mesh outside jit, grad and vmap")
-    points = jnp.asarray(points, dtype=float)
+    # Copies: asarray may alias the caller's NumPy arrays, and the mesh would change with them.
+    points = jnp.array(points, dtype=float)
     neighbours = pattern(tetrahedra, points)
-    tetrahedra = jnp.asarray(tetrahedra, dtype=jnp.int32)
+    tetrahedra = jnp.array(tetrahedra, dtype=jnp.int32)
     shape_vectors, volumes = _geometry(points, tetrahedra)
     nodes, elements = (
-        {k: jnp.asarray(v, dtype=jnp.int32) for k, v in (sets or {}).items()} for sets in (node_sets, element_sets)
+        {k: jnp.array(v, dtype=jnp.int32) for k, v in (sets or {}).items()} for sets in (node_sets, element_sets)
     )
     return TetMesh(
         points=points,
@@ -75,7 +76,7 @@ def tet_mesh(
 
 def with_points(mesh: TetMesh, points: Any) -> TetMesh:
     """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with."""
-    points = jnp.asarray(points, mesh.points.dtype)
+    points = jnp.array(points, mesh.points.dtype)
     if points.shape != mesh.points.shape:
         raise InputError(f"mesh.points has shape {points.shape}: give positions of shape {mesh.points.shape}")
     shape_vectors, volumes = _geometry(points, mesh.tetrahedra)

@@ -96,7 +96,7 @@ def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
     if not path:
         if isinstance(thing, tuple):
             return tuple(value)
-        return jnp.asarray(value, float) if isinstance(thing, jax.Array) else value
+        return jnp.array(value, float) if isinstance(thing, jax.Array) else value
     key, rest = path[0], path[1:]
     if isinstance(thing, dict) and ".".join(path) in thing:
         return thing | {".".join(path): value}

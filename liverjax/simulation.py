@@ -122,7 +122,7 @@ def simulate(
     """
     scene = prepared(scene)
     if start is not None:
-        start = jnp.asarray(start, scene.mesh.points.dtype)
+        start = jnp.array(start, scene.mesh.points.dtype)
         if start.shape != scene.mesh.points.shape:
             raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
     return _run(scene, start, report, checkpointing.number_kept(store, scene.solve.steps))

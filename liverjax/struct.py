@@ -54,9 +54,27 @@ def struct(cls: type[T]) -> type[T]:
     """Make `cls` a frozen, keyword-only dataclass registered as a pytree; `static` fields are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(made)
-    meta = [f.name for f in fields if f.metadata.get("static")]
-    data = [f.name for f in fields if not f.metadata.get("static")]
-    jax.tree_util.register_dataclass(made, data_fields=data, meta_fields=meta)
+    meta = tuple(f.name for f in fields if f.metadata.get("static"))
+    data = tuple(f.name for f in fields if not f.metadata.get("static"))
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
+
+    def flatten(thing: Any) -> tuple[tuple, tuple]:
+        values = thing.__dict__
+        # The class itself is part of the structure. `register_dataclass` of jaxlib 0.10.0 to 0.12.0.1 leaves it out
+        # where structures are compared: a jitted function then may run one law's program on another law's numbers.
+        return tuple(values[name] for name in data), (made, *(values[name] for name in meta))
+
+    def flatten_with_keys(thing: Any) -> tuple[tuple, tuple]:
+        values, structure = flatten(thing)
+        return tuple(zip(keys, values, strict=True)), structure
+
+    def unflatten(structure: tuple, values: Any) -> Any:
+        thing = object.__new__(made)
+        thing.__dict__.update(zip(data, values, strict=True))
+        thing.__dict__.update(zip(meta, structure[1:], strict=True))
+        return thing
+
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     return made
 
 
