@@ -43,9 +43,10 @@ class StepOptions(NamedTuple):
     """How hard to try; all but the tolerance is static."""
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
-    max_iterations: int = 25  # a part; 1: one step of Newton, no convergence asked for, derivatives not those of it
+    max_iterations: int = 25  # a part
+    one_step: bool = False  # one linear solve a step and no more; derivatives are not those of it
     linear_tolerance: float = 5e-2  # of a direction, the loosest
-    one_step_tolerance: float = 1e-4  # of the one direction where there is but one iteration
+    one_step_tolerance: float = 1e-4  # of the one direction where there is but one, the loosest
     contraction: float = 0.15  # of |r| in an iteration; a tangent that does worse is made anew
     wear: float = 1.2  # of the preconditioner: iterations a digit over those when it was new
     adjoint: float = 0.1  # tolerance of the solves that carry derivatives, over `tolerance`
@@ -164,8 +165,8 @@ def solve(
         return root, (statistics, jax.tree.map(lambda a: a.astype(start.dtype), kept))
 
     def found(start):
-        if options.max_iterations == 1:
-            return _one_iteration(method, start, kept, options)
+        if options.one_step:
+            return _one_step(method, start, kept, options)
         if method.energy is not None:
             return _robust(method, start, guess, kept, options)
         guessing = jnp.array(guess is not None)
@@ -189,17 +190,22 @@ def solve(
     return root, StepStatistics(code, iterations, linear, cuts, statistics.residual), kept
 
 
-def _one_iteration(method: Method, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
-    """One linear solve from the step's beginning and no more, whatever comes out."""
+def _one_step(method: Method, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
+    """One linear solve from the step's beginning and no more (chapter, section 4.1.2), by the stiffness asked for."""
+    if method.definite is not None:
+        method = method._replace(tangent=method.definite)
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
     r, _, by = method.residual(start, zero)
     load = -r - _along(method, start, zero) if method.moved else -r
-    at, wanted = (start, zero, by), options.one_step_tolerance
+    at = (start, zero, by)
+    finest = 16 * float(jnp.finfo(start.dtype).eps)
+    wanted = jnp.clip(0.3 * options.tolerance, finest, options.one_step_tolerance)
     dq, linear, kept, _ = _direction(method, options, kept, at, load, wanted, True, True)
     q = start + dq
     r, force, _ = method.residual(q, one)
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
-    code = jnp.where(jnp.isfinite(relative), status.CONVERGED, status.NOT_FINITE)
+    code = jnp.where(relative <= options.tolerance, status.CONVERGED, status.ONE_STEP)
+    code = jnp.where(jnp.isfinite(relative), code, status.NOT_FINITE)
     a, b, c, d = (jnp.asarray(n, start.dtype) for n in (code, one, linear, zero))
     return q, (StepStatistics(a, b, c, d, relative), kept)
 

@@ -34,9 +34,12 @@ class Solve:
     kind: str = static(default="static", about="static: no inertia; dynamic")
     steps: int = static(default=1, about="load steps, or time steps of dt")
     tolerance: Any = param("1", "of the residual, relative to the forces at work", default=1e-8)
-    newton_iterations: int = static(
-        default=25, about="of a step; 1 is the chapter's linearly implicit scheme (not for derivatives)"
+    newton: str = static(
+        default="converged",
+        about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "
+        "solve a step (not for derivatives)",
     )
+    newton_iterations: int = static(default=25, about="the most of a step; 1 means newton = one_step")
     integrator: str = static(
         default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
     )

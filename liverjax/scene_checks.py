@@ -12,6 +12,7 @@ from liverjax.scene import Scene
 #: What the choices of [solve] may be.
 CHOICES = {
     "kind": ("static", "dynamic"),
+    "newton": ("converged", "one_step"),
     "integrator": ("euler", "newmark"),
     "precision": ("float64", "float32"),
     "linear_solver": ("auto", "cg", "direct"),

@@ -163,6 +163,8 @@ def prepared(scene: Scene) -> Scene:
         InputError: as `simulate`.
     """
     check_choices(scene)
+    if scene.solve.newton_iterations == 1:
+        scene = replace(scene, solve=replace(scene.solve, newton="one_step"))
     if scene.region:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
         scene = replace(scene, law=per_element, region=())

@@ -8,6 +8,7 @@ INVERTED = 4
 STEP_CUT = 5
 GRADIENT_UNCONVERGED = 6
 ADJOINT_FAILED = 7
+ONE_STEP = 8
 
 ADVICE = {
     CONVERGED: "converged",
@@ -24,6 +25,8 @@ ADVICE = {
     "solution: mend the run first (Result.status)",
     ADJOINT_FAILED: "the linear solves of the derivative did not converge and it is not finite: take "
     "linear_solver = 'direct' or smaller steps",
+    ONE_STEP: "newton = 'one_step' solved once and left the residual above the tolerance: take smaller steps, a looser "
+    "tolerance, or newton = 'converged'",
 }
 
 
@@ -37,6 +40,7 @@ NAMES = {
     STEP_CUT: "step cut",
     GRADIENT_UNCONVERGED: "gradient unconverged",
     ADJOINT_FAILED: "adjoint failed",
+    ONE_STEP: "one step",
 }
 
 

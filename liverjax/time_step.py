@@ -245,10 +245,14 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     `kept` is the tangent of the last step, `near` one whose coarse space will do for derivatives.
     """
     scene, state, solve = e.scene, e.state, e.scene.solve
-    options = StepOptions(tolerance=jax.lax.stop_gradient(solve.tolerance), max_iterations=solve.newton_iterations)
+    options = StepOptions(
+        tolerance=jax.lax.stop_gradient(solve.tolerance),
+        max_iterations=solve.newton_iterations,
+        one_step=solve.newton == "one_step",
+    )
     guess = None
-    if e.mass is not None and not scene.displaced and solve.newton_iterations > 1:
-        # Straight on; one iteration starts at x, as printed.
+    if e.mass is not None and not scene.displaced and not options.one_step:
+        # Straight on; one step of Newton starts at x, as printed.
         guess = flat(e.mask * (state.x + solve.dt * state.velocity))
     q, statistics, kept = continuation.solve(method_of(e), flat(e.mask * state.x), options, guess, kept, near)
     one = jnp.ones((), state.x.dtype)
@@ -262,7 +266,8 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     if scene.viscosity is not None:
         history = viscosity.advance(scene.viscosity, state.history, element_law(scene), F, solve.dt)
     flowed = None if scene.porosity is None else porosity.advance(scene.porosity, state.fluid, fluid, F)
-    inverted = (statistics.status == status.CONVERGED) & jnp.any(determinant(F) <= 0)
+    found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)
+    inverted = found & jnp.any(determinant(F) <= 0)
     statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))
     return State(x, velocity, acceleration, history, flowed), reactions, statistics, kept
 
