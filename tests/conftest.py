@@ -80,8 +80,7 @@ def _compilation(request):
     quick = any(mark.name == "quick_to_compile" for mark in request.node.iter_markers())
     jax.config.update("jax_disable_most_optimizations", quick)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # of commands that tests start
-    # Hundreds of programs in one process: with jax 0.10.1 a stiffness and a force came out wrong there, never in a
-    # process that held few.
+    # Some 430 live programs fill the memory maps that Linux grants a process, and jax 0.10.1 crashes then.
     jax.clear_caches()
 
 
