@@ -73,8 +73,8 @@ def test_ratios_that_leave_almost_nothing():
 
 
 @pytest.mark.parametrize("solver", ["cg", "direct"])
-def test_a_capsule_ten_thousand_times_stiffer(solver):
-    """Moduli an element; in series the stiff layer hardly moves, whatever the other's modulus."""
+def test_a_layer_ten_thousand_times_stiffer(solver):
+    """A block of solid elements, its top quarter stiff, pulled: in series only the soft part stretches."""
     mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 4))
     height = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)[:, 2]
     mu = jnp.asarray(np.where(height > 0.75, 1e7, 1e3))

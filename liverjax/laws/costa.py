@@ -17,8 +17,9 @@ class Costa(Law):
     """W = c/2 (exp Q - 1) + U(J), Q = sum b_AB E_AB^2 over fibre, sheet, normal, shear pairs counted twice.
 
     Q = b_ff E_ff^2 + b_ss E_ss^2 + b_nn E_nn^2 + 2 (b_fs E_fs^2 + b_fn E_fn^2 + b_sn E_sn^2).
-    Chapter, Table 1; Costa, Holmes and McCulloch 2001. E is Green's strain in the axes fibre, sheet (made orthogonal to
-    the fibre) and normal. Not an isochoric energy: it adds to the bulk modulus.
+    Costa, Holmes and McCulloch 2001. The chapter names the law (section 4.1.2 i, for heart muscle) but prints no
+    formula: it is not in Table 1. E is Green's strain in the axes fibre, sheet (made orthogonal to the fibre) and
+    normal. Not an isochoric energy: it adds to the bulk modulus.
     """
 
     c: Any = param("Pa", "scale", above=0.0, typical=200.0)
