@@ -16,7 +16,8 @@ from liverjax import homogeneous, laws, viscosity
 from liverjax.colours import BLUE, COLOURS, GREY, ORANGE
 from liverjax.kinematics import pack, unpack
 
-#: The chapter's Table 1. St Venant-Kirchhoff and Costa (fibres along 1) are no isochoric forms: taken at det F = 1.
+#: The chapter's Table 1, and Costa's law (fibres along 1). It and St Venant-Kirchhoff are no isochoric forms: taken at
+#: det F = 1.
 TABLE_1 = (
     "saint_venant_kirchhoff",
     "neo_hookean",

@@ -1,4 +1,4 @@
-"""Material laws: Table 1 of the chapter, and how to make one by name."""
+"""Material laws: Table 1 of the chapter and three more, and how to make one by name."""
 
 import dataclasses
 import difflib
