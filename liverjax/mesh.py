@@ -1,7 +1,10 @@
 """Meshes of linear tetrahedra: positions, constant shape vectors, node sets; read and written by meshio."""
 
+import contextlib
 import dataclasses
+import io
 import os
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -138,20 +141,12 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     Raises:
         InputError: unreadable file, no or other-than-linear cells, unit unknown, unusable mesh.
     """
-    import meshio
-
     if unit not in UNITS:
         raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
     path = Path(path)
     if not path.is_file():
         raise InputError(f"mesh file {path}: {'is a folder' if path.is_dir() else 'no such file'}; give a mesh file")
-    try:
-        data = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio's readers raise whatever their parser meets, some exit
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(
-            f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh"
-        ) from None
+    data = _read_quietly(path)
     blocks = [block.data for block in data.cells if block.type == "tetra"]
     if not blocks:
         kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
@@ -177,6 +172,37 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
             f"mesh file {path} is {size:.4g} m long: if its numbers are millimetres write unit = 'mm'", stacklevel=2
         )
     return mesh
+
+
+#: What the beginning of a file says that meshio does not read -> what it is, and the remedy.
+_FOREIGN = {
+    r"\$NOD\b": "it is in Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
+    r"DATASET\s+POLYDATA|type=.PolyData": "it holds VTK polygons, a surface; fill the surface with tetrahedra "
+    "(Gmsh, TetGen) and export an unstructured grid",
+}
+
+
+def _read_quietly(path: Path) -> Any:
+    """What meshio reads, without what meshio prints: one sentence of ours says what was found."""
+    import meshio
+
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(1000).decode("latin-1")
+    except OSError as error:
+        raise InputError(f"mesh file {path} cannot be read ({error.strerror}); give a mesh file") from None
+    for mark, sentence in _FOREIGN.items():
+        if re.search(mark, beginning):
+            raise InputError(f"mesh file {path}: {sentence}")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+            return meshio.read(path)
+    except SystemExit:  # meshio's way to say that no reader took the file; their reasons are printed
+        reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
+    except Exception as error:  # meshio's readers raise whatever their parser meets
+        reason = " ".join(str(error).split()) or type(error).__name__
+    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh")
 
 
 #: Cells of surfaces and edges, which a volume mesh may carry beside its own.

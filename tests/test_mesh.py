@@ -106,3 +106,36 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
     with pytest.warns(UserWarning, match="280 m long: if its numbers are millimetres write unit = 'mm'"):
         lj.read_mesh(tmp_path / "large.vtk")
     assert np.isclose(float(lj.read_mesh(tmp_path / "large.vtk", "mm").volumes.sum()), 0.28**3)
+
+
+#: Name of a file -> its text and what the sentence says of it. Gmsh's manual, "MSH file format version 1 (Legacy)".
+FOREIGN = {
+    "old.msh": (
+        "$NOD\n4\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n$ENDNOD\n$ELM\n1\n1 4 1 1 4 1 2 3 4\n$ENDELM\n",
+        r"Gmsh's format of version 1 \(\$NOD, \$ELM\).*open it in Gmsh and save it as version 4",
+    ),
+    "surface.vtk": (
+        "# vtk DataFile Version 3.0\nsurface\nASCII\nDATASET POLYDATA\nPOINTS 3 float\n0 0 0 1 0 0 0 1 0\n"
+        "POLYGONS 1 4\n3 0 1 2\n",
+        "VTK polygons.*fill the surface with tetrahedra",
+    ),
+    "surface.vtp": ('<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1"/>\n', "VTK polygons"),
+    "junk.msh": ("not a mesh\n", r"its content is not what \.msh files hold"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_foreign_files_are_named_and_nothing_else_is_printed(name, tmp_path, capsys):
+    text, sentence = FOREIGN[name]
+    (tmp_path / name).write_text(text)
+    _refused(sentence, lambda: lj.read_mesh(tmp_path / name))
+    printed = capsys.readouterr()
+    assert printed.out == printed.err == ""
+
+
+def test_a_gmsh_file_is_read_without_a_word(tmp_path, capsys):
+    lj.write_mesh(tmp_path / "box.msh", lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1)))
+    capsys.readouterr()
+    lj.read_mesh(tmp_path / "box.msh")
+    printed = capsys.readouterr()
+    assert printed.out == printed.err == ""
