@@ -20,10 +20,10 @@ from liverjax.viscosity import Prony
 
 @struct
 class Body:
-    """Mass and weight."""
+    """Mass and weight: a node has its density times a quarter of every element around it."""
 
-    density: Any = param("kg/m^3", "per reference volume", above=0.0)
-    gravity: Any = param("m/s^2", "(3,)", default=(0.0, 0.0, 0.0))
+    density: Any = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0)
+    gravity: Any = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
 
 
 @struct

@@ -43,9 +43,20 @@ def check_choices(scene: Scene) -> None:
         name, shape = ("pressure", ()) if load.value is None else ("value", (3,))
         if np.shape(getattr(load, name)) != shape:
             raise InputError(f"traction.{k} {name} has shape {np.shape(getattr(load, name))}: give shape {shape}")
+    if scene.body is not None:
+        _body(scene)
     for k, motion in enumerate(scene.displaced):
         if (motion.by is None) == (motion.history is None):
             raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
+
+
+def _body(scene: Scene) -> None:
+    density, gravity = np.shape(scene.body.density), np.shape(scene.body.gravity)
+    nodes = scene.mesh.number_of_nodes
+    if density not in ((), (nodes,)):
+        raise InputError(f"body density has shape {density}: give one number, or one a node ({nodes},), in kg/m^3")
+    if gravity != (3,):
+        raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")
 
 
 def _nodal(scene: Scene) -> None:

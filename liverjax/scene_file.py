@@ -194,11 +194,22 @@ def _porosity(mesh: Any, table: dict) -> Porosity:
     if not isinstance(table.get("keep_bulk", False), bool):
         raise InputError(f"[porosity] keep_bulk = {table['keep_bulk']!r} must be true or false: give one of them")
     if "drained" in table:
-        given = table["drained"]
-        by_set = isinstance(given, dict) and set(given) == {"set"}
-        values["drained"] = _nodes(mesh, "porosity.drained", given if by_set else {"where": given})
+        values["drained"] = _drained(mesh, table["drained"])
     values |= {k: table[k] for k in ("scheme", "keep_bulk") if k in table}
     return Porosity(**values)
+
+
+def _drained(mesh: Any, given: Any) -> jax.Array:
+    """Nodes of one place, or of any place of a list."""
+    if given == []:
+        raise InputError("porosity.drained = [] names no place: give [{z_max = 0.0}], or leave it out (sealed)")
+    name = "porosity.drained"
+    places = {f"{name}.{k}": p for k, p in enumerate(given)} if isinstance(given, list) else {name: given}
+    nodes = []
+    for place, table in places.items():
+        by_set = isinstance(table, dict) and set(table) == {"set"}
+        nodes.append(_nodes(mesh, place, table if by_set else {"where": table}))
+    return jnp.asarray(np.unique(np.concatenate(nodes)))
 
 
 def _body(table: dict) -> Body:

@@ -133,6 +133,17 @@ def test_gradient_by_the_permeability():
     assert np.isclose((settled(2e-5 + h)[0] - settled(2e-5 - h)[0]) / (2 * h), exact, rtol=1e-6)
 
 
+def test_two_porous_platens_are_a_list_of_places():
+    def drained(given):
+        return np.asarray(column(2, 1, 1.0, drained=given).porosity.drained).tolist()
+
+    both, sets = [{"z_max": 0.0}, {"z_min": HEIGHT}], column(2, 1, 1.0).mesh.node_sets
+    ends = [np.asarray(sets[name]).tolist() for name in ("z_min", "z_max")]
+    assert drained(both) == sorted([*ends[0], *ends[1]])
+    assert drained([{"set": "z_min"}, both[1], both[1]]) == drained(both)  # a node may lie in two places
+    assert drained(both[:1]) == drained(both[0]) == drained({"set": "z_min"}) == ends[0]
+
+
 def test_only_a_porous_scene_has_pressure():
     scene = column(1, 1, 1.0)
     assert initial_state(scene).fluid is not None
@@ -148,6 +159,9 @@ def test_only_a_porous_scene_has_pressure():
         ({"permeability": -1.0}, "out of bounds"),
         ({"scheme": "explicit"}, "use implicit or chapter"),
         ({"drained": {"z_min": 1.0}}, "meets no node"),
+        ({"drained": [{"z_max": 0.0}, {"z_min": 1.0}]}, r"porosity\.drained\.1.*meets no node"),
+        ({"drained": []}, "drained = \\[\\].*leave it out"),
+        ({"drained": [0, 1]}, r"drained\.0 where = 0 must be a table"),
         ({"keep_bulk": 1}, "true or false"),
     ],
 )

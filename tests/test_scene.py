@@ -248,3 +248,31 @@ def test_a_body_that_cannot_move_is_pointed_out():
     with pytest.warns(UserWarning, match="nothing can move"):
         scene_from(content)
     scene_from(content | {"fixed": [{"where": {"z_max": 0.0}}]})
+
+
+def test_density_is_one_number_or_one_a_node():
+    """By node: a body of two halves weighs what both weigh; other shapes are refused."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 3))  # 16 nodes, 18 elements
+    scene = lj.Scene(
+        mesh=mesh, law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0), fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),)
+    )
+    share = np.asarray(lj.boundary.nodal_volumes(mesh))
+    density = np.where(np.asarray(mesh.points)[:, 2] > 0.05, 500.0, 1000.0)
+
+    def of(density, gravity=(0.0, 0.0, -9.81)):
+        return replace(scene, body=lj.Body(density=density, gravity=gravity))
+
+    held = np.asarray(lj.simulate(of(density)).check().reactions)[-1, :, 2].sum()
+    # Inner forces add up to zero, so what the support carries is the weight, to the tolerance of the forces.
+    assert np.isclose(held, 9.81 * (density * share).sum(), rtol=1e-7)
+    for body, sentence in (
+        (
+            of(np.full(mesh.number_of_elements, 1000.0)),
+            "body density has shape (18,): give one number, or one a node (16,)",
+        ),
+        (of(np.full((len(share), 1), 1000.0)), "body density has shape (16, 1)"),
+        (of(1000.0, (0.0, -9.81)), "body gravity has shape (2,): give three numbers in m/s^2"),
+    ):
+        for refused in (lj.simulate, lj.check_scene):
+            with pytest.raises(lj.InputError, match=re.escape(sentence)):
+                refused(body)
