@@ -18,7 +18,7 @@ AXES = "xyz"
 class Fixed:
     """Nodes that do not move along some axes."""
 
-    nodes: Any = param("1", "node numbers (n,)")
+    nodes: Any = param("1", "node numbers (n,)", lower=0)
     axes: str = static(default="xyz", about="held axes")
 
 
@@ -26,7 +26,7 @@ class Fixed:
 class Displaced:
     """Nodes that are moved: by `by` at the last step, proportionally before, or along a history."""
 
-    nodes: Any = param("1", "node numbers (n,)")
+    nodes: Any = param("1", "node numbers (n,)", lower=0)
     by: Any = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
     times: Any = param("s", "times of a history (T,)", default=None)
     history: Any = param("m", "displacements at these times (T, 3), linear in between", default=None)
@@ -37,7 +37,7 @@ class Displaced:
 class Traction:
     """A load on boundary triangles: dead (`value`), or a pressure that follows them."""
 
-    triangles: Any = param("1", "node numbers (m, 3), normals outwards")
+    triangles: Any = param("1", "node numbers (m, 3), normals outwards", lower=0)
     value: Any = param("Pa", "force per reference area (3,); direction and reference area count", default=None)
     pressure: Any = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
 

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from liverjax import assembly, coarse
+from liverjax import assembly, bounds, coarse
 from liverjax.coarse import Coarse
 from liverjax.errors import InputError
 from liverjax.kinematics import Matrix, Vector, cofactor, determinant, dot, matvec, scale
@@ -38,7 +37,7 @@ class Porosity:
     limit_bulk: Any = param("Pa", "K_lim, of the compressed sponge and of the pressure", above=0.0)
     fluid_fraction: Any = param("1", "r_w", above=0.0, upper=1.0)
     permeability: Any = param("m^4/(N s)", "kappa", lower=0.0)
-    drained: Any = param("1", "nodes where P = 0 (n,); None: sealed", default=None)
+    drained: Any = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
     scheme: str = static(default="implicit", about="implicit or chapter")
     keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy beside that of the sponge")
 
@@ -59,17 +58,10 @@ def check(porosity: Porosity) -> None:
     """
     if porosity.scheme not in SCHEMES:
         raise InputError(f"porosity scheme = {porosity.scheme!r} is not known: use {' or '.join(SCHEMES)}")
-    values = {n: float(getattr(porosity, n)) for n in ("bulk", "limit_bulk", "fluid_fraction", "permeability")}
-    for name, value in values.items():
-        low_enough = value <= 1 if name == "fluid_fraction" else True
-        if not (np.isfinite(value) and (value > 0 or (name == "permeability" and value == 0)) and low_enough):
-            raise InputError(
-                f"porosity {name} = {value:g} is out of bounds: give a positive number (fluid_fraction <= 1)"
-            )
-    if values["limit_bulk"] <= values["bulk"]:
-        raise InputError(
-            f"porosity limit_bulk = {values['limit_bulk']:g} must be above bulk = {values['bulk']:g}: a sponge stiffens"
-        )
+    bounds.check(porosity, "porosity")
+    bulk, limit = float(porosity.bulk), float(porosity.limit_bulk)
+    if limit <= bulk:
+        raise InputError(f"porosity limit_bulk = {limit:g} must be above bulk = {bulk:g}: a sponge stiffens")
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:

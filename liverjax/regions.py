@@ -65,6 +65,16 @@ def check(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Non
             raise InputError(f"region.{k} names elements outside 0 to {number_of_elements - 1}: renumber them")
         if not region.law:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
+    check_numbers(law, regions)
+
+
+def check_numbers(law: Law, regions: tuple[Region, ...]) -> None:
+    """Refuse numbers of regions that their law does not allow; traced ones pass.
+
+    Raises:
+        InputError: a name that the law has not, a value that is not finite or out of bounds.
+    """
+    for k, region in enumerate(regions):
         for name, value in region.law.items():
             path = name.split(".")
             _get(law, path, name)

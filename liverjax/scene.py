@@ -22,7 +22,7 @@ from liverjax.viscosity import Prony
 class Body:
     """Mass and weight: a node has its density times a quarter of every element around it."""
 
-    density: Any = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0)
+    density: Any = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0, typical=1060.0)
     gravity: Any = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
 
 
@@ -30,16 +30,16 @@ class Body:
 class Solve:
     """How the scene is solved; all but the time step and the tolerance is static."""
 
-    dt: Any = param("s", "time step; None: load steps without time", default=None)
+    dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
     kind: str = static(default="static", about="static: no inertia; dynamic")
-    steps: int = static(default=1, about="load steps, or time steps of dt")
-    tolerance: Any = param("1", "of the residual, relative to the forces at work", default=1e-8)
+    steps: int = static(default=1, about="load steps, or time steps of dt", lower=1)
+    tolerance: Any = param("1", "of the residual, relative to the forces at work", above=0.0, default=1e-8)
     newton: str = static(
         default="converged",
         about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "
         "solve a step (not for derivatives)",
     )
-    newton_iterations: int = static(default=25, about="the most of a step; 1 means newton = one_step")
+    newton_iterations: int = static(default=25, about="the most of a step; 1 means newton = one_step", lower=1)
     integrator: str = static(
         default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
     )

@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 
-from liverjax import boundary, laws, porosity, regions, viscosity
+from liverjax import boundary, bounds, laws, porosity, regions, viscosity
 from liverjax.errors import InputError
 from liverjax.mesh import check_mesh
-from liverjax.scene import Scene
+from liverjax.scene import Body, Scene
 
 #: What the choices of [solve] may be.
 CHOICES = {
@@ -44,15 +44,14 @@ def check_choices(scene: Scene) -> None:
         if np.shape(getattr(load, name)) != shape:
             raise InputError(f"traction.{k} {name} has shape {np.shape(getattr(load, name))}: give shape {shape}")
     if scene.body is not None:
-        _body(scene)
+        _body(scene.body, scene.mesh.number_of_nodes)
     for k, motion in enumerate(scene.displaced):
         if (motion.by is None) == (motion.history is None):
             raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
 
 
-def _body(scene: Scene) -> None:
-    density, gravity = np.shape(scene.body.density), np.shape(scene.body.gravity)
-    nodes = scene.mesh.number_of_nodes
+def _body(body: Body, nodes: int) -> None:
+    density, gravity = np.shape(body.density), np.shape(body.gravity)
     if density not in ((), (nodes,)):
         raise InputError(f"body density has shape {density}: give one number, or one a node ({nodes},), in kg/m^3")
     if gravity != (3,):
@@ -69,6 +68,16 @@ def _nodal(scene: Scene) -> None:
         raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
 
 
+def check_bounds(scene: Scene) -> None:
+    """Refuse numbers out of bounds, but for those of the mesh (`check_mesh`); traced ones pass. Compiles nothing.
+
+    Raises:
+        InputError: one sentence with the number's dotted name, value, bound and remedy.
+    """
+    bounds.check(scene, leave=("mesh",))
+    regions.check_numbers(scene.law, scene.region)
+
+
 def check_scene(scene: Scene) -> None:
     """Refuse a scene that cannot be simulated; host side, before any compile.
 
@@ -76,10 +85,11 @@ def check_scene(scene: Scene) -> None:
         InputError: an unusable mesh or viscosity, missing time step or mass, contradicting conditions, a loose body.
     """
     check_choices(scene)
+    check_bounds(scene)
     check_mesh(scene.mesh)
-    for k, load in enumerate(scene.traction):
-        if not np.all(np.isfinite(np.asarray(load.pressure if load.value is None else load.value, dtype=float))):
-            raise InputError(f"traction.{k} is not finite: give numbers in Pa")
+    for part in laws.summands(scene.law):
+        if hasattr(part, "check"):
+            part.check()
     regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
     if scene.viscosity is not None:
         viscosity.check(scene.viscosity, scene.law)

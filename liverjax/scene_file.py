@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import boundary, laws, porosity, regions, shapes, viscosity
+from liverjax import boundary, bounds, laws, porosity, regions, shapes, viscosity
 from liverjax.boundary import Displaced, Fixed, Traction
 from liverjax.errors import InputError
 from liverjax.laws import Law
@@ -215,12 +215,8 @@ def _drained(mesh: Any, given: Any) -> jax.Array:
 def _body(table: dict) -> Body:
     if "density" not in table:
         raise InputError("[body] needs density in kg/m^3: give e.g. density = 1060.0")
-    density = _number("[body] density", table["density"])
-    if density <= 0:
-        raise InputError(f"[body] density = {density:g} must be above 0: give e.g. 1060.0 kg/m^3")
-    return Body(
-        density=density, gravity=jnp.asarray(_numbers("[body] gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3))
-    )
+    gravity = _numbers("[body] gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3)
+    return Body(density=_number("[body] density", table["density"]), gravity=jnp.asarray(gravity))
 
 
 def _nodes(mesh: TetMesh, name: str, table: dict) -> jax.Array:
@@ -280,12 +276,7 @@ def _solve(table: dict) -> Solve:
     for key, allowed in CHOICES.items():
         if key in values and values[key] not in allowed:
             raise InputError(f"[solve] {key} = {values[key]!r} is not known: use {' or '.join(allowed)}")
-    for key in ("steps", "newton_iterations"):
-        if key in values and (isinstance(values[key], bool) or not isinstance(values[key], int) or values[key] < 1):
-            raise InputError(f"[solve] {key} = {values[key]!r} must be a whole number above 0: give e.g. 5")
-    for key in ("dt", "tolerance"):
-        if key in values and not _number(f"[solve] {key}", values[key]) > 0:
-            raise InputError(f"[solve] {key} = {values[key]!r} must be above 0: give a larger number")
+    values |= {key: _number(f"[solve] {key}", values[key]) for key in ("dt", "tolerance") if key in values}
     return Solve(**values)
 
 
@@ -324,5 +315,7 @@ def check_numbers(content: dict[str, Any]) -> None:
     if "porosity" in content:
         sponge = {k: v for k, v in content["porosity"].items() if k != "drained"}
         porosity.check(_porosity(None, sponge))
-    _section(content, "body", _body)
-    _solve(_table("solve", content.get("solve", {})))
+    body = _section(content, "body", _body)
+    if body is not None:
+        bounds.check(body, "body")
+    bounds.check(_solve(_table("solve", content.get("solve", {}))), "solve")

@@ -13,7 +13,7 @@ from liverjax.assembly import flat
 from liverjax.continuation import StepStatistics
 from liverjax.errors import InputError
 from liverjax.scene import Scene
-from liverjax.scene_checks import check_choices
+from liverjax.scene_checks import check_bounds, check_choices
 from liverjax.struct import param, replace, struct
 from liverjax.time_step import Sizes, State, equations, force_sizes, initial_state, method_of, step
 
@@ -117,8 +117,8 @@ def simulate(
             derivative it does nothing. See `liverjax.gradients`.
 
     Raises:
-        InputError: choices that mean nothing; precision "float64" where JAX's 64-bit mode is off. Numbers are checked
-            by `check_scene`, which reading a scene file calls.
+        InputError: choices that mean nothing; numbers out of bounds, unless traced; precision "float64" where JAX's
+            64-bit mode is off. `check_scene` checks more, the mesh above all; reading a scene file calls it.
     """
     scene = prepared(scene)
     if start is not None:
@@ -163,6 +163,7 @@ def prepared(scene: Scene) -> Scene:
         InputError: as `simulate`.
     """
     check_choices(scene)
+    check_bounds(scene)
     if scene.solve.newton_iterations == 1:
         scene = replace(scene, solve=replace(scene.solve, newton="one_step"))
     if scene.region:

@@ -8,9 +8,12 @@ import jax
 T = TypeVar("T")
 
 
-def static(default: Any = dataclasses.MISSING, about: str = "") -> Any:
-    """A field that is part of the structure (a tag, a count): changing it compiles anew, it has no gradient."""
-    return dataclasses.field(default=default, metadata={"static": True, "about": about})
+def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:
+    """A field that is part of the structure (a tag, a count): changing it compiles anew, it has no gradient.
+
+    With `lower` it is a whole number, at least that (see `liverjax.bounds`).
+    """
+    return dataclasses.field(default=default, metadata={"static": True, "about": about, "lower": lower})
 
 
 def param(
@@ -22,6 +25,7 @@ def param(
     above: float | None = None,
     nonzero: bool = False,
     each: bool = False,
+    unnamed: bool = False,
     typical: Any = None,
     default: Any = dataclasses.MISSING,
 ) -> Any:
@@ -31,8 +35,9 @@ def param(
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
         about: one line for ``python -m liverjax laws``.
         lower, upper: inclusive bounds; ``above``: strict lower bound.
-        nonzero: 0 is refused.
+        nonzero: 0 is refused. `liverjax.bounds.check` reads all of these.
         each: a sequence, one number a term (or the components of a direction).
+        unnamed: structs inside it; the dotted names of scene files leave this field out.
         typical: value for a soft tissue of about 1 kPa shear modulus, used where a law is asked for by name alone.
         default: as in `dataclasses.field`.
     """
@@ -44,6 +49,7 @@ def param(
         "above": above,
         "nonzero": nonzero,
         "each": each,
+        "unnamed": unnamed,
         "typical": default if typical is None and default is not dataclasses.MISSING else typical,
     }
     return dataclasses.field(default=default, metadata=metadata)

@@ -155,8 +155,8 @@ def test_only_a_porous_scene_has_pressure():
     ("change", "sentence"),
     [
         ({"limit_bulk": 300.0}, "must be above bulk"),
-        ({"fluid_fraction": 1.5}, "out of bounds"),
-        ({"permeability": -1.0}, "out of bounds"),
+        ({"fluid_fraction": 1.5}, r"porosity\.fluid_fraction = 1.5 must be at most 1"),
+        ({"permeability": -1.0}, r"porosity\.permeability = -1.0 must be at least 0 m\^4"),
         ({"scheme": "explicit"}, "use implicit or chapter"),
         ({"drained": {"z_min": 1.0}}, "meets no node"),
         ({"drained": [{"z_max": 0.0}, {"z_min": 1.0}]}, r"porosity\.drained\.1.*meets no node"),

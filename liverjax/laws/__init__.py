@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax import bounds
 from liverjax.errors import InputError
 from liverjax.laws.arruda_boyce import ArrudaBoyce
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
@@ -131,30 +132,11 @@ def check_value(where: str, metadata: Any, value: Any) -> None:
         if not isinstance(value, str) or value not in VOLUMETRIC:
             raise InputError(f"{where} = {value!r} is not known: use one of {', '.join(VOLUMETRIC)}")
         return
-    if isinstance(value, jax.core.Tracer):  # a number only under jit or grad: nothing to check yet
-        return
-    if isinstance(value, (list, tuple)) and any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(value)):
-        return
-    try:
-        if isinstance(value, str):
-            raise TypeError
-        numbers = np.atleast_1d(np.asarray(value, dtype=float))
-    except (TypeError, ValueError):
-        raise InputError(f"{where} = {value!r} is not a number: give a value in {metadata['unit']}") from None
-    above, lower, upper = metadata.get("above"), metadata.get("lower"), metadata.get("upper")
-    if metadata["each"] != (np.ndim(value) > 0):
+    several = isinstance(value, (list, tuple)) or np.ndim(value) > 0
+    if metadata["each"] != several and not isinstance(value, (str, jax.core.Tracer)):
         shape = "a list of numbers" if metadata["each"] else "one number"
         raise InputError(f"{where} = {value} is not {shape}: give {shape} in {metadata['unit']}")
-    if metadata["nonzero"] and np.any(numbers == 0):
-        raise InputError(f"{where} = {value} must not be 0: give another exponent")
-    if not np.all(np.isfinite(numbers)):
-        raise InputError(f"{where} = {value} is not finite: give a number in {metadata['unit']}")
-    if above is not None and np.any(numbers <= above):
-        raise InputError(f"{where} = {value} must be above {above:g} {metadata['unit']}: give a larger value")
-    if lower is not None and np.any(numbers < lower):
-        raise InputError(f"{where} = {value} must be at least {lower:g} {metadata['unit']}: give a larger value")
-    if upper is not None and np.any(numbers > upper):
-        raise InputError(f"{where} = {value} must be at most {upper:g} {metadata['unit']}: give a smaller value")
+    bounds.check_value(where, metadata, value)
 
 
 def typical(name: str) -> Law:

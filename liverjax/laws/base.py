@@ -143,7 +143,7 @@ def _floating(F: Any) -> jax.Array:
 class Sum(Law):
     """Several laws acting in parallel: energies add."""
 
-    laws: tuple = param("1", "laws that add up")
+    laws: tuple = param("1", "laws that add up", unnamed=True)
 
     def measures(self, F):
         """One set of invariants a summand: what two of them share is computed once."""

@@ -18,7 +18,7 @@ class Continued(Law):
     invariants exist; a volumetric energy is its Taylor parabola at c. The energy rises towards inversion.
     """
 
-    law: Any = param("1", "the law")
+    law: Any = param("1", "the law", unnamed=True)
     below: float = static(default=0.1, about="c")
 
     @property

@@ -1,0 +1,145 @@
+"""Bounds of numbers: one place reads them, for scenes made in Python as for files, before anything is compiled."""
+
+import re
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax import bounds, porosity, scene_checks, viscosity
+from liverjax.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+MESH = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+SOUND = lj.Scene(
+    mesh=MESH,
+    law=lj.laws.Sum(
+        laws=(
+            lj.laws.continued(lj.laws.NeoHookean(mu=770.0, bulk=2200.0), 0.1),
+            lj.laws.Ogden(mu=(200.0, -30.0), alpha=(2.0, -4.0), bulk=100.0),
+        )
+    ),
+    region=(lj.Region(elements=jnp.array([0, 1]), law={"0.mu": 2000.0}),),
+    viscosity=lj.Prony(ratios=jnp.array([0.2, 0.3]), relaxation_times=jnp.array([0.27, 0.03])),
+    porosity=lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5),
+    body=lj.Body(density=1060.0),
+    fixed=(lj.Fixed(nodes=MESH.node_sets["z_min"]),),
+    displaced=(lj.Displaced(nodes=MESH.node_sets["z_max"], by=jnp.zeros(3)),),
+    traction=(lj.Traction(triangles=jnp.array([[0, 1, 3]]), pressure=4.0),),
+    solve=lj.Solve(dt=0.05, steps=2, newton_iterations=3),
+)
+
+#: A dotted name, a value that its field does not allow, and the sentence.
+REFUSED = (
+    ("law.0.mu", -1.0, "law.0.mu = -1.0 must be above 0 Pa: give e.g. 770"),
+    ("law.0.bulk", float("nan"), "law.0.bulk = nan is not finite: give a number in Pa"),
+    ("law.1.alpha.1", 0.0, "law.1.alpha = [2.0, 0.0] must not be 0: give another exponent"),
+    ("region.0.law.0.mu", -5.0, "region.0: law.0.mu = -5.0 must be above 0 Pa: give e.g. 770"),
+    ("viscosity.relaxation_times", (0.3, 0.0), "viscosity.relaxation_times = [0.3, 0.0] must be above 0 s"),
+    ("viscosity.ratios.0", -0.1, "viscosity.ratios = [-0.1, 0.3] must be at least 0: give a larger value"),
+    ("porosity.fluid_fraction", 1.5, "porosity.fluid_fraction = 1.5 must be at most 1: give a smaller value"),
+    ("porosity.permeability", -1.0, "porosity.permeability = -1.0 must be at least 0 m^4/(N s): give a larger value"),
+    ("body.density", -1, "body.density = -1 must be above 0 kg/m^3: give e.g. 1060"),
+    ("body.density", "heavy", "body.density = 'heavy' is not a number: give a value in kg/m^3"),
+    ("body.gravity", (0.0, 0.0, np.inf), "body.gravity = [0.0, 0.0, inf] is not finite: give a number in m/s^2"),
+    ("displaced.0.by.2", np.nan, "displaced.0.by = [0.0, 0.0, nan] is not finite: give a number in m"),
+    ("traction.0.pressure", np.nan, "traction.0.pressure = nan is not finite: give a number in Pa"),
+    ("fixed.0.nodes.0", -1, "fixed.0.nodes = [-1, "),
+    ("solve.dt", -0.1, "solve.dt = -0.1 must be above 0 s: give a larger value"),
+    ("solve.tolerance", 0.0, "solve.tolerance = 0.0 must be above 0: give e.g. 1e-08"),
+)
+COUNTS = (
+    ("steps", 0, "solve.steps = 0 must be a whole number above 0: give 1 or more"),
+    ("steps", 2.5, "solve.steps = 2.5 must be a whole number above 0"),
+    ("newton_iterations", True, "solve.newton_iterations = True must be a whole number above 0"),
+)
+
+
+def spoiled() -> list:
+    """Every scene with one number out of bounds, and its sentence."""
+    cases = []
+    for name, value, sentence in REFUSED:
+        cases.append(pytest.param(lj.with_parameters(SOUND, {name: value}), sentence, id=f"{name}={value}"))
+    for name, value, sentence in COUNTS:
+        scene = replace(SOUND, solve=replace(SOUND.solve, **{name: value}))
+        cases.append(pytest.param(scene, sentence, id=f"{name}={value}"))
+    return cases
+
+
+@pytest.mark.parametrize(("scene", "sentence"), spoiled())
+def test_scenes_made_in_python_are_refused_before_any_compile(scene, sentence, monkeypatch):
+    monkeypatch.setattr(scene_checks, "check_mesh", lambda mesh: pytest.fail("bounds come first"))
+    monkeypatch.setattr("liverjax.simulation._run", lambda *_: pytest.fail("it was run"))
+    for refuse in (lj.check_scene, lj.simulate):
+        with pytest.raises(lj.InputError, match=re.escape(sentence)) as caught:
+            refuse(scene)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_sound_scene_passes_and_traced_numbers_are_left_alone(monkeypatch):
+    monkeypatch.setattr("liverjax.simulation._run", lambda scene, *_: scene.law.laws[0].law.mu)
+    assert np.asarray(lj.simulate(SOUND)).shape == (MESH.number_of_elements,)
+
+    def traced(mu):
+        return jnp.sum(lj.simulate(lj.with_parameters(SOUND, {"law.0.mu": mu, "body.density": mu})))
+
+    assert np.isfinite(jax.jit(jax.grad(traced))(-1.0))
+    with pytest.raises(lj.InputError, match=r"law\.0\.bulk"):  # a number beside it is not traced
+        jax.jit(lambda mu: traced(mu) + jnp.sum(lj.simulate(lj.with_parameters(SOUND, {"law.0.bulk": -1.0}))))(1.0)
+
+
+def test_one_of_many_numbers_is_named_by_its_place():
+    density = np.full(MESH.number_of_nodes, 1060.0)
+    bounds.check(lj.Body(density=density))
+    mu = np.full(1000, 770.0)
+    mu[416] = 0.0
+    with pytest.raises(lj.InputError, match=r"^law\.mu, number 417 of 1000, = 0 must be above 0 Pa"):
+        bounds.check(lj.laws.NeoHookean(mu=mu, bulk=2200.0), "law")
+    mu[416], mu[5] = 770.0, np.nan
+    with pytest.raises(lj.InputError, match=r"^law\.mu, number 6 of 1000, = nan is not finite"):
+        bounds.check(lj.laws.NeoHookean(mu=jnp.asarray(mu), bulk=2200.0), "law")
+
+
+@lj.struct
+class Mine:
+    """A struct of a user's own, with a field that states nothing."""
+
+    count: int = lj.static(default=3, lower=2)
+    share: Any = lj.param("1", lower=0.0, upper=1.0, default=0.5)
+    notes: Any = None
+
+
+def test_structs_of_a_users_own_are_read_alike():
+    bounds.check(Mine(notes="anything"), "mine")
+    for of, sentence in (
+        (Mine(count=1), "mine.count = 1 must be a whole number above 1: give 2 or more"),
+        (Mine(share=(0.5, 1.5)), "mine.share = [0.5, 1.5] must be at most 1: give e.g. 0.5"),
+    ):
+        with pytest.raises(lj.InputError, match=re.escape(sentence)):
+            bounds.check(of, "mine")
+
+
+def test_parts_of_a_scene_checked_alone_use_the_same_place():
+    prony = lj.Prony(ratios=(0.5,), relaxation_times=(np.nan,))
+    with pytest.raises(lj.InputError, match=r"viscosity\.relaxation_times = \[nan\] is not finite"):
+        viscosity.check(prony, SOUND.law)
+    with pytest.raises(lj.InputError, match=r"porosity\.bulk = 0 must be above 0 Pa"):
+        porosity.check(replace(SOUND.porosity, bulk=0))
+    with pytest.raises(lj.InputError, match="2 mu and 1 alpha"):
+        lj.check_scene(replace(SOUND, region=(), law=lj.laws.Ogden(mu=(1.0, 2.0), alpha=(2.0,), bulk=10.0)))
+
+
+def test_bounds_cost_less_than_a_millisecond():
+    """Asked at every call of `simulate`: the best of ten, since other programs may hold the processor."""
+    scene_checks.check_bounds(SOUND)
+    times = []
+    for _ in range(10):
+        begin = time.perf_counter()
+        scene_checks.check_bounds(SOUND)
+        times.append(time.perf_counter() - begin)
+    assert min(times) < 1e-3
