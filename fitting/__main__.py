@@ -27,6 +27,7 @@ def _parser() -> argparse.ArgumentParser:
         "field --help. " + EXIT_CODES,
     )
     parser.add_argument("sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text")
+    parser.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     parser.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
     parser.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
     parser.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
@@ -84,7 +85,7 @@ def identify(options: argparse.Namespace) -> int:
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
     laws.find(options.law)
-    sweep = rheometer.read_sweep(options.sweep)
+    sweep = rheometer.read_sweep(options.sweep, options.table)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     if options.modes != "auto":

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fitting import workbook
 from liverjax import homogeneous
 from liverjax.errors import InputError
 
@@ -68,7 +69,9 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
 
 def _rows(file: Path) -> list[dict[str, str]]:
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        data = file.read_bytes()
+        workbook.refuse(file, data, "the sheet of the curves")
+        text = data.decode("utf-8-sig")
     except IsADirectoryError:
         raise InputError(f"{file} is a folder: give a CSV file of curves") from None
     except UnicodeDecodeError:

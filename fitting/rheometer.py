@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fitting import workbook
 from liverjax.errors import InputError
 
 #: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
@@ -21,6 +22,8 @@ FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1"
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
 #: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.
 SMALLEST, LARGEST = 1e-30, 1e30
+#: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
+FEWEST = 3
 NEEDED = {
     "frequency": "frequency_Hz or angular_frequency_rad_s",
     "storage": "storage_modulus_Pa",
@@ -56,34 +59,66 @@ class _Column(NamedTuple):
 
 
 class _Table(NamedTuple):
+    name: str  # what the file calls it, may be empty
     columns: list[_Column]
     rows: list[list[float]]  # in the order of the columns
     numbers: list[int]  # of the lines in the file
 
+    @property
+    def frequencies(self) -> int:
+        """How many different ones it holds."""
+        place = next(j for j, c in enumerate(self.columns) if c.quantity == "frequency")
+        return len({row[place] for row in self.rows})
 
-def read_sweep(path: str | os.PathLike) -> Sweep:
+
+def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """Read a frequency sweep.
+
+    A point with a modulus or frequency that is not finite, not positive or beyond any measurement is left out, and a
+    note names it.
 
     Args:
         path: text with a header naming ``frequency_Hz`` or ``angular_frequency_rad_s``, ``storage_modulus_Pa``,
             ``loss_modulus_Pa`` (kPa, MPa likewise), optional ``storage_modulus_sd_Pa`` and ``loss_modulus_sd_Pa``;
             ``#`` comments; or an instrument's export.
+        table: of a file with several tables, the number (from 1), the name or a part of the name of the one to read;
+            by default the one with most frequencies, the first of equals.
 
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
     """
-    lines = _text(Path(path)).splitlines()
-    tables = _tables(str(path), lines)
-    table = max(tables, key=lambda t: len(set(np.asarray(t.rows)[:, _first(t.columns, "frequency")])))
-    notes = []
-    if len(tables) > 1:
-        count = len(table.rows)
-        notes.append(f"the file holds {len(tables)} tables; the one with most frequencies, {count} rows, is used")
-    return _sweep(str(path), table, notes)
+    tables = _tables(str(path), _text(Path(path)).splitlines())
+    chosen, notes = _choose(str(path), tables, table)
+    return _sweep(str(path), tables[chosen], notes)
 
 
-def _first(columns: list[_Column], quantity: str) -> int:
-    return next(j for j, c in enumerate(columns) if c.quantity == quantity)
+def _choose(path: str, tables: list[_Table], wanted: str | None) -> tuple[int, list[str]]:
+    """Place of the table to read, and a note where there are several."""
+    names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
+    if wanted is not None:
+        k = _named(path, tables, names, wanted)
+        return k, [f"table {names[k]} of {len(tables)} is used"] if len(tables) > 1 else []
+    counts = [t.frequencies for t in tables]
+    k = counts.index(max(counts))
+    if len(tables) == 1:
+        return k, []
+    why = f"{'the first' if counts.count(counts[k]) > 1 else 'the one'} with most frequencies, {counts[k]}"
+    listed = f"the file holds {len(tables)} tables: {', '.join(names)}"
+    return k, [f"{listed}; table {names[k]} is used, {why}; choose another with --table NUMBER or NAME"]
+
+
+def _named(path: str, tables: list[_Table], names: list[str], wanted: str) -> int:
+    """Place of the table with this number, this name, or alone with this in its name."""
+    if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
+        return int(wanted) - 1
+    sought = wanted.strip().lower()
+    matches = [k for k, t in enumerate(tables) if sought == t.name.lower()]
+    matches = matches or [k for k, t in enumerate(tables) if sought and sought in t.name.lower()]
+    if len(matches) == 1:
+        return matches[0]
+    found = f"is in the names of {len(matches)} tables" if matches else "is no table of the file"
+    offered = ", ".join(names[k] for k in matches) if matches else ", ".join(names)
+    raise InputError(f"{path}: --table {wanted} {found}; give the number or the whole name of one: {offered}")
 
 
 def _text(path: Path) -> str:
@@ -97,6 +132,7 @@ def _text(path: Path) -> str:
         raise InputError(f"{path}: {error.strerror}; give the CSV file of a frequency sweep") from None
     if not data.strip():
         raise InputError(f"{path} is empty: export the sweep again")
+    workbook.refuse(path, data, "the sheet of the frequency sweep")
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     if b"\0" in data:
@@ -196,7 +232,7 @@ def _tables(path: str, lines: list[str]) -> list[_Table]:
 
 def _search(path: str, lines: list[str]) -> tuple[list[_Table], list[int]]:
     """Tables with numbers, and the line numbers of all complete headers."""
-    tables, headers, k = [], [], 0
+    tables, headers, k, free = [], [], 0, 0  # `free`: from where on lines belong to no table
     while k < len(lines):
         line = lines[k]
         k += 1
@@ -208,11 +244,25 @@ def _search(path: str, lines: list[str]) -> tuple[list[_Table], list[int]]:
         if not set(NEEDED) <= {c.quantity for c in columns}:
             continue
         headers.append(k)
+        name = _title(lines[free : k - 1])
         columns, k = _with_unit_row(columns, lines, k, delimiter)
         rows, numbers, k = _rows(path, columns, lines, k, delimiter, len(cells))
         if rows:
-            tables.append(_Table(columns, rows, numbers))
+            tables.append(_Table(name, columns, rows, numbers))
+        free = k
     return tables, headers
+
+
+def _title(above: list[str]) -> str:
+    """What the lines above a header call its table: TRIOS's step, RheoCompass's result, else the nearest line."""
+    cells = [[c.strip("#\"' ") for c in line.split("\t")] for line in above]
+    cells = [[c for c in row if c] for row in cells]
+    for row in reversed(cells):
+        if len(row) > 1 and row[0].lower().rstrip(":") in ("step name", "result", "test"):
+            return row[1]
+    steps = [k for k, row in enumerate(cells) if row and row[0].lower() == "[step]"]
+    titles = [row[0] for row in (cells[steps[-1] + 1 :] if steps else cells[::-1]) if row]
+    return titles[0][:60] if titles else ""
 
 
 def _with_unit_row(columns: list[_Column], lines: list[str], k: int, delimiter: str) -> tuple[list[_Column], int]:
@@ -276,7 +326,7 @@ def _complete(line: str) -> bool:
 
 
 def _si(path: str, table: _Table, j: int, notes: list[str]) -> np.ndarray:
-    """Column j in rad/s or Pa; every value checked."""
+    """Column j in rad/s or Pa."""
     column, unit = table.columns[j], table.columns[j].unit
     if unit is None:
         unit = "Pa" if column.quantity != "frequency" else "rad/s" if _is_angular(column) else "Hz"
@@ -289,30 +339,64 @@ def _si(path: str, table: _Table, j: int, notes: list[str]) -> np.ndarray:
             f"{path}: column {column.name} is an angular frequency in Hz; "
             "name it frequency_Hz or angular_frequency_rad_s"
         )
-    values = np.asarray(table.rows)[:, j]
     scale = FREQUENCY_UNITS[unit.lower()] if column.quantity == "frequency" else MODULUS_UNITS[unit]
-    for number, value in zip(table.numbers, values, strict=True):
-        if not np.isfinite(value):
-            problem, remedy = "is not finite", "remove the line"
-        elif value <= 0:
-            problem, remedy = "is not positive", "correct the sign or remove the line"
-        elif not SMALLEST < value * scale < LARGEST:
-            problem, remedy = "is beyond any measurement", "check the unit"
-        else:
-            continue
-        raise InputError(f"{path}: line {number}: {column.name} = {value:g} {problem}; {remedy}")
-    return values * scale
+    return np.asarray(table.rows)[:, j] * scale
+
+
+def _fault(column: _Column, written: float, value: float) -> tuple[str, str] | None:
+    """What is wrong with a value in SI, as the file writes it, and the remedy."""
+    if not np.isfinite(value):
+        problem, remedy = "is not finite", "remove the line"
+    elif value <= 0:
+        problem, remedy = "is not positive", "correct the sign or remove the line"
+    elif not SMALLEST < value < LARGEST:
+        problem, remedy = "is beyond any measurement", "check the unit"
+    else:
+        return None
+    return f"{column.name} = {written:g} {problem}", remedy
+
+
+def _usable(path: str, table: _Table, values: dict[int, np.ndarray]) -> tuple[np.ndarray, list[str]]:
+    """Which rows are good in all columns of `values`, and a note on the others.
+
+    Raises:
+        InputError: fewer than half of the points, or of three frequencies, are good.
+    """
+    good, faults = np.ones(len(table.rows), bool), []
+    for k, number in enumerate(table.numbers):
+        found = (_fault(table.columns[j], table.rows[k][j], column[k]) for j, column in values.items())
+        fault = next((f for f in found if f is not None), None)
+        if fault is not None:
+            good[k] = False
+            faults.append((f"line {number}: {fault[0]}", fault[1]))
+    if not faults:
+        return good, []
+    omega = next(column for j, column in values.items() if table.columns[j].quantity == "frequency")
+    if len(np.unique(omega[good])) < FEWEST or 2 * good.sum() < len(good):
+        told, remedy = faults[0]
+        more = f" (and {len(faults) - 1} more points are unusable)" if len(faults) > 1 else ""
+        raise InputError(f"{path}: {told}{more}; {remedy}")
+    told = "; ".join(told for told, _ in faults[:8]) + (f"; and {len(faults) - 8} more" if len(faults) > 8 else "")
+    verb = "is" if len(faults) == 1 else "are"
+    return good, [f"{len(faults)} of {len(good)} points {verb} left out as unusable: {told}"]
 
 
 def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
-    values: dict[str, np.ndarray] = {}
-    names: dict[str, str] = {}
+    places: dict[str, int] = {}
+    columns: dict[int, np.ndarray] = {}
+    for j, column in enumerate(table.columns):
+        if column.quantity not in places:
+            places[column.quantity], columns[j] = j, _si(path, table, j, notes)
+    good, left_out = _usable(path, table, columns)
+    values = {q: columns[j][good] for q, j in places.items()}
     for j, column in enumerate(table.columns):
         q = column.quantity
-        if q not in values:
-            values[q], names[q] = _si(path, table, j, notes), column.name
-        elif _known_unit(q, column.unit) and not np.allclose(_si(path, table, j, []), values[q], rtol=0.01):
-            raise InputError(f"{path}: columns {names[q]} and {column.name} disagree; remove the wrong one")
+        if j == places[q] or not _known_unit(q.removesuffix("_sd"), column.unit):
+            continue
+        if not np.allclose(_si(path, table, j, [])[good], values[q], rtol=0.01):
+            name = table.columns[places[q]].name
+            raise InputError(f"{path}: columns {name} and {column.name} disagree; remove the wrong one")
+    notes += left_out
     omega = values["frequency"]
     if len(np.unique(omega)) < 2:
         raise InputError(f"{path}: it holds {len(np.unique(omega))} frequency; give at least two different ones")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+from fitting.curves import read_curves
 from fitting.rheometer import read_sweep
 from liverjax import InputError
 
@@ -243,3 +244,75 @@ def test_lions_mane_table_is_the_mean_of_the_raw_sweeps():
     s = read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
     assert np.allclose(s.storage, raw[:, :, 1].mean(axis=0), rtol=1e-5)
     assert np.allclose(s.loss_sd, raw[:, :, 2].std(axis=0, ddof=1), rtol=1e-5)
+
+
+def _trios(temperatures, rows=ROWS):
+    """An export with one step a temperature, G' higher by the step's number."""
+    steps = ["[Parameters]\nTemperature limit\t620.000 [°C]"]
+    for k, t in enumerate(temperatures):
+        numbers = "\n".join(f"{f}\t{float(s) + k}\t{l}" for f, s, l in (r.split(",") for r in rows.split()))
+        title = f"[Step]\nStep name\tFrequency sweep ({t:.1f} °C)\nNumber of points\t3"
+        steps.append(f"{title}\nAngular frequency\tStorage modulus\tLoss modulus\nrad/s\tPa\tPa\n{numbers}")
+    return "\n".join(steps) + "\n"
+
+
+def test_a_file_of_many_tables_names_them_and_one_is_chosen(tmp_path):
+    path = _write(tmp_path, _trios((150, 20, -20)), "export.txt")
+    s = read_sweep(path)
+    (note,) = s.notes
+    assert s.storage[0] == 300 and "3 tables: 1 'Frequency sweep (150.0 °C)', 2 'Frequency sweep (20.0 °C)'" in note
+    assert "table 1 'Frequency sweep (150.0 °C)' is used, the first with most frequencies, 3" in note
+    assert "--table" in note
+    for wanted, place in (("2", 1), ("(20.0 °C)", 1), ("-20", 2), ("frequency sweep (-20.0 °c)", 2), ("150", 0)):
+        chosen = read_sweep(path, table=wanted)
+        assert chosen.storage[0] == 300 + place and f"table {place + 1} '" in chosen.notes[0]
+    for wanted, sentence in (("20.0", "in the names of 2 tables"), ("37 °C", "is no table"), ("4", "is no table")):
+        with pytest.raises(InputError, match=f"--table .*{sentence}.*2 'Frequency sweep"):
+            read_sweep(path, table=wanted)
+    assert read_sweep(_write(tmp_path, HEADER + ROWS), table="1").notes == ()
+
+
+def test_tables_are_named_as_every_instrument_does(tmp_path):
+    assert "1 'Amplitude sweep - 1', 2 'Frequency sweep - 2'" in read_sweep(_write(tmp_path, TRIOS)).notes[0]
+    two = RHEOCOMPASS + RHEOCOMPASS.replace("sweep 1", "sweep 2")
+    assert "1 'Frequency sweep 1', 2 'Frequency sweep 2'" in read_sweep(_write(tmp_path, two)).notes[0]
+    plain = "# liver\n" + HEADER + ROWS + "\n# kidney\n" + HEADER + ROWS
+    assert "1 'liver', 2 'kidney'" in read_sweep(_write(tmp_path, plain)).notes[0]
+
+
+@pytest.mark.parametrize("bad", ["-90", "0", "nan", "1e200"])
+def test_unusable_points_are_left_out_and_named(tmp_path, bad):
+    rows = "0.01,200,20\n" + ROWS.replace("90", bad)
+    s = read_sweep(_write(tmp_path, HEADER + rows))
+    assert s.storage.tolist() == [200, 300, 400] and s.loss.tolist() == [20, 30, 60]
+    (note,) = s.notes
+    assert "1 of 4 points is left out" in note and f"line 5: loss_modulus_Pa = {float(bad):g} is " in note
+
+
+def test_too_few_usable_points_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"line 4: loss_modulus_Pa = -90 is not positive; correct"):
+        read_sweep(_write(tmp_path, HEADER + ROWS.replace("90", "-90")))
+    two = "storage_modulus_Pa,loss_modulus_Pa,frequency_Hz\n300,30,1\n301,30,1\n302,30,2\n303,-30,3\n"
+    with pytest.raises(InputError, match="line 5"):  # three points remain, but at two frequencies
+        read_sweep(_write(tmp_path, two))
+    falling = "".join(f"{k},{300 + k},{30 if k < 4 else -30}\n" for k in range(1, 9))
+    with pytest.raises(InputError, match=r"line 5: .* is not positive \(and 4 more points are unusable\)"):
+        read_sweep(_write(tmp_path, HEADER + falling))
+    spread = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_sd_Pa,loss_sd_Pa\n"
+    s = read_sweep(_write(tmp_path, spread + "".join(f"{k},300,30,{k - 1},3\n" for k in range(1, 6))))
+    assert len(s.storage) == 4 and "storage_sd_Pa = 0 is not positive" in s.notes[0]
+
+
+def test_a_workbook_is_called_one(tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "new.xlsx", "w") as file:
+        file.writestr("xl/workbook.xml", "<workbook/>")
+    old = _write(tmp_path, bytes.fromhex("d0cf11e0a1b11ae1") + bytes(504), "old.xls")
+    for path in (tmp_path / "new.xlsx", old):
+        with pytest.raises(
+            InputError, match=r"is a spreadsheet workbook.*export the sheet of the frequency sweep as CSV"
+        ):
+            read_sweep(path)
+        with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of the curves as CSV"):
+            read_curves([path])
