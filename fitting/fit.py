@@ -17,7 +17,6 @@ from liverjax import laws, status
 from liverjax.errors import InputError
 from liverjax.viscosity import Prony
 
-MAX_MODES = 6
 OPTIMIZERS = ("levenberg-marquardt", "bfgs")
 
 
@@ -122,12 +121,9 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, .
     )
 
 
-def identifiable(fit: Fit) -> bool:
-    """Every mode is needed and none has merged: parameters known to 50 %, times a factor 1.5 apart."""
-    n, u = fit.modes, fit.uncertainty
-    known = np.all(u.standard_errors[1:] < 0.5 * u.values[1:])
-    tau = u.values[n + 1 :]
-    return bool(fit.converged and known and np.all(tau[:-1] > 1.5 * tau[1:]))
+def identifiable(fit: Fit, sweep: Sweep) -> bool:
+    """Converged, and nothing advises against any of its modes."""
+    return bool(fit.converged and not uncertainty.superfluous(sweep, fit.uncertainty))
 
 
 def information_criterion(fit: Fit) -> float:
@@ -144,48 +140,69 @@ EXACT = 1e-7
 def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) -> tuple[Fit, list[Fit]]:
     """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact; all that was tried.
 
-    One failure may be a local minimum: the search ends at the second in a row.
+    One failure may be a local minimum: the search ends at the second in a row. A number of modes whose computation
+    breaks down is such a failure, and is named in the warnings; the others stay.
     """
-    decades = np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
-    cap = min(max(MAX_MODES, int(decades) + 2), prony.largest_number_of_modes(sweep))
+    cap = min(uncertainty.supported_modes(sweep), prony.largest_number_of_modes(sweep))
     tried: list[Fit] = []
-    chosen, failures = closed_form(sweep, 1, dense, optimizer), 0
+    broken: dict[int, str] = {}
+    chosen, failures = None, 0
     for modes in range(1, cap + 1):
-        fit = chosen if modes == 1 else closed_form(sweep, modes, dense, optimizer)
-        tried.append(fit)
-        falls = information_criterion(fit) < information_criterion(chosen)
-        if modes == 1 or (identifiable(fit) and falls):
-            chosen, failures = fit, 0
-        else:
+        try:
+            fit = closed_form(sweep, modes, dense, optimizer)
+        except (ArithmeticError, RuntimeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            broken[modes] = " ".join(str(error).split())[:100] or type(error).__name__
             failures += 1
-        if failures == 2 or np.max(fit.relative_errors(sweep)) < EXACT:
+        else:
+            tried.append(fit)
+            falls = chosen is None or information_criterion(fit) < information_criterion(chosen)
+            if chosen is None or (identifiable(fit, sweep) and falls):
+                chosen, failures = fit, 0
+            else:
+                failures += 1
+            if np.max(fit.relative_errors(sweep)) < EXACT:
+                break
+        if failures == 2:
             break
-    warnings = chosen.warnings
-    closer = min(tried, key=information_criterion)
-    if information_criterion(closer) < information_criterion(chosen) - 10:
-        a, b = (100 * np.mean(f.relative_errors(sweep)) for f in (closer, chosen))
-        warnings += (
-            f"{closer.modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but "
-            f"the data leave some of their parameters free; --modes {closer.modes} gives them all the same",
-        )
+    if chosen is None:
+        raise InputError(f"{sweep.source or 'sweep'}: no number of modes could be fitted ({broken[1]}); check the data")
     table = [
         {
             "modes": f.modes,
             "information_criterion": float(information_criterion(f)),
-            "identifiable": identifiable(f),
+            "identifiable": identifiable(f, sweep),
             "mean_relative_error": float(np.mean(f.relative_errors(sweep))),
         }
         for f in tried
     ]
     return (
         chosen._replace(
-            warnings=warnings,
+            warnings=(*chosen.warnings, *_other_numbers(sweep, chosen, tried, broken)),
             compile_time=sum(f.compile_time for f in tried),
             run_time=sum(f.run_time for f in tried),
             details=chosen.details | {"modes_tried": table},
         ),
         tried,
     )
+
+
+def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:
+    """Sentences on the numbers of modes that were not chosen: one that is closer, and those that broke down."""
+    out = []
+    closer = min(tried, key=information_criterion)
+    if information_criterion(closer) < information_criterion(chosen) - 10:
+        a, b = (100 * np.mean(f.relative_errors(sweep)) for f in (closer, chosen))
+        out.append(
+            f"{closer.modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but "
+            f"the data leave some of their parameters free; --modes {closer.modes} gives them all the same"
+        )
+    for modes, reason in broken.items():
+        out.append(
+            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}) and took no part in the choice"
+        )
+    return out
 
 
 class Simulation(NamedTuple):

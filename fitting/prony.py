@@ -87,11 +87,24 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
     top = np.column_stack([np.ones_like(omega), x**2 / (1 + x**2)]) / size[:, None]
     bottom = np.column_stack([np.zeros_like(omega), x / (1 + x**2)]) / size[:, None]
     A, b = np.vstack([top, bottom]), np.concatenate([sweep.storage / size, sweep.loss / size])
-    # Columns of equal length keep the active-set iteration short.
-    norm = np.linalg.norm(A, axis=0)
-    weights, rest = scipy.optimize.nnls(A / norm, b, maxiter=50 * A.shape[1])
-    weights = weights / norm
+    weights, rest = _non_negative(A, b)
     return Spectrum(times, weights[1:], float(weights[0]), float(rest / np.sqrt(len(omega))))
+
+
+def _non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
+    """x >= 0 that brings A x nearest to b, and their distance.
+
+    An active set that cycles (columns that are nearly the same, which close relaxation times give) leaves the problem
+    to SciPy's bounded least squares, which always comes back with its best point.
+    """
+    norm = np.linalg.norm(A, axis=0)  # columns of equal length keep the active-set iteration short
+    norm = np.where(norm > 0, norm, 1.0)
+    try:
+        x, rest = scipy.optimize.nnls(A / norm, b, maxiter=50 * A.shape[1])
+    except RuntimeError:
+        x = np.maximum(scipy.optimize.lsq_linear(A / norm, b, bounds=(0, np.inf)).x, 0.0)
+        rest = float(np.linalg.norm(A / norm @ x - b))
+    return x / norm, float(rest)
 
 
 #: Above this misfit no number of modes describes the data even roughly: columns or units are wrong.
@@ -143,7 +156,7 @@ def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
     one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
     scale = np.concatenate(sweep.deviations)
     A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])]) / scale[:, None]
-    strengths, _ = scipy.optimize.nnls(A, np.concatenate([sweep.storage, sweep.loss]) / scale)
+    strengths, _ = _non_negative(A, np.concatenate([sweep.storage, sweep.loss]) / scale)
     total = strengths.sum()
     share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
     share = share / share.sum()

@@ -142,53 +142,78 @@ def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
     return float(x[k - 1] + (x[k] - x[k - 1]) * rise[k - 1] / (rise[k - 1] - rise[k]))
 
 
-def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
-    """Sentences on what the data do not tell, each with the number it rests on and what to do."""
+#: Neighbouring relaxation times closer than this factor act as one mode.
+MERGED = 1.5
+
+
+def _decades(sweep: Sweep) -> float:
+    return float(np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0]))
+
+
+def supported_modes(sweep: Sweep) -> int:
+    """How many modes the band has room for: about one a decade and one more, at least one."""
+    return max(1, int(_decades(sweep) + 1 + 1e-9))  # a decade is a decade in spite of rounding
+
+
+def superfluous(sweep: Sweep, u: Uncertainty) -> list[str]:
+    """Sentences that advise against some of the modes; none for a number of modes that may be chosen."""
     modes = (len(u.values) - 1) // 2
+    fewer = "use fewer modes or a wider sweep" if modes > 1 else "use a wider sweep"
     g, tau = u.values[1 : modes + 1], u.values[modes + 1 :]
     g_err, tau_err = u.standard_errors[1 : modes + 1], u.standard_errors[modes + 1 :]
-    omega = sweep.angular_frequency
-    low, high, decades = 1 / omega[-1], 1 / omega[0], float(np.log10(omega[-1] / omega[0]))
+    low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
     out = []
     for k in range(modes):
         if not low / 100 <= tau[k] <= 100 * high:
             product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the measured "
-                f"frequencies resolve: only {product} is determined, no factor of it; use fewer modes or another band"
+                f"frequencies resolve: only {product} is determined, no factor of it; "
+                f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
             )
-        elif not low <= tau[k] <= high:
+        if not g_err[k] < 0.5 * g[k]:
+            out.append(
+                f"ratios[{k}] = {g[k]:.3g} has a standard error of {_percent(g_err[k], g[k])}: "
+                + ("the data do not need this mode; use fewer modes" if modes > 1 else f"it is not determined; {fewer}")
+            )
+        elif not tau_err[k] < 0.5 * tau[k]:
+            out.append(
+                f"relaxation_times[{k}] = {tau[k]:.3g} s has a standard error of {_percent(tau_err[k], tau[k])}: "
+                f"the data leave it nearly free; {fewer}"
+            )
+    for k in range(modes - 1):
+        if tau[k] < MERGED * tau[k + 1]:
+            out.append(
+                f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
+                f"{modes - 1} mode{'s' if modes > 2 else ''}"
+            )
+    if modes > supported_modes(sweep) or _decades(sweep) < 0.3:
+        out.append(
+            f"the sweep spans {_decades(sweep):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
+            f"(about one a decade and one more); {fewer}"
+        )
+    return out
+
+
+def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
+    """Sentences on what the data do not tell, each with the number it rests on and what to do."""
+    modes = (len(u.values) - 1) // 2
+    tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
+    low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
+    out = superfluous(sweep, u)
+    for k in range(modes):
+        if low / 100 <= tau[k] <= 100 * high and not low <= tau[k] <= high:
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies outside the {low:.3g}-{high:.3g} s that the measured "
                 f"frequencies resolve: it is extrapolated (standard error {_percent(tau_err[k], tau[k])}); measure at "
                 f"{'higher' if tau[k] < low else 'lower'} frequencies to pin it down"
             )
-        if not g_err[k] < 0.5 * g[k]:
-            out.append(
-                f"ratios[{k}] = {g[k]:.3g} has a standard error of {_percent(g_err[k], g[k])}: "
-                "the data do not need this mode; use fewer modes"
-            )
-        elif not tau_err[k] < 0.5 * tau[k]:
-            out.append(
-                f"relaxation_times[{k}] = {tau[k]:.3g} s has a standard error of {_percent(tau_err[k], tau[k])}: "
-                "the data leave it nearly free; use fewer modes or a wider sweep"
-            )
-    for k in range(modes - 1):
-        if tau[k] < 2 * tau[k + 1]:
-            out.append(
-                f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
-                f"{modes - 1} mode{'s' if modes > 2 else ''}"
-            )
-    equilibrium = u.values[0] * (1 - g.sum())
+    ratios = u.values[1 : modes + 1].sum()
+    equilibrium = u.values[0] * (1 - ratios)
     if not equilibrium > 2 * u.equilibrium_error:
         out.append(
-            f"the ratios add up to {g.sum():.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
+            f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
             "from zero (a fluid); measure at lower frequencies"
-        )
-    if modes > decades + 1 or decades < 0.3:
-        out.append(
-            f"the sweep spans {decades:.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
-            "(about one a decade and one more); use fewer modes or a wider sweep"
         )
     if sweep.storage_sd is not None:
         r = np.asarray(found.residuals)

@@ -144,6 +144,62 @@ def test_modes_limited_by_points():
         fit.closed_form(s, 3)
 
 
+def melt() -> Sweep:
+    """A fractional Maxwell liquid: a broad spectrum that ends in flow, as of a polymer melt or a dynamic gel."""
+    omega = np.geomspace(0.1, 100, 31)
+    z = 0.1j * omega
+    G = 1000 / (1 / z + z**-0.5)
+    return Sweep(omega, G.real, G.imag)
+
+
+@pytest.mark.parametrize("modes", [5, 12])
+def test_many_modes_of_a_melt_have_starts(modes):
+    s = melt()
+    assert np.all(np.isfinite(prony.starts(s, modes, prony.spectrum(s))))
+
+
+def test_where_the_active_set_cycles_the_bounded_solver_finds_the_same(monkeypatch):
+    rng = np.random.default_rng(0)
+    A, b = rng.uniform(0.1, 1, (20, 4)), rng.uniform(-1, 1, 20)
+    x, rest = prony._non_negative(A, b)
+
+    def cycles(*_, **__):
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr(scipy.optimize, "nnls", cycles)
+    y, other = prony._non_negative(A, b)
+    # lsq_linear ends where the cost gains less than 1e-10 of itself: its root, the distance, is half as far off.
+    assert np.all(y >= 0) and np.isclose(other, rest, rtol=1e-10) and np.allclose(x, y, atol=1e-5)
+
+
+def test_a_number_of_modes_that_breaks_down_leaves_the_others(monkeypatch):
+    s, closed_form = sweep(0.01, 5, omega=np.geomspace(1, 100, 12)), fit.closed_form
+
+    def breaking(sweep, modes, *rest):
+        if modes == 2:
+            raise RuntimeError("Maximum number of iterations reached.")
+        return closed_form(sweep, modes, *rest)
+
+    monkeypatch.setattr(fit, "closed_form", breaking)
+    chosen, tried = fit.choose_modes(s, prony.spectrum(s))
+    assert [f.modes for f in tried] == [1, 3] and chosen.modes in (1, 3)
+    assert warned(chosen, "2 modes could not be fitted (Maximum number of iterations reached.)")
+    monkeypatch.setattr(fit, "closed_form", lambda *a: breaking(s, 2))
+    with pytest.raises(InputError, match="no number of modes could be fitted"):
+        fit.choose_modes(s, prony.spectrum(s))
+
+
+def test_what_auto_chooses_is_not_advised_against():
+    # Three modes within 1.6 decades, without noise: the criterion would take all three.
+    model = np.array([770.0, 0.2, 0.25, 0.3, 1.0, 0.2, 0.05])
+    s = sweep(0.0, model=model)
+    chosen, _ = fit.choose_modes(s, prony.spectrum(s))
+    assert chosen.modes == 2 and not warned(chosen, "fewer modes") and not warned(chosen, "merged")
+    narrow = sweep(0.01, 2, omega=2 * np.pi * np.geomspace(1, 1.5, 12))
+    one, _ = fit.choose_modes(narrow, prony.spectrum(narrow))
+    assert one.modes == 1 and warned(one, "use a wider sweep") and not warned(one, "fewer modes")
+
+
 def warned(f: fit.Fit, words: str) -> bool:
     return any(words in sentence for sentence in f.warnings)
 
