@@ -173,7 +173,7 @@ def prepared(scene: Scene) -> Scene:
         scene = replace(scene, solve=replace(scene.solve, linear_solver=choice.linear_solver(scene)))
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
-    elif not jax.config.jax_enable_x64:
+    elif jnp.result_type(float) != jnp.float64:  # 64-bit mode is off
         raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
     return scene
 
