@@ -1,7 +1,8 @@
 """Other ways to the same numbers, for comparison: force and the 45 entries of every element's stiffness.
 
-All in the layout of `liverjax.mjed` (the element index last, every scalar written out), except the vmapped Hessian.
-Only the contracted way writes its parts to memory (`liverjax.kinematics.stored`); the others are as books have them.
+All in the layout of `liverjax.elements.mjed` (the element index last, every scalar written out), except the vmapped
+Hessian. Only the contracted way writes its parts to memory (`liverjax.tensors.matrices.stored`); the others are as
+books have them.
 """
 
 from typing import Any
@@ -9,9 +10,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from liverjax import chapter_terms, green_terms, mjed, stretch_terms, terms
-from liverjax.axes_terms import SIX, six_of, symmetric
-from liverjax.kinematics import (
+from liverjax.elements import mjed
+from liverjax.laws.terms import chapter_terms, green_terms, invariant_terms, stretch_terms
+from liverjax.laws.terms.invariant_terms import summands
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.tensors.material_axes import SIX, six_of, symmetric
+from liverjax.tensors.matrices import (
     Matrix,
     add_matrices,
     cofactor,
@@ -25,8 +29,6 @@ from liverjax.kinematics import (
     stored,
     transpose,
 )
-from liverjax.mesh import TetMesh
-from liverjax.terms import summands
 
 #: The blocks that are written: nodes 1 to 3 of an element, by shape vector.
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -44,9 +46,9 @@ def _entries(mesh: TetMesh, blocks: list) -> list:
 def contracted(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
     """The way of `liverjax`: all terms of the energy at once."""
     F = stored(deformation_gradient(mesh, x))
-    shared = terms.state(law, F)
-    force = mjed.nodal_force(mesh, terms.piola(F, shared.cof, terms.stress(shared)))
-    return force, _entries(mesh, terms.blocks(shared, _shape_vectors(mesh), PAIRS))
+    shared = invariant_terms.state(law, F)
+    force = mjed.nodal_force(mesh, invariant_terms.piola(F, shared.cof, invariant_terms.stress(shared)))
+    return force, _entries(mesh, invariant_terms.blocks(shared, _shape_vectors(mesh), PAIRS))
 
 
 def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None) -> tuple:

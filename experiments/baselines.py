@@ -8,9 +8,13 @@ import jax
 import jax.numpy as jnp
 
 import liverjax as lj
-from liverjax import assembly, boundary, kinematics, mjed, tangent
-from liverjax.linear import conjugate_gradients
-from liverjax.pattern import PAIRS
+from liverjax.elements import mjed
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.physics import boundary
+from liverjax.simulation import tangent
+from liverjax.solvers import block_matrix
+from liverjax.solvers.krylov import conjugate_gradients
+from liverjax.tensors import matrices
 
 
 def _mass_and_weight(scene: lj.Scene) -> tuple[jax.Array, jax.Array]:
@@ -26,7 +30,7 @@ def critical_step(scene: lj.Scene) -> jax.Array:
     mask = boundary.free_degrees(scene.mesh, scene.fixed, ())
 
     def stiffness(v):
-        return jnp.stack(assembly.product(A, v.T), axis=-1)
+        return jnp.stack(block_matrix.product(A, v.T), axis=-1)
 
     def iterate(_, v):
         w = mask * stiffness(mask * v) / mass
@@ -56,11 +60,11 @@ def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
     return jax.lax.scan(block, (mesh.points, v), length=steps // keep)[1]
 
 
-def _rotation(F: kinematics.Matrix) -> kinematics.Matrix:
+def _rotation(F: matrices.Matrix) -> matrices.Matrix:
     """The rotation of a polar decomposition: nine of Higham's iterations R <- (R + R^-T) / 2."""
     for _ in range(9):
-        cof = kinematics.cofactor(F)
-        det = kinematics.determinant(F)
+        cof = matrices.cofactor(F)
+        det = matrices.determinant(F)
         F = tuple(tuple(0.5 * (F[i][j] + cof[i][j] / det) for j in range(3)) for i in range(3))
     return F
 
@@ -73,21 +77,21 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
     mesh = scene.mesh
     mass, weight = _mass_and_weight(scene)
     mask = boundary.free_degrees(mesh, scene.fixed, ())
-    rest = tangent.element_blocks(scene, None, None, kinematics.deformation_gradient(mesh, mesh.points))
+    rest = tangent.element_blocks(scene, None, None, matrices.deformation_gradient(mesh, mesh.points))
     own = mjed.element_stiffness(mesh, scene.law, mesh.points)
     full = mjed.all_blocks(own)
     corners = [tuple(mesh.points[mesh.tetrahedra[:, a]].T) for a in range(4)]
 
     def rotated(R, K):
-        return kinematics.matmul(kinematics.matmul(R, K), kinematics.transpose(R))
+        return matrices.matmul(matrices.matmul(R, K), matrices.transpose(R))
 
     def advance(state, _):
         x, v = state
-        R = _rotation(kinematics.deformation_gradient(mesh, x))
+        R = _rotation(matrices.deformation_gradient(mesh, x))
         turned_back = [
-            kinematics.add(
-                kinematics.matvec(kinematics.transpose(R), tuple(x[mesh.tetrahedra[:, a]].T)),
-                kinematics.scale(-1.0, corners[a]),
+            matrices.add(
+                matrices.matvec(matrices.transpose(R), tuple(x[mesh.tetrahedra[:, a]].T)),
+                matrices.scale(-1.0, corners[a]),
             )
             for a in range(4)
         ]
@@ -95,20 +99,20 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
         for a in range(4):
             f = (0.0, 0.0, 0.0)
             for b in range(4):
-                f = kinematics.add(f, kinematics.matvec(full[a][b], turned_back[b]))
-            force = force.at[mesh.tetrahedra[:, a]].add(jnp.stack(kinematics.matvec(R, f), axis=-1))
-        A = assembly.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, mass[:, 0] / dt**2)
-        inverse = assembly.inverse_blocks(A.diagonal, mask)
+                f = matrices.add(f, matrices.matvec(full[a][b], turned_back[b]))
+            force = force.at[mesh.tetrahedra[:, a]].add(jnp.stack(matrices.matvec(R, f), axis=-1))
+        A = block_matrix.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, mass[:, 0] / dt**2)
+        inverse = block_matrix.inverse_blocks(A.diagonal, mask)
 
         def precondition(r):
-            return jnp.concatenate(assembly.applied(inverse, assembly.columns(r)))
+            return jnp.concatenate(block_matrix.applied(inverse, block_matrix.columns(r)))
 
         def matvec(u):
-            return mask.T.ravel() * jnp.concatenate(assembly.product(A, assembly.columns(mask.T.ravel() * u)))
+            return mask.T.ravel() * jnp.concatenate(block_matrix.product(A, block_matrix.columns(mask.T.ravel() * u)))
 
         b = mask * (weight - force + mass * v / dt)
-        dx, _ = conjugate_gradients(matvec, assembly.flat(b), precondition, 1e-4, 2000)
-        dx = jnp.stack(assembly.columns(dx), axis=-1)
+        dx, _ = conjugate_gradients(matvec, block_matrix.flat(b), precondition, 1e-4, 2000)
+        dx = jnp.stack(block_matrix.columns(dx), axis=-1)
         return (x + dx, dx / dt), x + dx
 
     return jax.lax.scan(advance, (mesh.points, jnp.zeros_like(mesh.points)), length=steps)[1]

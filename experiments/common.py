@@ -17,7 +17,7 @@ import matplotlib.ticker
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from liverjax.versions import versions
+from liverjax.core.versions import versions
 
 #: Fewer cases and smaller ones, for a look at whether everything runs; published results stay as they are.
 QUICK = "--quick" in sys.argv[1:]

@@ -14,11 +14,13 @@ import numpy as np
 from common import plt, save
 
 import liverjax as lj
-from fitting import joint, prony, rigs
-from fitting.rheometer import Sweep
-from liverjax.colours import COLOURS
+from fitting.fits import joint
+from fitting.methods import generalised_maxwell
+from fitting.readers.rheometer import Sweep
+from fitting.rigs import glued
+from liverjax.core.plotting import COLOURS
 
-TRUE = prony.Maxwell(jnp.asarray(770.0), jnp.array([0.2, 0.2, 0.25]), jnp.array([30.0, 1.0, 0.05]))
+TRUE = generalised_maxwell.Maxwell(jnp.asarray(770.0), jnp.array([0.2, 0.2, 0.25]), jnp.array([30.0, 1.0, 0.05]))
 LAW = lj.laws.NeoHookean(mu=1.0, bulk=20.0)
 RADIUS, HEIGHT, CELL, NOISE = 0.01, 0.01, 0.004, 0.02
 
@@ -26,28 +28,28 @@ RADIUS, HEIGHT, CELL, NOISE = 0.01, 0.01, 0.004, 0.02
 def sweep(rng: np.random.Generator) -> joint.Test:
     """Seventeen frequencies."""
     omega = 2 * np.pi * np.logspace(-1, 1, 17)
-    pure = [np.asarray(m) for m in prony.moduli(TRUE, jnp.asarray(omega))]
+    pure = [np.asarray(m) for m in generalised_maxwell.moduli(TRUE, jnp.asarray(omega))]
     noisy = [m * (1 + NOISE * rng.normal(size=m.shape)) for m in pure]
     return joint.sweep(Sweep(omega, *noisy, *(NOISE * m for m in pure), "synthetic"))
 
 
-def readings(fine: rigs.Rig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def readings(fine: glued.Rig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """What a rig of half the time step shows at every second step, with noise, and its standard deviation."""
     viscosity = lj.Prony(ratios=TRUE.ratios, relaxation_times=TRUE.relaxation_times)
-    pure = np.asarray(rigs.read(fine, lj.laws.scaled(LAW, TRUE.shear_modulus), viscosity)[0])[1::2]
+    pure = np.asarray(glued.read(fine, lj.laws.scaled(LAW, TRUE.shear_modulus), viscosity)[0])[1::2]
     return pure + NOISE * abs(pure) * rng.normal(size=pure.shape), NOISE * abs(pure)
 
 
 def creep(rng: np.random.Generator, seconds: float, dt: float = 1.0) -> joint.Test:
     """A pull of 20 Pa."""
-    made = [rigs.creep(RADIUS, HEIGHT, h, round(seconds / h), 20.0, CELL) for h in (dt, dt / 2)]
+    made = [glued.creep(RADIUS, HEIGHT, h, round(seconds / h), 20.0, CELL) for h in (dt, dt / 2)]
     return joint.through("creep", made[0], *readings(made[1], rng))
 
 
 def pull(rng: np.random.Generator, seconds: float, dt: float = 0.5) -> joint.Test:
     """5 % within a step, then held."""
     made = [
-        rigs.tension(RADIUS, HEIGHT, h, 0.05 * np.minimum(1, h / dt * np.arange(1, round(seconds / h) + 1)), CELL)
+        glued.tension(RADIUS, HEIGHT, h, 0.05 * np.minimum(1, h / dt * np.arange(1, round(seconds / h) + 1)), CELL)
         for h in (dt, dt / 2)
     ]
     return joint.through("pull", made[0], *readings(made[1], rng))
@@ -57,7 +59,7 @@ def main(quick: bool) -> None:
     """A row a choice of tests; figure of intervals."""
     rng = np.random.default_rng(0)
     tests = {"sweep": sweep(rng), "creep": creep(rng, 10 if quick else 120), "pull": pull(rng, 5 if quick else 30)}
-    start = prony.Maxwell(jnp.asarray(700.0), jnp.array([0.25, 0.2, 0.2]), jnp.array([20.0, 1.5, 0.08]))
+    start = generalised_maxwell.Maxwell(jnp.asarray(700.0), jnp.array([0.25, 0.2, 0.2]), jnp.array([20.0, 1.5, 0.08]))
     true = np.asarray([float(TRUE.shear_modulus), *np.asarray(TRUE.ratios), *np.asarray(TRUE.relaxation_times)])
     rows = []
     for names in (("sweep",), ("creep",), ("sweep", "creep"), ("sweep", "pull"), ("sweep", "creep", "pull")):

@@ -8,8 +8,10 @@ from pathlib import Path
 
 from common import either, save
 
-from fitting import curves, curves_report, stress_stretch
-from fitting.report import numbers
+from fitting.fits import stress_stretch
+from fitting.readers import curves
+from fitting.reports import curves_report
+from fitting.reports.sweep_report import numbers
 
 DATA = Path(__file__).parent.parent / "data"
 LAWS = either(("all",), ("neo_hookean", "veronda_westmann"))

@@ -12,9 +12,11 @@ import numpy as np
 from common import either, plt, save, timed
 
 import liverjax as lj
-from liverjax import homogeneous, laws, viscosity
-from liverjax.colours import BLUE, COLOURS, GREY, ORANGE
-from liverjax.kinematics import pack, unpack
+from liverjax import laws
+from liverjax.core.plotting import BLUE, COLOURS, GREY, ORANGE
+from liverjax.laws import homogeneous
+from liverjax.physics import viscosity
+from liverjax.tensors.matrices import pack, unpack
 
 #: The chapter's Table 1, and Costa's law (fibres along 1). It and St Venant-Kirchhoff are no isochoric forms: taken at
 #: det F = 1.

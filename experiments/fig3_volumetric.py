@@ -8,8 +8,8 @@ import numpy as np
 from common import plt, save
 
 import liverjax as lj
-from liverjax import porosity
-from liverjax.colours import BLUE, GREY, ORANGE
+from liverjax.core.plotting import BLUE, GREY, ORANGE
+from liverjax.physics import porosity
 
 
 def main() -> None:

@@ -16,9 +16,11 @@ import numpy as np
 from common import either, plain_ticks, plt, save
 
 import liverjax as lj
-from liverjax import laws, mjed, tangent
-from liverjax.colours import BLUE, COLOURS, GREY
-from liverjax.errors import InputError
+from liverjax import laws
+from liverjax.core.errors import InputError
+from liverjax.core.plotting import BLUE, COLOURS, GREY
+from liverjax.elements import mjed
+from liverjax.simulation import tangent
 
 WAYS = {
     "contracted": assembly_rivals.contracted,

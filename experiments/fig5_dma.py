@@ -12,11 +12,13 @@ import numpy as np
 from common import plain_ticks, plt, save, timed
 
 import liverjax as lj
-from fitting import fit, prony, torsion
-from fitting.rheometer import read_sweep
-from fitting.torsion import Drive
-from liverjax.colours import BLUE, GREEN, GREY, ORANGE
-from liverjax.struct import replace
+from fitting.fits import viscoelastic
+from fitting.methods import generalised_maxwell
+from fitting.readers.rheometer import read_sweep
+from fitting.rigs import torsion
+from fitting.rigs.torsion import Drive
+from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE
+from liverjax.core.struct import replace
 
 DATA = Path(__file__).parent.parent / "data"
 TABLE_2 = lj.Prony(ratios=jnp.array([0.235, 0.333]), relaxation_times=jnp.array([0.27, 0.03]))
@@ -90,10 +92,10 @@ def mesh_table(sweep, cells: tuple[float, ...]) -> list[dict]:
 def modes_table() -> list[dict]:
     """What a finite number of modes costs on a real tissue (the chapter's measured points exist only as a picture)."""
     sweep = read_sweep(DATA / "lions_mane_frequency_sweep.csv")
-    dense = prony.spectrum(sweep)
+    dense = generalised_maxwell.spectrum(sweep)
     rows = []
     for modes in (1, 2, 3, 4, 5):
-        f = fit.closed_form(sweep, modes, dense)
+        f = viscoelastic.closed_form(sweep, modes, dense)
         rows.append(
             {"modes": modes, "mean": float(f.relative_errors(sweep).mean()), "run_s": f.run_time}
             | {"compile_s": f.compile_time}

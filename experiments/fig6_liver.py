@@ -12,8 +12,8 @@ from common import either, plain_ticks, plt, save
 from liver import error, models, timed_run, with_solve
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from liverjax.boundary import boundary_triangles
-from liverjax.colours import COLOURS
+from liverjax.core.plotting import COLOURS
+from liverjax.physics.boundary import boundary_triangles
 
 SECONDS, AT = either((2.4, (0.6, 1.2, 1.8, 2.4)), (1.2, (0.6, 1.2)))
 PICTURES = (0.05, 0.15, 0.25, 0.4, 0.8)

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 from common import plain_ticks, plt, save
 
-from fitting import fit
-from fitting.rheometer import Sweep, read_sweep
-from liverjax.colours import BLUE, ORANGE
+from fitting.fits import viscoelastic
+from fitting.readers.rheometer import Sweep, read_sweep
+from liverjax.core.plotting import BLUE, ORANGE
 
 DATA = Path(__file__).parent.parent / "data" / "porcine_liver_frequency_sweep.csv"
 TRUE = np.array([770.0, 0.235, 0.333, 0.27, 0.03])
 
 
-def row(name: str, found: fit.Fit) -> dict:
+def row(name: str, found: viscoelastic.Fit) -> dict:
     """Mean relative error of G0, ratios and times, and what the fit took."""
     off = found.uncertainty.values / TRUE - 1
     return {
@@ -35,15 +35,17 @@ def row(name: str, found: fit.Fit) -> dict:
 
 def ways(sweep: Sweep, quick: bool) -> list[dict]:
     """A row a way."""
-    closed = fit.closed_form(sweep, 2)
+    closed = viscoelastic.closed_form(sweep, 2)
     rows = [
         row("closed form, Levenberg-Marquardt", closed),
-        row("closed form, BFGS", fit.closed_form(sweep, 2, optimizer="bfgs")),
+        row("closed form, BFGS", viscoelastic.closed_form(sweep, 2, optimizer="bfgs")),
     ]
     cases = [("exponential", n) for n in (10, 20, 50, 100)] + [("chapter", n) for n in (50, 100)]
     for scheme, steps in cases[:1] if quick else cases:
-        simulation = fit.Simulation(scheme=scheme, steps=steps)
-        rows.append(row(f"torsion, {scheme} recursion, {steps} steps", fit.through_torsion(sweep, closed, simulation)))
+        simulation = viscoelastic.Simulation(scheme=scheme, steps=steps)
+        rows.append(
+            row(f"torsion, {scheme} recursion, {steps} steps", viscoelastic.through_torsion(sweep, closed, simulation))
+        )
         print(rows[-1], flush=True)
     return rows
 

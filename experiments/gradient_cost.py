@@ -20,9 +20,9 @@ from common import plt, save
 from liver import models, with_solve
 
 import liverjax as lj
-from liverjax import checkpointing, gradients
-from liverjax.colours import BLUE, GREEN, ORANGE
-from liverjax.struct import replace
+from liverjax.core.plotting import BLUE, GREEN, ORANGE
+from liverjax.core.struct import replace
+from liverjax.simulation import checkpoints, gradients
 
 
 def small() -> lj.Scene:
@@ -81,7 +81,7 @@ def measure(model: str, steps: int, store: str) -> dict:
         "tetrahedra": scene.mesh.number_of_elements,
         "steps": steps,
         "store": store,
-        "states_kept": checkpointing.number_kept(kept, steps),
+        "states_kept": checkpoints.number_kept(kept, steps),
         "forward_s": forward_s,
         "gradient_s": gradient_s,
         "ratio": gradient_s / forward_s,

@@ -12,10 +12,11 @@ from common import either, plt, save
 from liver import models, timed_run
 
 import liverjax as lj
-from liverjax import laws, status
-from liverjax.colours import COLOURS
-from liverjax.kinematics import deformation_gradient, determinant
-from liverjax.struct import replace
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.plotting import COLOURS
+from liverjax.core.struct import replace
+from liverjax.tensors.matrices import deformation_gradient, determinant
 
 STEPS = either(20, 10)
 RELAXED = 1 - 0.235 - 0.333

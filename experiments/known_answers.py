@@ -18,8 +18,9 @@ import numpy as np
 from common import plain_ticks, plt, save
 
 import liverjax as lj
-from liverjax import boundary, status
-from liverjax.colours import BLUE, GREEN, GREY, ORANGE
+from liverjax.core import status
+from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE
+from liverjax.physics import boundary
 
 MM = 1e-3
 

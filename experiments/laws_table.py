@@ -14,8 +14,9 @@ import numpy as np
 from common import either, plt, save
 
 import liverjax as lj
-from liverjax import laws, mjed
-from liverjax.colours import BLUE, GREY, ORANGE
+from liverjax import laws
+from liverjax.core.plotting import BLUE, GREY, ORANGE
+from liverjax.elements import mjed
 
 ROUNDS = either(15, 3)
 

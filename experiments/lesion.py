@@ -2,9 +2,9 @@
 
 The liver is held from below and hangs under its weight in three positions. The truth is computed with 342,464
 tetrahedra (every one of the phantom's cut into 64). Found are a smooth map of the shear modulus with its uncertainty
-(`fitting.field`), with the phantom's 5,351, and from it a sphere (`fitting.inclusion`), with 42,808: a sphere's modulus
-needs elements that are small beside it. No noise, 1 % and 5 % of the largest displacement; what a mesh misses for a
-uniform body beside the finest counts as noise.
+(`fitting.fits.field`), with the phantom's 5,351, and from it a sphere (`fitting.fits.inclusion`), with 42,808: a
+sphere's modulus needs elements that are small beside it. No noise, 1 % and 5 % of the largest displacement;
+what a mesh misses for a uniform body beside the finest counts as noise.
 
     python experiments/lesion.py [--quick]
 """
@@ -19,11 +19,11 @@ import numpy as np
 from common import plt, save
 
 import liverjax as lj
-from fitting import field, inclusion, scenes
-from fitting.displacements import read_displacements
-from fitting.field_report import section
-from liverjax.boundary import boundary_triangles
-from liverjax.colours import ORANGE
+from fitting.fits import field, inclusion, scene_numbers
+from fitting.readers.displacements import read_displacements
+from fitting.reports.field_report import section
+from liverjax.core.plotting import ORANGE
+from liverjax.physics.boundary import boundary_triangles
 
 MESH = Path(__file__).parent.parent / "data" / "liver_phantom.vtu"
 CENTRE, RADIUS, MU, STIFFER = np.array([0.06, 0.005, 0.008]), 0.025, 770.0, 3.0
@@ -82,7 +82,7 @@ def displaced(scene: lj.Scene, nodes: np.ndarray) -> np.ndarray:
     return np.asarray(lj.simulate(scene).check().positions[-1] - scene.mesh.points)[nodes]
 
 
-def problem_of(mesh: lj.TetMesh, seen: np.ndarray, u: list, sd: list, noise: float, seed: int) -> scenes.Problem:
+def problem_of(mesh: lj.TetMesh, seen: np.ndarray, u: list, sd: list, noise: float, seed: int) -> scene_numbers.Problem:
     """What a user has: scenes and CSV files. Fits begin at 1.3 times the true background."""
     rng, X = np.random.default_rng(seed), np.asarray(mesh.points)
     made, data = [], []
@@ -95,10 +95,10 @@ def problem_of(mesh: lj.TetMesh, seen: np.ndarray, u: list, sd: list, noise: flo
             np.savetxt(file, rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
             data.append(read_displacements(file, scene, noise=float(np.hypot(size, model))))
         made.append(scene)
-    return scenes.Problem(tuple(made), tuple(data))
+    return scene_numbers.Problem(tuple(made), tuple(data))
 
 
-def mapped(problem: scenes.Problem, noise: float, length: float, iterations: int) -> tuple[dict, field.Field]:
+def mapped(problem: scene_numbers.Problem, noise: float, length: float, iterations: int) -> tuple[dict, field.Field]:
     """The map: one row."""
     mesh = problem.scenes[0].mesh
     found = field.estimate(problem, "law.mu", length=length, max_iterations=iterations)
@@ -123,7 +123,7 @@ def mapped(problem: scenes.Problem, noise: float, length: float, iterations: int
     }, found
 
 
-def sphere_in(problem: scenes.Problem, start: np.ndarray) -> dict:
+def sphere_in(problem: scene_numbers.Problem, start: np.ndarray) -> dict:
     """The sphere: one row."""
     found = inclusion.estimate(problem, "law.mu", start)
     values = dict(zip(found.names, found.values.tolist(), strict=True))

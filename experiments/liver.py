@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 import liverjax as lj
-from liverjax import status
-from liverjax.struct import replace
+from liverjax.core import status
+from liverjax.core.struct import replace
 
 SCENE = Path(__file__).parent / "scenes" / "liver_gravity.toml"
 

@@ -14,8 +14,8 @@ from baselines import corotational, critical_step, explicit
 from common import either, plain_ticks, plt, save
 from liver import error, models, timed_run, with_solve
 
-from liverjax.colours import COLOURS
-from liverjax.struct import replace
+from liverjax.core.plotting import COLOURS
+from liverjax.core.struct import replace
 
 SECONDS, AT = either((1.8, (0.6, 1.2, 1.8)), (0.6, (0.6,)))
 

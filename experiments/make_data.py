@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.prony import Maxwell, moduli
+from fitting.methods.generalised_maxwell import Maxwell, moduli
 
 DATA = Path(__file__).parent.parent / "data"
 

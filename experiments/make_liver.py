@@ -13,7 +13,7 @@ import tetgen
 from skimage.measure import marching_cubes
 
 import liverjax as lj
-from liverjax.boundary import boundary_triangles
+from liverjax.physics.boundary import boundary_triangles
 
 FILE = Path(__file__).parent.parent / "data" / "liver_phantom.vtu"
 #: Lobes as ellipsoids: centre and semi-axes [m]; the left one is flatter and thins out.

@@ -17,9 +17,10 @@ from liver import models, timed_run, with_solve
 from solve_benchmark import cube, medians
 
 import liverjax as lj
-from liverjax import mjed, status
-from liverjax.colours import BLUE, ORANGE
-from liverjax.struct import replace
+from liverjax.core import status
+from liverjax.core.plotting import BLUE, ORANGE
+from liverjax.core.struct import replace
+from liverjax.elements import mjed
 
 PRECISIONS = {"float64": jnp.float64, "float32": jnp.float32}
 

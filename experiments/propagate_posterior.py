@@ -19,9 +19,9 @@ from liver import models, with_solve
 from tqdm import tqdm
 
 import liverjax as lj
-from fitting.fit import closed_form
-from fitting.rheometer import read_sweep
-from liverjax import status
+from fitting.fits.viscoelastic import closed_form
+from fitting.readers.rheometer import read_sweep
+from liverjax.core import status
 
 SWEEP = "data/porcine_liver_frequency_sweep.csv"
 NOISE, SEED, DRAWS, SOBOL, SECONDS, DT, LANES = 0.05, 3, either(256, 16), either(64, 4), 1.0, 0.05, either(32, 4)

@@ -16,8 +16,8 @@ from assembly_rivals import contracted
 from common import either, plain_ticks, plt, save
 
 import liverjax as lj
-from liverjax import status
-from liverjax.colours import BLUE, GREEN, ORANGE
+from liverjax.core import status
+from liverjax.core.plotting import BLUE, GREEN, ORANGE
 
 CELLS = either((6, 9, 15, 25, 44, 55), (6, 9))
 SIZE = 0.1

@@ -15,11 +15,13 @@ from common import either, plain_ticks, plt, save
 from liver import models, with_solve
 
 import liverjax as lj
-from liverjax import boundary, status, tangent
-from liverjax.coarse import Coarse
-from liverjax.colours import BLUE, GREY, ORANGE
-from liverjax.linear import conjugate_gradients
-from liverjax.struct import replace
+from liverjax.core import status
+from liverjax.core.plotting import BLUE, GREY, ORANGE
+from liverjax.core.struct import replace
+from liverjax.physics import boundary
+from liverjax.simulation import tangent
+from liverjax.solvers.krylov import conjugate_gradients
+from liverjax.solvers.preconditioner import Coarse
 
 ROUNDS = either(5, 1)
 CELLS, RATIOS, STIFFER = either((15, (10.0, 50.0, 500.0), (1e1, 1e3, 1e5)), (8, (50.0,), (1e1,)))

@@ -15,9 +15,11 @@ import numpy as np
 from common import either, plain_ticks, save
 
 import liverjax as lj
-from liverjax import boundary, shapes, status
-from liverjax.colours import COLOURS
-from liverjax.kinematics import deformation_gradient, determinant
+from liverjax.core import status
+from liverjax.core.plotting import COLOURS
+from liverjax.mesh import shapes
+from liverjax.physics import boundary
+from liverjax.tensors.matrices import deformation_gradient, determinant
 
 MU = 770.0
 RATIOS = either((1.0, 10.0, 100.0, 1e3, 1e4, 1e5), (1e3,))

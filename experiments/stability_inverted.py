@@ -21,7 +21,10 @@ from common import RESULTS, either, save
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import liverjax as lj
-from liverjax import boundary, laws, shapes, status
+from liverjax import laws
+from liverjax.core import status
+from liverjax.mesh import shapes
+from liverjax.physics import boundary
 
 MESH = shapes.box((0.1, 0.1, 0.1), (3, 3, 3))
 PARTS, SEEDS, FLAT = (0.0, 0.05, 0.2, 0.5), either(50, 4), 0.05

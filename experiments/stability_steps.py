@@ -13,10 +13,10 @@ from common import either, save
 from liver import models, timed_run
 
 import liverjax as lj
-from liverjax import status
-from liverjax.colours import COLOURS
-from liverjax.kinematics import deformation_gradient, determinant
-from liverjax.struct import replace
+from liverjax.core import status
+from liverjax.core.plotting import COLOURS
+from liverjax.core.struct import replace
+from liverjax.tensors.matrices import deformation_gradient, determinant
 
 STEPS = either(20, 5)
 SIZES = either((1e-3, 0.01, 0.05, 0.15, 0.3, 1.0, 3.0, 10.0), (0.05, 1.0))

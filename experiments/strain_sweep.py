@@ -8,9 +8,9 @@ import numpy as np
 from common import either, plt, save, timed
 
 import liverjax as lj
-from fitting import torsion
-from fitting.torsion import Drive
-from liverjax.colours import BLUE, GREEN, GREY, ORANGE
+from fitting.rigs import torsion
+from fitting.rigs.torsion import Drive
+from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE
 
 STYLES = {
     "neo_hookean": (BLUE, "o-"),

@@ -21,7 +21,7 @@ from liver import SCENE
 
 import liverjax as lj
 from liverjax.__main__ import main as command
-from liverjax.struct import replace
+from liverjax.core.struct import replace
 
 RANGES = {
     "law.mu": (700.0, 2800.0),

@@ -5,9 +5,9 @@ import os
 import sys
 from pathlib import Path
 
-from fitting.exit_codes import EXIT_CODES
-from liverjax.errors import InputError
-from liverjax.folders import writable
+from fitting.commands.exit_codes import EXIT_CODES
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
 
 
 def _modes(text: str) -> int | str:
@@ -74,7 +74,10 @@ def _progress(sweep_size: int):
 
 def identify(options: argparse.Namespace) -> int:
     """Run the fit that the options ask for; the exit code."""
-    from fitting import fit, prony, report, rheometer, uncertainty
+    from fitting.fits import viscoelastic
+    from fitting.methods import generalised_maxwell, uncertainty
+    from fitting.readers import rheometer
+    from fitting.reports import sweep_report
     from liverjax import laws
 
     for name in ("radius", "height"):
@@ -89,30 +92,30 @@ def identify(options: argparse.Namespace) -> int:
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     if options.modes != "auto":
-        fit.check_modes(sweep, options.modes)
-    dense = prony.refuse_impossible(sweep)
+        viscoelastic.check_modes(sweep, options.modes)
+    dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
     if options.modes == "auto":
-        closed = fit.choose_modes(sweep, dense, options.optimizer)[0]
+        closed = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
     else:
-        closed = fit.closed_form(sweep, options.modes, dense, options.optimizer)
+        closed = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
     fits = [closed]
     if options.method == "torsion":
-        simulation = fit.Simulation(
-            radius=options.radius or fit.Simulation().radius,
-            height=options.height or fit.Simulation().height,
+        simulation = viscoelastic.Simulation(
+            radius=options.radius or viscoelastic.Simulation().radius,
+            height=options.height or viscoelastic.Simulation().height,
             law=options.law,
             scheme=options.scheme,
             steps=options.steps,
         )
         update, bar = _progress(len(sweep.angular_frequency))
         with bar:
-            fits.append(fit.through_torsion(sweep, closed, simulation, options.optimizer, update))
+            fits.append(viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, update))
     profile = None
     if options.profile:
         profile = uncertainty.profile_intervals(closed.solution, sweep, closed.uncertainty)
-    report.write(options.out, sweep, fits, profile)
-    print(report.table(sweep, fits))
+    sweep_report.write(options.out, sweep, fits, profile)
+    print(sweep_report.table(sweep, fits))
     if profile is not None:
         for name, (low, high) in profile.items():
             ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
@@ -127,7 +130,9 @@ def identify_laws(options: argparse.Namespace) -> int:
     """Fit one law, or all, to the curves; the exit code."""
     from tqdm import tqdm
 
-    from fitting import curves, curves_report, stress_stretch
+    from fitting.fits import stress_stretch
+    from fitting.readers import curves
+    from fitting.reports import curves_report
     from liverjax import laws
 
     candidates = stress_stretch.candidates(options.law, options.terms)
@@ -157,7 +162,7 @@ def main(arguments: list[str] | None = None) -> int:
         if arguments[:1] == ["curves"]:
             return identify_laws(_curves_parser().parse_args(arguments[1:]))
         if arguments[:1] == ["field"]:
-            from fitting import field_command
+            from fitting.commands import field_command
 
             return field_command.identify(field_command.parser().parse_args(arguments[1:]))
         return identify(_parser().parse_args(arguments))

@@ -4,6 +4,7 @@ Importing turns on JAX's 64-bit mode unless the environment sets ``JAX_ENABLE_X6
 """
 
 import os
+import sys
 
 import jax
 
@@ -15,23 +16,31 @@ if jax.__version__ in ("0.10.2", "0.11.0"):
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-from liverjax import boundary, laws, mjed, reference, shapes, viscosity
-from liverjax.batch import Batch, simulate_batch
-from liverjax.boundary import Displaced, Fixed, Traction
-from liverjax.errors import InputError
-from liverjax.gradients import Gradient, value_and_gradient
+from liverjax import laws
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.elements import mjed, reference
 from liverjax.laws import Law
-from liverjax.mesh import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
-from liverjax.porosity import Porosity
-from liverjax.regions import Region
-from liverjax.scene import Body, Scene, Solve, with_parameters
-from liverjax.scene_checks import check_scene
-from liverjax.scene_file import load_scene
-from liverjax.simulation import Result, simulate
-from liverjax.struct import param, static, struct
-from liverjax.viscosity import Prony
+from liverjax.mesh import shapes
+from liverjax.mesh.tetrahedra import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
+from liverjax.physics import boundary, viscosity
+from liverjax.physics.boundary import Displaced, Fixed, Traction
+from liverjax.physics.porosity import Porosity
+from liverjax.physics.viscosity import Prony
+from liverjax.scenes.regions import Region
+from liverjax.scenes.scene import Body, Scene, Solve, with_parameters
+from liverjax.scenes.scene_checks import check_scene
+from liverjax.scenes.scene_file import load_scene
+from liverjax.simulation import gradients
+from liverjax.simulation.batch import Batch, simulate_batch
+from liverjax.simulation.gradients import Gradient, value_and_gradient
+from liverjax.simulation.run import Result, simulate
 
 __version__ = "0.1.0"
+
+# `from liverjax.shapes import box` and the like, as users have written them, still find these modules.
+for _module in (boundary, gradients, mjed, reference, shapes, viscosity):
+    sys.modules[f"liverjax.{_module.__name__.rpartition('.')[2]}"] = _module
 
 __all__ = [
     "Batch",

@@ -8,8 +8,8 @@ import warnings
 from pathlib import Path
 
 from liverjax import laws
-from liverjax.errors import InputError
-from liverjax.folders import writable
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
 from liverjax.laws.volumetric import VOLUMETRIC
 
 
@@ -39,13 +39,13 @@ def check_law(name: str, out: Path) -> int:
     """Print the table of a law's gradient check and draw it; 1 if a row failed."""
     import jax
 
-    from liverjax import check, figures
+    from liverjax.laws import figures, gradient_check
 
     jax.config.update("jax_enable_x64", True)  # its limits are those of 64 bits
-    law = check.load(name)
+    law = gradient_check.load(name)
     file = _target(out, f"check_{_label(name)}.png")
-    result = check.check(law)
-    print(check.table(result))
+    result = gradient_check.check(law)
+    print(gradient_check.table(result))
     figures.gradient_check(result, _label(name), file)
     print(f"written: {file}")
     for row in result.failed:
@@ -55,7 +55,7 @@ def check_law(name: str, out: Path) -> int:
 
 def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
     """Draw the stress-stretch curves of laws."""
-    from liverjax import check, figures
+    from liverjax.laws import figures, gradient_check
 
     if not 0 < stretches[0] < 1 < stretches[1] <= 20:
         raise InputError(
@@ -63,7 +63,7 @@ def plot_laws(names: list[str], out: Path, stretches: list[float]) -> int:
         )
     names = [n for name in names for n in (laws.LAWS if name == "all" else [name])]
     labels = [_label(name) for name in names]
-    named = {n if labels.count(k) > 1 else k: check.load(n) for k, n in zip(labels, names, strict=True)}
+    named = {n if labels.count(k) > 1 else k: gradient_check.load(n) for k, n in zip(labels, names, strict=True)}
     file = _target(out, "laws.png")
     figures.curves(named, file, (stretches[0], stretches[1]))
     print(f"written: {file}")
@@ -75,8 +75,11 @@ def run_scene(options: argparse.Namespace) -> int:
     import numpy as np
     from tqdm import tqdm
 
-    from liverjax import long_run, output, parts, porosity, scene_file, status
-    from liverjax.versions import versions
+    from liverjax.core import status
+    from liverjax.core.versions import versions
+    from liverjax.jobs import long_run, output, parts
+    from liverjax.physics import porosity
+    from liverjax.scenes import scene_file
 
     file, out = options.scene, options.out
     read, text = scene_file.load_scene(file), file.read_text(encoding="utf-8")
@@ -156,7 +159,8 @@ def run_sweep(options: argparse.Namespace) -> int:
         jax.config.update("jax_num_cpu_devices", options.devices)
     process = (0, 1) if options.distributed is None else _share(options.distributed)
 
-    from liverjax import status, sweep
+    from liverjax.core import status
+    from liverjax.jobs import sweep
 
     table = sweep.read_sweep(
         options.scene,
@@ -190,7 +194,7 @@ def run_sweep(options: argparse.Namespace) -> int:
 
 def write_design(options: argparse.Namespace) -> int:
     """Write a table of parameters for a sweep."""
-    from liverjax import design
+    from liverjax.jobs import design
 
     ranges = design.read_ranges(options.range)
     rows = design.design(ranges, options.rows, options.kind, options.seed)

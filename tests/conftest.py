@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax.versions import versions
+from liverjax.core.versions import versions
 
 matplotlib.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")

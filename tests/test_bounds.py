@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import bounds, porosity, scene_checks, viscosity
-from liverjax.struct import replace
+from liverjax.core import bounds
+from liverjax.core.struct import replace
+from liverjax.physics import porosity, viscosity
+from liverjax.scenes import scene_checks
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -74,7 +76,7 @@ def spoiled() -> list:
 @pytest.mark.parametrize(("scene", "sentence"), spoiled())
 def test_scenes_made_in_python_are_refused_before_any_compile(scene, sentence, monkeypatch):
     monkeypatch.setattr(scene_checks, "check_mesh", lambda mesh: pytest.fail("bounds come first"))
-    monkeypatch.setattr("liverjax.simulation._run", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr("liverjax.simulation.run._run", lambda *_: pytest.fail("it was run"))
     for refuse in (lj.check_scene, lj.simulate):
         with pytest.raises(lj.InputError, match=re.escape(sentence)) as caught:
             refuse(scene)
@@ -82,7 +84,7 @@ def test_scenes_made_in_python_are_refused_before_any_compile(scene, sentence, m
 
 
 def test_a_sound_scene_passes_and_traced_numbers_are_left_alone(monkeypatch):
-    monkeypatch.setattr("liverjax.simulation._run", lambda scene, *_: scene.law.laws[0].law.mu)
+    monkeypatch.setattr("liverjax.simulation.run._run", lambda scene, *_: scene.law.laws[0].law.mu)
     assert np.asarray(lj.simulate(SOUND)).shape == (MESH.number_of_elements,)
 
     def traced(mu):

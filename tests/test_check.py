@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import check, homogeneous
 from liverjax.__main__ import main
+from liverjax.laws import gradient_check, homogeneous
 
 HEAD = """
 import jax.numpy as jnp
@@ -162,7 +162,7 @@ def test_users_laws_pass_or_are_refused_in_one_sentence(tmp_path, capsys):
 
 
 def test_differences_have_the_v_shape():
-    result = check.check(lj.laws.typical("yeoh"))
+    result = gradient_check.check(lj.laws.typical("yeoh"))
     for errors in result.difference_errors.values():
         k = int(np.argmin(errors))
         assert 1.9 < np.log10(errors[1] / errors[3]) < 2.1  # second order while it falls
@@ -176,9 +176,9 @@ def test_stable_ranges_of_known_laws():
     l = np.linspace(0.1, 1.0, 100_001)
     slope = 2 * ((1 + 2 * l**-3) * (c10 + c01 / l) - (l - l**-2) * c01 / l**2)
     root = l[slope < 0].max()
-    low, _ = check.check(lj.laws.MooneyRivlin(c10=c10, c01=c01, bulk=7700.0)).stable["uniaxial"]
+    low, _ = gradient_check.check(lj.laws.MooneyRivlin(c10=c10, c01=c01, bulk=7700.0)).stable["uniaxial"]
     assert 0 <= low - root < 0.1  # the ellipticity may be lost a little before
-    assert check.check(lj.laws.typical("neo_hookean")).stable["uniaxial"] == (0.2, 4.0)
+    assert gradient_check.check(lj.laws.typical("neo_hookean")).stable["uniaxial"] == (0.2, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_stable_ranges_of_known_laws():
         ("mine.py", "names no law"),
         ("mine.py:Lew", "use Law"),
         ("mine.py:number", "is no law"),
-        ("mine.py:Bare", "write @liverjax.struct"),
+        ("mine.py:Bare", "write @liverjax.core.struct"),
         ("mine.py:NoTypical", "parameter mu has no typical value"),
         ("broken.py:Law", "does not run"),
     ],

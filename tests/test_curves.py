@@ -9,9 +9,10 @@ import pytest
 import scipy.optimize
 
 import liverjax as lj
-from fitting import curves, stress_stretch
 from fitting.__main__ import main
-from liverjax import homogeneous
+from fitting.fits import stress_stretch
+from fitting.readers import curves
+from liverjax.laws import homogeneous
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import boundary, choice, direct, simulation, status, tangent
 from liverjax.__main__ import main
-from liverjax.struct import replace
+from liverjax.core import status
+from liverjax.core.struct import replace
+from liverjax.physics import boundary
+from liverjax.simulation import automatic, run, tangent
+from liverjax.solvers import direct
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -65,16 +68,16 @@ def test_its_gradient_against_differences():
 def test_auto_decides_by_size_and_stiffness():
     static = lj.Scene(mesh=MESH, law=LAW, fixed=HELD)
     stiff = replace(static, law=replace(LAW, bulk=2000 * float(LAW.mu)))
-    assert static.solve.linear_solver == "auto" and choice.linear_solver(static) == "cg"
-    assert choice.linear_solver(stiff) == "direct"
-    assert choice.linear_solver(replace(stiff, solve=replace(stiff.solve, kind="dynamic", dt=0.1))) == "cg"
+    assert static.solve.linear_solver == "auto" and automatic.linear_solver(static) == "cg"
+    assert automatic.linear_solver(stiff) == "direct"
+    assert automatic.linear_solver(replace(stiff, solve=replace(stiff.solve, kind="dynamic", dt=0.1))) == "cg"
     load = lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(MESH, MESH.node_sets["z_max"])), pressure=4.0)
-    assert choice.linear_solver(replace(stiff, traction=(load,))) == "cg"
+    assert automatic.linear_solver(replace(stiff, traction=(load,))) == "cg"
     points = np.asarray(MESH.points) * np.array([1.0, 1.0, 1e-4])
-    assert choice.linear_solver(replace(static, mesh=lj.tet_mesh(points, MESH.tetrahedra))) == "direct"
-    assert abs(choice.thinnest(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]]), np.array([1 / 6])) - 0.77) < 0.01
+    assert automatic.linear_solver(replace(static, mesh=lj.tet_mesh(points, MESH.tetrahedra))) == "direct"
+    assert abs(automatic.thinnest(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]]), np.array([1 / 6])) - 0.77) < 0.01
     seen = []
-    jax.eval_shape(lambda s: seen.append(choice.linear_solver(s)), stiff)
+    jax.eval_shape(lambda s: seen.append(automatic.linear_solver(s)), stiff)
     assert seen == ["cg"]  # traced numbers are not known
 
     @lj.struct
@@ -86,7 +89,7 @@ def test_auto_decides_by_size_and_stiffness():
             return self.mu / 2 * (I.I1 - 3 - 2 * jnp.log(I.J)) + self.mu * (I.J - 1) ** 2
 
     # A law need not state its moduli.
-    assert choice.linear_solver(replace(static, law=Bare(mu=770.0))) == "cg"
+    assert automatic.linear_solver(replace(static, law=Bare(mu=770.0))) == "cg"
     lj.simulate(replace(PULLED, law=Bare(mu=770.0))).check()
 
 
@@ -108,7 +111,7 @@ def test_loads_that_follow_are_refused():
 
 def test_a_number_that_changes_costs_no_compilation():
     lj.simulate(POROUS)
-    before = simulation._run._cache_size()
+    before = run._run._cache_size()
     for path, value in {
         "law.mu": 800.0,
         "law.bulk": 3000.0,
@@ -119,7 +122,7 @@ def test_a_number_that_changes_costs_no_compilation():
         "solve.tolerance": 1e-6,
     }.items():
         lj.simulate(lj.with_parameters(POROUS, {path: value})).check()
-    assert simulation._run._cache_size() == before
+    assert run._run._cache_size() == before
 
 
 def test_a_tangent_goes_from_step_to_step():
@@ -135,7 +138,7 @@ def test_a_tangent_goes_from_step_to_step():
     scene = replace(POROUS, porosity=None, solve=replace(POROUS.solve, dt=0.002, steps=10, tolerance=1e-8))
     tangent.stiffness = counted
     try:
-        result = simulation._run.__wrapped__(scene, None, None, scene.solve.steps)
+        result = run._run.__wrapped__(scene, None, None, scene.solve.steps)
     finally:
         tangent.stiffness = original
     result.check()

@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import boundary, laws, nodal_volume, shapes, status, viscosity
-from liverjax.kinematics import deformation_gradient, determinant
-from liverjax.struct import replace
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.struct import replace
+from liverjax.mesh import shapes
+from liverjax.physics import boundary, nodal_volume, viscosity
+from liverjax.tensors.matrices import deformation_gradient, determinant
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import mjed, reference
+from liverjax.elements import mjed, reference
 
 pytestmark = pytest.mark.quick_to_compile
 

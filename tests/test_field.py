@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting import displacements, field, inclusion, prior, scenes
 from fitting.__main__ import main
-from liverjax.struct import replace
+from fitting.fits import field, inclusion, scene_numbers
+from fitting.methods import prior
+from fitting.readers import displacements
+from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -64,7 +66,7 @@ def problem(tmp_path_factory):
         scene = _scene(folder, gravity=gravity, name=f"{k}.toml")
         made.append(scene)
         data.append(displacements.read_displacements(_write(folder / f"{k}.csv", scene, 5e-5, seed=k), scene, 5e-5))
-    return scenes.Problem(tuple(made), tuple(data))
+    return scene_numbers.Problem(tuple(made), tuple(data))
 
 
 def test_places_in_a_mesh():
@@ -172,7 +174,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
     p, base = prior.prior(mesh, 0.02), field.start_of(problem, "law.mu")
     T = found.deviation * prior.to_nodes(p, np.eye(mesh.number_of_nodes))
     J = np.asarray(
-        jax.jit(jax.jacfwd(lambda m: scenes.misfit(problem, field.values_at(problem, "law.mu", base, m))[0]))(
+        jax.jit(jax.jacfwd(lambda m: scene_numbers.misfit(problem, field.values_at(problem, "law.mu", base, m))[0]))(
             jnp.asarray(found.log_factor)
         )
     )
@@ -217,7 +219,7 @@ def test_few_numbers_of_several_scenes(problem):
         placed = np.einsum("nk,nkc->nc", d.weights, (u + noise)[d.nodes])
         data.append(d._replace(measured=placed))
     wrong = [lj.with_parameters(s, {"law.mu": 500.0, "law.bulk": 5000.0}) for s in problem.scenes]
-    found = scenes.fit_numbers(scenes.Problem(tuple(wrong), tuple(data)), ["law.mu", "law.bulk"])
+    found = scene_numbers.fit_numbers(scene_numbers.Problem(tuple(wrong), tuple(data)), ["law.mu", "law.bulk"])
     assert found.converged and found.names == ("law.mu", "law.bulk")
     assert np.all(np.abs(found.values - [800.0, 3000.0]) < 4 * found.standard_errors)
     assert 0.5 < found.chi2 / found.components < 1.5
@@ -295,7 +297,7 @@ def test_a_sphere_is_found_where_it_is():
         data.append(displacements.Displacements(np.zeros(len(seen), np.int32), nodes, weights, u + noise, sd))
     made = tuple(scene(g, jnp.asarray(900.0)) for g in loads)
     start = np.array([0.030, 0.033, 0.027, np.log(0.013), 0.0, 0.7])
-    found = inclusion.estimate(scenes.Problem(made, tuple(data)), "law.mu", start, max_iterations=30)
+    found = inclusion.estimate(scene_numbers.Problem(made, tuple(data)), "law.mu", start, max_iterations=30)
     values = dict(zip(found.names, found.values, strict=True))
     true = [*np.asarray(centre), 0.016, 800.0, 2400.0]
     assert np.all(np.abs(found.values - true) < 5 * found.standard_errors), (values, found.standard_errors)

@@ -7,10 +7,11 @@ import pytest
 import scipy.optimize
 from conftest import ROOT
 
-from fitting import fit, prony, uncertainty
-from fitting.least_squares import bfgs, levenberg_marquardt
-from fitting.prony import Maxwell
-from fitting.rheometer import Sweep, read_sweep
+from fitting.fits import viscoelastic
+from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.least_squares import bfgs, levenberg_marquardt
+from fitting.readers.rheometer import Sweep, read_sweep
 from liverjax import InputError
 
 TRUTH = np.array([770.0, 0.235, 0.333, 0.27, 0.03])
@@ -22,32 +23,33 @@ def sweep(noise: float = 0.0, seed: int = 0, model: np.ndarray = TRUTH, omega: n
     maxwell = Maxwell(jnp.asarray(model[0]), jnp.asarray(model[1 : n + 1]), jnp.asarray(model[n + 1 :]))
     rng = np.random.default_rng(seed)
     storage, loss = (
-        np.asarray(v) * (1 + noise * rng.standard_normal(len(omega))) for v in prony.moduli(maxwell, jnp.asarray(omega))
+        np.asarray(v) * (1 + noise * rng.standard_normal(len(omega)))
+        for v in generalised_maxwell.moduli(maxwell, jnp.asarray(omega))
     )
     return Sweep(omega, storage, loss)
 
 
-def parameters(f: fit.Fit) -> np.ndarray:
+def parameters(f: viscoelastic.Fit) -> np.ndarray:
     return f.uncertainty.values
 
 
 def test_parametrisation_has_an_inverse():
     for model in (TRUTH, np.array([1e4, 0.5, 1.0]), np.array([1.0, 0.1, 0.2, 0.3, 9.0, 1.0, 1e-3])):
         n = (len(model) - 1) // 2
-        u = prony.unconstrained(
+        u = generalised_maxwell.unconstrained(
             Maxwell(jnp.asarray(model[0]), jnp.asarray(model[1 : n + 1]), jnp.asarray(model[n + 1 :]))
         )
         assert np.allclose(uncertainty.parameter_vector(u), model, rtol=1e-12)
 
 
 def test_noise_free_sweep_is_recovered():
-    f = fit.closed_form(sweep(), 2)
+    f = viscoelastic.closed_form(sweep(), 2)
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() < 1e-6
 
 
 def test_given_deviations_change_the_weights_not_the_answer():
     s = sweep()
-    f = fit.closed_form(s._replace(storage_sd=0.02 * s.storage, loss_sd=5.0 + 0 * s.loss), 2)
+    f = viscoelastic.closed_form(s._replace(storage_sd=0.02 * s.storage, loss_sd=5.0 + 0 * s.loss), 2)
     assert np.abs(parameters(f) / TRUTH - 1).max() < 1e-6
     assert f.uncertainty.noise == 1.0
 
@@ -56,13 +58,17 @@ def test_given_deviations_change_the_weights_not_the_answer():
 def draws():
     """200 seeded sweeps with 2 % noise on every modulus: parameters and standard errors."""
     sweeps = [sweep(0.02, seed) for seed in range(200)]
-    starts = np.stack([prony.starts(s, 2, prony.spectrum(s, per_decade=4), count=4) for s in sweeps])
+    starts = np.stack(
+        [generalised_maxwell.starts(s, 2, generalised_maxwell.spectrum(s, per_decade=4), count=4) for s in sweeps]
+    )
     storage, loss = np.stack([s.storage for s in sweeps]), np.stack([s.loss for s in sweeps])
 
     @jax.jit
     def all_fits(starts, storage, loss):
         def one(u, G1, G2):
-            return levenberg_marquardt(prony.residuals, u, jnp.asarray(OMEGA), G1, G2, jnp.concatenate([G1, G2]))
+            return levenberg_marquardt(
+                generalised_maxwell.residuals, u, jnp.asarray(OMEGA), G1, G2, jnp.concatenate([G1, G2])
+            )
 
         return jax.vmap(jax.vmap(one, in_axes=(0, None, None)))(starts, storage, loss)
 
@@ -90,7 +96,7 @@ def test_intervals_cover(draws):
 
 def test_profile_likelihood():
     s = sweep(0.02, 3)
-    f = fit.closed_form(s, 2)
+    f = viscoelastic.closed_form(s, 2)
     intervals = uncertainty.profile_intervals(f.solution, s, f.uncertainty)
     for j, name in enumerate(f.uncertainty.names):
         low, high = intervals[name]
@@ -105,7 +111,9 @@ def test_profile_likelihood():
 def test_lions_mane_no_worse_than_scipy_from_50_starts(modes):
     s = read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
     scales = np.concatenate(s.deviations)
-    residuals = jax.jit(lambda u: prony.residuals(u, jnp.asarray(s.angular_frequency), s.storage, s.loss, scales))
+    residuals = jax.jit(
+        lambda u: generalised_maxwell.residuals(u, jnp.asarray(s.angular_frequency), s.storage, s.loss, scales)
+    )
     jacobian = jax.jit(jax.jacfwd(residuals))
     rng = np.random.default_rng(0)
     low, high = -np.log(s.angular_frequency[-1]) - 1, -np.log(s.angular_frequency[0]) + 1
@@ -113,20 +121,20 @@ def test_lions_mane_no_worse_than_scipy_from_50_starts(modes):
     for _ in range(50):
         tau = np.exp(np.sort(rng.uniform(low, high, modes))[::-1])
         g = rng.dirichlet(np.ones(modes + 1))[:modes]
-        start = prony.unconstrained(
+        start = generalised_maxwell.unconstrained(
             Maxwell(jnp.asarray(s.storage.max() * rng.uniform(1, 3)), jnp.asarray(g), jnp.asarray(tau))
         )
         best = min(best, scipy.optimize.least_squares(residuals, start, jac=jacobian).cost)
-    f = fit.closed_form(s, modes)
+    f = viscoelastic.closed_form(s, modes)
     assert f.converged and float(f.solution.cost) <= best * (1 + 1e-9)
 
 
 def test_bfgs_finds_the_same_minimum():
     s = sweep(0.02, 1)
-    f = fit.closed_form(s, 2)
+    f = viscoelastic.closed_form(s, 2)
     data = (jnp.asarray(s.angular_frequency), s.storage, s.loss, np.concatenate(s.deviations))
-    start = prony.starts(s, 2, prony.spectrum(s), count=2)[0]
-    found = jax.jit(lambda u, *d: bfgs(prony.residuals, u, *d))(start, *data)
+    start = generalised_maxwell.starts(s, 2, generalised_maxwell.spectrum(s), count=2)[0]
+    found = jax.jit(lambda u, *d: bfgs(generalised_maxwell.residuals, u, *d))(start, *data)
     assert bool(found.converged)
     assert np.isclose(found.cost, f.solution.cost, rtol=1e-6)
 
@@ -134,14 +142,14 @@ def test_bfgs_finds_the_same_minimum():
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_auto_finds_the_two_modes_of_table_2(noise):
     s = sweep(noise, 5)
-    chosen, tried = fit.choose_modes(s, prony.spectrum(s))
+    chosen, tried = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
     assert chosen.modes == 2 and len(tried) <= 4
 
 
 def test_modes_limited_by_points():
     s = sweep(omega=OMEGA[:3])
     with pytest.raises(InputError, match="use at most --modes 2"):
-        fit.closed_form(s, 3)
+        viscoelastic.closed_form(s, 3)
 
 
 def melt() -> Sweep:
@@ -155,75 +163,75 @@ def melt() -> Sweep:
 @pytest.mark.parametrize("modes", [5, 12])
 def test_many_modes_of_a_melt_have_starts(modes):
     s = melt()
-    assert np.all(np.isfinite(prony.starts(s, modes, prony.spectrum(s))))
+    assert np.all(np.isfinite(generalised_maxwell.starts(s, modes, generalised_maxwell.spectrum(s))))
 
 
 def test_where_the_active_set_cycles_the_bounded_solver_finds_the_same(monkeypatch):
     rng = np.random.default_rng(0)
     A, b = rng.uniform(0.1, 1, (20, 4)), rng.uniform(-1, 1, 20)
-    x, rest = prony._non_negative(A, b)
+    x, rest = generalised_maxwell._non_negative(A, b)
 
     def cycles(*_, **__):
         raise RuntimeError("Maximum number of iterations reached.")
 
     monkeypatch.setattr(scipy.optimize, "nnls", cycles)
-    y, other = prony._non_negative(A, b)
+    y, other = generalised_maxwell._non_negative(A, b)
     # lsq_linear ends where the cost gains less than 1e-10 of itself: its root, the distance, is half as far off.
     assert np.all(y >= 0) and np.isclose(other, rest, rtol=1e-10) and np.allclose(x, y, atol=1e-5)
 
 
 def test_a_number_of_modes_that_breaks_down_leaves_the_others(monkeypatch):
-    s, closed_form = sweep(0.01, 5, omega=np.geomspace(1, 100, 12)), fit.closed_form
+    s, closed_form = sweep(0.01, 5, omega=np.geomspace(1, 100, 12)), viscoelastic.closed_form
 
     def breaking(sweep, modes, *rest):
         if modes == 2:
             raise RuntimeError("Maximum number of iterations reached.")
         return closed_form(sweep, modes, *rest)
 
-    monkeypatch.setattr(fit, "closed_form", breaking)
-    chosen, tried = fit.choose_modes(s, prony.spectrum(s))
+    monkeypatch.setattr(viscoelastic, "closed_form", breaking)
+    chosen, tried = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
     assert [f.modes for f in tried] == [1, 3] and chosen.modes in (1, 3)
     assert warned(chosen, "2 modes could not be fitted (Maximum number of iterations reached.)")
-    monkeypatch.setattr(fit, "closed_form", lambda *a: breaking(s, 2))
+    monkeypatch.setattr(viscoelastic, "closed_form", lambda *a: breaking(s, 2))
     with pytest.raises(InputError, match="no number of modes could be fitted"):
-        fit.choose_modes(s, prony.spectrum(s))
+        viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
 
 
 def test_what_auto_chooses_is_not_advised_against():
     # Three modes within 1.6 decades, without noise: the criterion would take all three.
     model = np.array([770.0, 0.2, 0.25, 0.3, 1.0, 0.2, 0.05])
     s = sweep(0.0, model=model)
-    chosen, _ = fit.choose_modes(s, prony.spectrum(s))
+    chosen, _ = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
     assert chosen.modes == 2 and not warned(chosen, "fewer modes") and not warned(chosen, "merged")
     narrow = sweep(0.01, 2, omega=2 * np.pi * np.geomspace(1, 1.5, 12))
-    one, _ = fit.choose_modes(narrow, prony.spectrum(narrow))
+    one, _ = viscoelastic.choose_modes(narrow, generalised_maxwell.spectrum(narrow))
     assert one.modes == 1 and warned(one, "use a wider sweep") and not warned(one, "fewer modes")
 
 
-def warned(f: fit.Fit, words: str) -> bool:
+def warned(f: viscoelastic.Fit, words: str) -> bool:
     return any(words in sentence for sentence in f.warnings)
 
 
 def test_user_is_told_what_the_data_do_not_tell():
-    f = fit.closed_form(sweep(0.01, 2), 2)
+    f = viscoelastic.closed_form(sweep(0.01, 2), 2)
     assert warned(f, "relaxation_times[1]") and warned(f, "outside the 0.0398-1.59 s")
     assert not warned(f, "merged") and not warned(f, "equilibrium")
-    three = fit.closed_form(sweep(0.01, 2), 3)
+    three = viscoelastic.closed_form(sweep(0.01, 2), 3)
     assert warned(three, "use fewer modes") or warned(three, "merged")
-    fluid = fit.closed_form(sweep(0.01, 2, np.array([1000.0, 0.9999, 0.1])), 1)
+    fluid = viscoelastic.closed_form(sweep(0.01, 2, np.array([1000.0, 0.9999, 0.1])), 1)
     assert warned(fluid, "cannot be told from zero")
-    narrow = fit.closed_form(sweep(0.01, 2, omega=2 * np.pi * np.geomspace(1, 2, 12)), 3)
+    narrow = viscoelastic.closed_form(sweep(0.01, 2, omega=2 * np.pi * np.geomspace(1, 2, 12)), 3)
     assert warned(narrow, "too short for 3 modes")
     s = sweep(0.01, 2)
-    wide = fit.closed_form(s._replace(storage_sd=0.4 * s.storage, loss_sd=0.4 * s.loss), 2)
+    wide = viscoelastic.closed_form(s._replace(storage_sd=0.4 * s.storage, loss_sd=0.4 * s.loss), 2)
     assert warned(wide, "closer than the given deviations")
-    small = fit.closed_form(s._replace(storage_sd=1e-3 * s.storage, loss_sd=1e-3 * s.loss), 2)
+    small = viscoelastic.closed_form(s._replace(storage_sd=1e-3 * s.storage, loss_sd=1e-3 * s.loss), 2)
     assert warned(small, "times the given deviations") and small.uncertainty.noise > 5
 
 
 def test_merged_modes_are_named():
-    f = fit.closed_form(sweep(0.0, 0), 2)
-    u = prony.unconstrained(Maxwell(jnp.array(770.0), jnp.array([0.3, 0.2]), jnp.array([0.12, 0.1])))
+    f = viscoelastic.closed_form(sweep(0.0, 0), 2)
+    u = generalised_maxwell.unconstrained(Maxwell(jnp.array(770.0), jnp.array([0.3, 0.2]), jnp.array([0.12, 0.1])))
     moved = f.solution._replace(u=u)
     sentences = uncertainty.cautions(sweep(), uncertainty.estimate(moved, False), moved)
     assert any("have merged" in s and "use 1 mode" in s for s in sentences)
@@ -231,21 +239,21 @@ def test_merged_modes_are_named():
 
 def test_better_than_pyvisco_on_the_noise_free_table_2_sweep():
     # PyVisco 2.1.3 answers G0 603 Pa and tau 0.108 and 0.450 s here: 22 %, 260 % and 67 % off.
-    f = fit.closed_form(sweep(), 2)
+    f = viscoelastic.closed_form(sweep(), 2)
     theirs = np.array([603.0, 0.450, 0.108]) / TRUTH[[0, 3, 4]] - 1
     ours = parameters(f)[[0, 3, 4]] / TRUTH[[0, 3, 4]] - 1
     assert np.all(np.abs(ours) < 1e-6 * np.abs(theirs))
     # It also says 'converged' to exchanged columns; to a NaN and a negative modulus, see test_rheometer.
     s = sweep()
     with pytest.raises(InputError, match="are the two columns exchanged"):
-        fit.closed_form(s._replace(storage=s.loss, loss=s.storage), 2)
+        viscoelastic.closed_form(s._replace(storage=s.loss, loss=s.storage), 2)
 
 
 @pytest.fixture(scope="module")
 def coarse_torsion():
     s = sweep()
-    closed = fit.closed_form(s, 2)
-    return s, closed, fit.through_torsion(s, closed, fit.Simulation(cell_size=0.004))
+    closed = viscoelastic.closed_form(s, 2)
+    return s, closed, viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004))
 
 
 def test_torsion_fit_recovers_table_2(coarse_torsion):
@@ -262,8 +270,8 @@ def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
 @pytest.mark.slow
 def test_chapter_recursion_biases_the_fit():
     s = sweep(omega=OMEGA[::3])
-    closed = fit.closed_form(s, 2)
-    f = fit.through_torsion(s, closed, fit.Simulation(cell_size=0.004, scheme="chapter"))
+    closed = viscoelastic.closed_form(s, 2)
+    f = viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004, scheme="chapter"))
     # First order: at 50 steps a cycle its G'' is 5 % off at 4 Hz, which the parameters have to absorb.
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() > 0.02
 
@@ -273,7 +281,7 @@ def test_twelve_decades_need_more_than_six_modes():
     tau = 10.0 ** np.arange(4, -4, -1)
     model = np.concatenate([[1e5], np.full(8, 0.1), tau])
     s = sweep(0.0, model=model, omega=np.geomspace(1e-6, 1e6, 60))
-    chosen, _ = fit.choose_modes(s, prony.spectrum(s))
+    chosen, _ = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
     assert chosen.modes == 8 and np.allclose(parameters(chosen), model, rtol=1e-4)
 
 
@@ -281,18 +289,18 @@ def test_an_outlier_is_named():
     s = sweep(0.0)
     storage = s.storage.copy()
     storage[5] *= 3
-    f = fit.closed_form(s._replace(storage=storage), 2)
+    f = viscoelastic.closed_form(s._replace(storage=storage), 2)
     assert warned(f, "storage_modulus at 0.342 Hz")
 
 
 def test_a_plateau_that_is_measured_is_no_fluid():
     model = np.array([1e9, 0.5, 0.499, 1e-6, 1e-8])
-    f = fit.closed_form(sweep(0.01, 2, model, np.geomspace(1e2, 1e10, 40)), 2)
+    f = viscoelastic.closed_form(sweep(0.01, 2, model, np.geomspace(1e2, 1e10, 40)), 2)
     assert not warned(f, "cannot be told from zero")
 
 
 def test_parameters_at_a_bound_claim_no_certainty():
-    f = fit.closed_form(sweep(0.02, 4, omega=2 * np.pi * np.linspace(1, 1.01, 10)), 1)
+    f = viscoelastic.closed_form(sweep(0.02, 4, omega=2 * np.pi * np.linspace(1, 1.01, 10)), 1)
     assert np.all(f.uncertainty.standard_errors > 0) and warned(f, "too short")
 
 

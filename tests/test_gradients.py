@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import checkpointing, gradients, status
-from liverjax.struct import replace
+from liverjax.core import status
+from liverjax.core.struct import replace
+from liverjax.simulation import checkpoints, gradients
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -204,5 +205,5 @@ def test_unknown_modes_and_names_are_refused():
 def test_segments_cover_all_steps():
     for steps in range(1, 40):
         for kept in range(1, steps):
-            count, length, rest = checkpointing.lengths(steps, kept)
+            count, length, rest = checkpoints.lengths(steps, kept)
             assert count * length + rest == steps and count + (rest > 0) <= kept

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-FILES = sorted([*(ROOT / "liverjax").rglob("*.py"), *(ROOT / "fitting").glob("*.py")])
+FILES = sorted([*(ROOT / "liverjax").rglob("*.py"), *(ROOT / "fitting").rglob("*.py")])
 
 
 def _module(file: Path) -> str:

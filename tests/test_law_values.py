@@ -12,9 +12,9 @@ import pytest
 from conftest import ROOT
 
 import liverjax as lj
-from liverjax import chapter_terms
-from liverjax.kinematics import pack, unpack
 from liverjax.laws import products
+from liverjax.laws.terms import chapter_terms
+from liverjax.tensors.matrices import pack, unpack
 
 pytestmark = pytest.mark.quick_to_compile
 

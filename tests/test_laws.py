@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax.kinematics import Invariants
 from liverjax.laws.base import autodiff_derivatives
+from liverjax.tensors.matrices import Invariants
 
 pytestmark = pytest.mark.quick_to_compile
 

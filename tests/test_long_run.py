@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import parts, scene_file
 from liverjax.__main__ import main
+from liverjax.jobs import parts
+from liverjax.scenes import scene_file
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax.kinematics import deformation_gradient, pack
+from liverjax.tensors.matrices import deformation_gradient, pack
 
 SHAPES = {
     "box": lambda: lj.shapes.box((1.0, 2.0, 3.0), (2, 3, 4)),

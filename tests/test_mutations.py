@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting.prony import refuse_impossible
-from fitting.rheometer import read_sweep
-from liverjax import shapes, sweep
-from liverjax.scene_file import load_scene
+from fitting.methods.generalised_maxwell import refuse_impossible
+from fitting.readers.rheometer import read_sweep
+from liverjax.jobs import sweep
+from liverjax.mesh import shapes
+from liverjax.scenes.scene_file import load_scene
 
 pytestmark = pytest.mark.quick_to_compile
 

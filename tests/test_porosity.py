@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import porosity
-from liverjax.kinematics import deformation_gradient
-from liverjax.scene_file import scene_from
-from liverjax.simulation import _cast
-from liverjax.struct import replace
-from liverjax.time_step import initial_state
+from liverjax.core.struct import replace
+from liverjax.physics import porosity
+from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation.run import _cast
+from liverjax.simulation.step import initial_state
+from liverjax.tensors.matrices import deformation_gradient
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import regions
-from liverjax.struct import replace
+from liverjax.core.struct import replace
+from liverjax.scenes import regions
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from fitting.curves import read_curves
-from fitting.rheometer import read_sweep
+from fitting.readers.curves import read_curves
+from fitting.readers.rheometer import read_sweep
 from liverjax import InputError
 
 HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"

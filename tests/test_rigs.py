@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting import joint, prony, rigs, torsion
-from fitting.rheometer import Sweep
+from fitting.fits import joint
+from fitting.methods import generalised_maxwell
+from fitting.readers.rheometer import Sweep
+from fitting.rigs import glued, torsion
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -22,9 +24,9 @@ def test_creep_is_that_of_the_standard_linear_solid(verified):
     first step, in which the load comes up; at second order."""
     errors = []
     for dt in (0.1, 0.05):
-        rig = rigs.creep(R, H, dt, round(1 / dt), 0.01, cell_size=0.005)
-        u, codes = rigs.read(rig, LAW, PRONY)
-        elastic = rigs.read(rigs.creep(R, H, 1.0, 1, 0.01, cell_size=0.005), LAW, None)[0][0]
+        rig = glued.creep(R, H, dt, round(1 / dt), 0.01, cell_size=0.005)
+        u, codes = glued.read(rig, LAW, PRONY)
+        elastic = glued.read(glued.creep(R, H, 1.0, 1, 0.01, cell_size=0.005), LAW, None)[0][0]
         t = dt * np.arange(1, len(u) + 1)
         rate = 0.6 / 0.5
         exact = 1 / 0.6 - 0.4 / 0.6 * np.exp(-rate * t) * np.expm1(rate * dt) / (rate * dt)
@@ -39,8 +41,8 @@ def test_creep_is_that_of_the_standard_linear_solid(verified):
 def test_tension_relaxes_as_the_law_says(verified):
     """Held at a small strain, the force falls to 1 - g (1 - q exp(...)): after many relaxation times to 1 - g."""
     strains = np.full(40, 1e-4)
-    force, codes = rigs.read(rigs.tension(R, H, 0.25, strains, cell_size=0.005), LAW, PRONY)
-    elastic = rigs.read(rigs.tension(R, H, 0.25, strains[:1], cell_size=0.005), LAW, None)[0][0]
+    force, codes = glued.read(glued.tension(R, H, 0.25, strains, cell_size=0.005), LAW, PRONY)
+    elastic = glued.read(glued.tension(R, H, 0.25, strains[:1], cell_size=0.005), LAW, None)[0][0]
     assert not np.any(codes)
     off = abs(float(force[-1] / elastic) - 0.6)
     verified("relaxed over elastic force of a cylinder", "1 - sum of ratios", off, 1e-6)
@@ -53,8 +55,8 @@ def test_tension_relaxes_as_the_law_says(verified):
 @pytest.mark.slow
 def test_indentation_is_near_that_of_a_half_space():
     """4 G a d / (1 - nu) of a smooth punch on a half-space; glued, and on a block ten times as wide, a little more."""
-    rig = rigs.indentation(0.02, 0.02, 0.0025, 1.0, [1e-5], cell_size=0.00125)
-    force, _ = rigs.read(rig, LAW, None)
+    rig = glued.indentation(0.02, 0.02, 0.0025, 1.0, [1e-5], cell_size=0.00125)
+    force, _ = glued.read(rig, LAW, None)
     nu = (3 * 2400 - 2 * 800) / (2 * (3 * 2400 + 800))
     # Two cells under the punch, and linear tetrahedra are stiff.
     assert 1.0 < float(-force[0]) / (4 * 800 * 0.0025 * 1e-5 / (1 - nu)) < 1.6
@@ -66,15 +68,15 @@ def test_derivatives_by_the_parameters(kind):
     """Of the last reading by mu, g and tau: forward and reverse mode, and central differences."""
     strains = 0.1 * np.arange(1, 4) / 3
     rig = {
-        "tension": lambda: rigs.tension(R, H, 0.2, strains, cell_size=0.005),
-        "indentation": lambda: rigs.indentation(R, H, 0.006, 0.2, 0.01 * strains, cell_size=0.005),
-        "creep": lambda: rigs.creep(R, H, 0.2, 3, 50.0, cell_size=0.005),
+        "tension": lambda: glued.tension(R, H, 0.2, strains, cell_size=0.005),
+        "indentation": lambda: glued.indentation(R, H, 0.006, 0.2, 0.01 * strains, cell_size=0.005),
+        "creep": lambda: glued.creep(R, H, 0.2, 3, 50.0, cell_size=0.005),
     }[kind]()
 
     @jax.jit
     def last(p):
         law = lj.laws.NeoHookean(mu=p[0], bulk=jnp.asarray(2400.0))
-        return rigs.read(rig, law, lj.Prony(ratios=p[1:2], relaxation_times=p[2:]))[0][-1]
+        return glued.read(rig, law, lj.Prony(ratios=p[1:2], relaxation_times=p[2:]))[0][-1]
 
     p = jnp.array([800.0, 0.4, 0.5])
     reverse, forward = jax.grad(last)(p), jax.jacfwd(last)(p)
@@ -88,7 +90,7 @@ def test_derivatives_by_the_parameters(kind):
 
 def _sweep(model, noise, seed):
     omega = 2 * np.pi * np.logspace(-1, 1, 12)
-    storage, loss = (np.asarray(m) for m in prony.moduli(model, jnp.asarray(omega)))
+    storage, loss = (np.asarray(m) for m in generalised_maxwell.moduli(model, jnp.asarray(omega)))
     rng = np.random.default_rng(seed)
     noisy = [m * (1 + noise * rng.normal(size=12)) for m in (storage, loss)]
     return Sweep(omega, *noisy, noise * storage, noise * loss, "synthetic")
@@ -97,15 +99,15 @@ def _sweep(model, noise, seed):
 @pytest.mark.slow
 def test_two_tests_know_more_than_one():
     """A slow mode outside a sweep's band: creep adds it; every interval of the joint fit is narrower than alone."""
-    model = prony.Maxwell(jnp.asarray(800.0), jnp.array([0.3, 0.3]), jnp.array([8.0, 0.1]))
-    rig = rigs.creep(R, H, 1.0, 20, 20.0, cell_size=0.005)
+    model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.3, 0.3]), jnp.array([8.0, 0.1]))
+    rig = glued.creep(R, H, 1.0, 20, 20.0, cell_size=0.005)
     law = lj.laws.NeoHookean(mu=1.0, bulk=3.0)
     viscosity = lj.Prony(ratios=model.ratios, relaxation_times=model.relaxation_times)
-    readings = np.asarray(rigs.read(rig, lj.laws.scaled(law, 800.0), viscosity)[0])
+    readings = np.asarray(glued.read(rig, lj.laws.scaled(law, 800.0), viscosity)[0])
     sd = 0.01 * readings[-1]
     noisy = readings + sd * np.random.default_rng(1).normal(size=readings.shape)
     of_sweep, of_creep = joint.sweep(_sweep(model, 0.02, 0)), joint.through("creep", rig, noisy, sd)
-    start = prony.Maxwell(jnp.asarray(700.0), jnp.array([0.25, 0.25]), jnp.array([5.0, 0.2]))
+    start = generalised_maxwell.Maxwell(jnp.asarray(700.0), jnp.array([0.25, 0.25]), jnp.array([5.0, 0.2]))
     alone, both = joint.fit([of_sweep], start, law), joint.fit([of_sweep, of_creep], start, law)
     assert both.converged and both.names == alone.names
     true = np.array([800.0, 0.3, 0.3, 8.0, 0.1])
@@ -119,7 +121,7 @@ def test_two_tests_know_more_than_one():
 @pytest.mark.slow
 def test_a_free_height_serves_as_a_test():
     """The torsion rig whose plate may rise: at small strain the moduli are those of the fixed one."""
-    model = prony.Maxwell(jnp.asarray(800.0), jnp.array([0.4]), jnp.array([0.5]))
+    model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.4]), jnp.array([0.5]))
     data = _sweep(model, 0.01, 2)
     data = data._replace(
         angular_frequency=data.angular_frequency[::6],
@@ -138,12 +140,12 @@ def test_a_free_height_serves_as_a_test():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: rigs.tension(R, H, 0.0, [0.1]), "dt = 0.0"),
-        (lambda: rigs.tension(R, H, 0.1, [-0.95]), "above -0.9"),
-        (lambda: rigs.tension(R, H, 0.1, [np.nan]), "finite numbers"),
-        (lambda: rigs.tension(-R, H, 0.1, [0.1]), "radius"),
-        (lambda: rigs.indentation(R, H, 0.02, 0.1, [1e-3]), "punch"),
-        (lambda: rigs.indentation(R, H, 1e-5, 0.1, [1e-3]), "punch"),
+        (lambda: glued.tension(R, H, 0.0, [0.1]), "dt = 0.0"),
+        (lambda: glued.tension(R, H, 0.1, [-0.95]), "above -0.9"),
+        (lambda: glued.tension(R, H, 0.1, [np.nan]), "finite numbers"),
+        (lambda: glued.tension(-R, H, 0.1, [0.1]), "radius"),
+        (lambda: glued.indentation(R, H, 0.02, 0.1, [1e-3]), "punch"),
+        (lambda: glued.indentation(R, H, 1e-5, 0.1, [1e-3]), "punch"),
     ],
 )
 def test_bad_rigs_are_one_sentence(make, words):

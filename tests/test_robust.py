@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import laws, projection, shapes, status, terms, time_step
-from liverjax.assembly import flat
-from liverjax.kinematics import pack, unpack
-from liverjax.scene_file import scene_from
-from liverjax.struct import replace
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.struct import replace
+from liverjax.elements import projection
+from liverjax.laws.terms import invariant_terms
+from liverjax.mesh import shapes
+from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation import step
+from liverjax.solvers.block_matrix import flat
+from liverjax.tensors.matrices import pack, unpack
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -53,7 +58,7 @@ def test_projection_is_the_absolute_value_of_the_eigenvalues(gradients, name):
     if name in ("neo_hookean", "mooney_rivlin"):
         law = laws.continued(law, 0.3)
     F = unpack(gradients)
-    A = matrix(terms.blocks(terms.state(law, F), AXES, ALL), len(gradients))
+    A = matrix(invariant_terms.blocks(invariant_terms.state(law, F), AXES, ALL), len(gradients))
     found = matrix(projection.blocks([(1.0, law)], None, F, AXES, ALL), len(gradients))
     values, vectors = np.linalg.eigh(A)
     assert (values < 0).any()
@@ -66,7 +71,7 @@ def test_projection_of_stretches(gradients):
     law = laws.typical("ogden")
     F = jnp.eye(3)[None] + 0.15 * gradients
     F = F[np.asarray(jnp.linalg.det(F)) > 0.1]
-    A = matrix(terms.blocks(terms.state(law, unpack(F)), AXES, ALL), len(F))
+    A = matrix(invariant_terms.blocks(invariant_terms.state(law, unpack(F)), AXES, ALL), len(F))
     found = matrix(projection.blocks([(1.0, law)], None, unpack(F), AXES, ALL), len(F))
     values, vectors = np.linalg.eigh(A)
     exact = np.einsum("nij,nj,nkj->nik", vectors, abs(values), vectors)
@@ -92,7 +97,7 @@ def test_projection_of_other_axes_is_positive_and_exact_where_nothing_is_negativ
     A = matrix(projection.blocks([(1.0, law)], None, unpack(F), AXES, ALL), len(F))
     assert (np.linalg.eigvalsh(A)[:, 0] > -100 * EPS * np.abs(A).max(axis=(1, 2))).all()
     rest = jnp.eye(3)[None]
-    exact = matrix(terms.blocks(terms.state(law, unpack(rest)), AXES, ALL), 1)
+    exact = matrix(invariant_terms.blocks(invariant_terms.state(law, unpack(rest)), AXES, ALL), 1)
     found = matrix(projection.blocks([(1.0, law)], None, unpack(rest), AXES, ALL), 1)
     assert np.abs(found - exact).max() < 100 * EPS * np.abs(exact).max()
 
@@ -177,15 +182,15 @@ SCENES = {
 def test_the_residual_is_the_gradient_of_the_energy(scene):
     rng = np.random.default_rng(0)
     shaken = [MESH.points + 0.003 * rng.standard_normal(MESH.points.shape) for _ in range(2)]
-    begin = time_step.initial_state(scene)
+    begin = step.initial_state(scene)
     # Any state will do, so no step is made: every leaf a little off rest.
     state = jax.tree.map(lambda a: a + 0.01 * (1 + abs(a)) * rng.standard_normal(a.shape), begin)._replace(x=shaken[0])
 
     @jax.jit
     def both(scene, state, x):
-        e = time_step.equations(scene, state, 2.0)
+        e = step.equations(scene, state, 2.0)
         q = flat(e.mask * x)
-        return time_step.residual(e, q, 1.0)[0], jax.grad(lambda q: time_step.energy(e, q))(q)
+        return step.residual(e, q, 1.0)[0], jax.grad(lambda q: step.energy(e, q))(q)
 
     r, slope = both(scene, state, shaken[1])
     # The porous energy holds an iterative solve to a hundredth of the scene's tolerance.

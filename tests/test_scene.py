@@ -13,8 +13,8 @@ import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
-from liverjax.scene_file import scene_from
-from liverjax.struct import replace
+from liverjax.core.struct import replace
+from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -9,11 +9,14 @@ import pytest
 import scipy.sparse.linalg
 
 import liverjax as lj
-from liverjax import boundary, continuation, mjed, status
-from liverjax.continuation import StepOptions
-from liverjax.linear import conjugate_gradients
-from liverjax.struct import replace
-from liverjax.time_step import equations, initial_state, step
+from liverjax.core import status
+from liverjax.core.struct import replace
+from liverjax.elements import mjed
+from liverjax.physics import boundary
+from liverjax.simulation.step import equations, initial_state, step
+from liverjax.solvers import continuation
+from liverjax.solvers.continuation import StepOptions
+from liverjax.solvers.krylov import conjugate_gradients
 
 pytestmark = pytest.mark.quick_to_compile
 

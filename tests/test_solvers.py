@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import continuation, newton, status
-from liverjax.linear import conjugate_gradients, differentiable_solve
+from liverjax.core import status
+from liverjax.solvers import continuation, newton
+from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
 
 RNG = np.random.default_rng(0)
 _B = RNG.standard_normal((20, 20))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import spectral
-from liverjax.kinematics import unpack
+from liverjax.tensors import principal
+from liverjax.tensors.matrices import unpack
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -219,7 +219,7 @@ def test_principal_stretches_of_many_matrices():
     n = 100_000
     Q1, Q2 = (np.linalg.qr(RNG.standard_normal((n, 3, 3)))[0] for _ in range(2))
     F = Q1 @ (np.exp(RNG.uniform(-3, 1, (n, 3)))[:, :, None] * Q2)
-    logs, axes = jax.jit(spectral.principal)(unpack(jnp.asarray(F)))
+    logs, axes = jax.jit(principal.principal)(unpack(jnp.asarray(F)))
     ours = np.sort(np.exp(np.stack(logs, axis=-1)), axis=-1)
     exact = np.sort(np.linalg.svd(F, compute_uv=False), axis=-1)
     # F N is rounded to eps |F|: relative to the smallest stretch up to e^4 eps, times the 3 products of a sum.

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import design, parts, status, sweep
 from liverjax.__main__ import OUTPUTS, main
-from liverjax.batch import strategy_for
-from liverjax.scene_file import changed_content
+from liverjax.core import status
+from liverjax.jobs import design, parts, sweep
+from liverjax.scenes.scene_file import changed_content
+from liverjax.simulation.batch import strategy_for
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import assembly, boundary, mjed, porosity, tangent, terms, viscosity
-from liverjax.kinematics import add_matrices, deformation_gradient, determinant
-from liverjax.linear import chebyshev, stabilised_biconjugate_gradients
+from liverjax.elements import mjed
+from liverjax.laws.terms import invariant_terms
+from liverjax.physics import boundary, porosity, viscosity
+from liverjax.simulation import tangent
+from liverjax.solvers import block_matrix
+from liverjax.solvers.krylov import chebyshev, stabilised_biconjugate_gradients
+from liverjax.tensors.matrices import add_matrices, deformation_gradient, determinant
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -40,7 +44,7 @@ def test_assembled_stiffness_is_the_sparse_one():
     A = jax.jit(lambda x: tangent.stiffness(scene, None, None, None, x))(X)
     K = mjed.stiffness_matrix(MESH, LAW, X)
     expected = (K @ np.asarray(V).ravel()).reshape(-1, 3)
-    assert np.abs(np.stack(assembly.product(A, V.T), axis=-1) - expected).max() < 1e-13 * abs(K).max() * 10
+    assert np.abs(np.stack(block_matrix.product(A, V.T), axis=-1) - expected).max() < 1e-13 * abs(K).max() * 10
 
 
 @pytest.mark.parametrize("part", ["all", "isochoric"])
@@ -65,7 +69,7 @@ def test_viscous_and_porous_tangent_against_autodiff(part):
 
     expected = jax.jit(lambda: jax.jvp(forces, (X,), (V,))[1])()
     A = jax.jit(lambda: tangent.stiffness(scene, memory, P, None, X))()
-    error = np.stack(assembly.product(A, V.T), axis=-1) - np.asarray(expected)
+    error = np.stack(block_matrix.product(A, V.T), axis=-1) - np.asarray(expected)
     assert np.abs(error).max() < 1e-12 * np.abs(np.asarray(expected)).max()
 
 
@@ -83,13 +87,13 @@ def test_coupled_matrix_against_autodiff():
 
         def equations(x, P):
             F = deformation_gradient(MESH, x)
-            stress = add_matrices(terms.first_piola(law, F), porosity.first_piola(SPONGE, MESH, P, F))
+            stress = add_matrices(invariant_terms.first_piola(law, F), porosity.first_piola(SPONGE, MESH, P, F))
             volume = porosity._scatter(MESH, MESH.volumes * determinant(F) / 4)
-            flux = jnp.stack(assembly.product(flow.matrix, (P,)), axis=-1)
+            flux = jnp.stack(block_matrix.product(flow.matrix, (P,)), axis=-1)
             return jnp.concatenate([mjed.nodal_force(MESH, stress), -flux - volume[:, None]], axis=1)
 
         exact = jax.jvp(equations, (X, P), (V, dP))[1]
-        return jnp.stack(assembly.product(A, (*V.T, dP)), axis=-1), exact
+        return jnp.stack(block_matrix.product(A, (*V.T, dP)), axis=-1), exact
 
     ours, exact = map(np.asarray, both())
     for column in (slice(0, 3), slice(3, 4)):  # forces and volumes: each to its own size
@@ -100,7 +104,7 @@ def test_darcys_laplacian_and_its_polynomial():
     fluid = porosity.initial_fluid(SPONGE, MESH)
     flow = jax.jit(lambda: porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, X), 0.05, 1e-10))()
     n = MESH.number_of_nodes
-    A = np.asarray(jax.vmap(lambda e: assembly.product(flow.matrix, (e,))[0])(jnp.eye(n)))
+    A = np.asarray(jax.vmap(lambda e: block_matrix.product(flow.matrix, (e,))[0])(jnp.eye(n)))
     assert np.allclose(A, A.T, rtol=0, atol=1e-15 * A.max())
     assert np.allclose(A.sum(axis=1), np.asarray(flow.store), rtol=1e-9)  # a uniform pressure does not flow
     lowest = np.linalg.eigvals(A / np.diag(A)[:, None]).real.min()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting import torsion
-from fitting.torsion import Drive
-from liverjax import viscosity
-from liverjax.struct import replace
+from fitting.rigs import torsion
+from fitting.rigs.torsion import Drive
+from liverjax.core.struct import replace
+from liverjax.physics import viscosity
 
 pytestmark = pytest.mark.quick_to_compile
 

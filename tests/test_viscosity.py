@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax import terms, viscosity
-from liverjax.kinematics import unpack
-from liverjax.struct import replace
+from liverjax.core.struct import replace
+from liverjax.laws.terms import invariant_terms
+from liverjax.physics import viscosity
+from liverjax.tensors.matrices import unpack
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -104,8 +105,8 @@ def test_step_relaxation_follows_alpha(part, table_2):
     g, tau = np.asarray(table_2.ratios), np.asarray(table_2.relaxation_times)
     ramp = tau / dt * np.expm1(dt / tau)
     alpha = 1 - np.sum(g * (1 - ramp * np.exp(-n * dt / tau)))
-    whole = terms.first_piola(law, F)
-    kept = terms.first_piola(lj.laws.volumetric_part(law), F) if part == "isochoric" else None
+    whole = invariant_terms.first_piola(law, F)
+    kept = invariant_terms.first_piola(lj.laws.volumetric_part(law), F) if part == "isochoric" else None
     for i in range(3):
         for j in range(3):
             rest = kept[i][j] if kept else 0.0

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax import bounds
-from liverjax.errors import InputError
+from liverjax.core import bounds
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
 from liverjax.laws.arruda_boyce import ArrudaBoyce
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
 from liverjax.laws.continued import Continued, continued
@@ -22,7 +23,6 @@ from liverjax.laws.stable_neo_hookean import StableNeoHookean
 from liverjax.laws.stretches import Bogen, Exponential, Logarithmic, Ogden
 from liverjax.laws.volumetric import VOLUMETRIC
 from liverjax.laws.yeoh import Yeoh
-from liverjax.struct import replace
 
 __all__ = [
     "LAWS",

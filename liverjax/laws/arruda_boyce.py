@@ -2,8 +2,8 @@
 
 from typing import Any, ClassVar
 
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, static, struct
 
 #: Series coefficients of the inverse Langevin function; the chapter's print lacks the numerators (11, 19, 519).
 COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)

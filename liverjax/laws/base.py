@@ -1,6 +1,6 @@
 """What a material law is: a strain energy, and its derivatives with respect to what it depends on.
 
-A law is a frozen pytree made with `liverjax.struct.struct`. It states one or more of
+A law is a frozen pytree made with `liverjax.core.struct.struct`. It states one or more of
 
 * `isochoric_energy(Ibar1, Ibar2)` of J^(-2/3) I1 and J^(-4/3) I2;
 * `stretch_energy(X_1, …)` of X_k = sum_m (J^(-1/3) lambda_m)^alpha_k - 3, with `exponents()` giving the alpha_k;
@@ -18,10 +18,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from liverjax import terms
-from liverjax.errors import InputError
-from liverjax.green_terms import components, material_axes
-from liverjax.kinematics import (
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, static, struct
+from liverjax.laws.terms import invariant_terms
+from liverjax.laws.terms.green_terms import components, material_axes
+from liverjax.laws.terms.invariant_terms import fibre_invariants, summands
+from liverjax.laws.volumetric import volumetric
+from liverjax.tensors.matrices import (
     Invariants,
     Matrix,
     determinant,
@@ -33,10 +36,7 @@ from liverjax.kinematics import (
     pack,
     unpack,
 )
-from liverjax.laws.volumetric import volumetric
-from liverjax.spectral import power_sum, stretches
-from liverjax.struct import param, replace, static, struct
-from liverjax.terms import fibre_invariants, summands
+from liverjax.tensors.principal import power_sum, stretches
 
 First = dict[str, Any]
 Second = dict[tuple[str, str], Any]
@@ -114,11 +114,11 @@ class Law:
 
     def first_piola(self, F: jax.Array) -> jax.Array:
         """First Piola-Kirchhoff stress dW/dF [Pa], shape (..., 3, 3), by the hand-derived MJED terms."""
-        return pack(terms.first_piola(self, unpack(_floating(F))))
+        return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
         """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: the block of D = e_J, e_L."""
-        A = terms.tangent(self, unpack(_floating(F)))
+        A = invariant_terms.tangent(self, unpack(_floating(F)))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)

@@ -4,10 +4,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from liverjax.errors import InputError
-from liverjax.kinematics import determinant
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
-from liverjax.struct import param, static, struct
+from liverjax.tensors.matrices import determinant
 
 
 @struct

@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.axes_terms import SIX, symmetric
-from liverjax.errors import InputError
-from liverjax.green_terms import Moduli
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, static, struct
+from liverjax.laws.terms.green_terms import Moduli
+from liverjax.tensors.material_axes import SIX, symmetric
 
 
 @struct

@@ -2,8 +2,8 @@
 
 from typing import Any, ClassVar
 
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, static, struct
 
 _POWERS = {"c10": (1, 0), "c01": (0, 1), "c20": (2, 0), "c11": (1, 1), "c02": (0, 2)} | {
     "c30": (3, 0),

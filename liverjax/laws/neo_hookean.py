@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, static, struct
 
 
 @struct

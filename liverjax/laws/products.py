@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from liverjax.errors import InputError
-from liverjax.kinematics import Invariants
+from liverjax.core.errors import InputError
 from liverjax.laws.arruda_boyce import COEFFICIENTS, ArrudaBoyce
 from liverjax.laws.base import Law, Volumetric
 from liverjax.laws.exponential_invariants import FungDemiray, VerondaWestmann
@@ -16,6 +15,7 @@ from liverjax.laws.neo_hookean import NeoHookean, NeoHookeanCompressible
 from liverjax.laws.saint_venant_kirchhoff import SaintVenantKirchhoff
 from liverjax.laws.volumetric import volumetric
 from liverjax.laws.yeoh import Yeoh
+from liverjax.tensors.matrices import Invariants
 
 
 class Product(NamedTuple):

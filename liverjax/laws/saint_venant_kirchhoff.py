@@ -2,8 +2,8 @@
 
 from typing import Any, ClassVar
 
+from liverjax.core.struct import param, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, struct
 
 
 @struct

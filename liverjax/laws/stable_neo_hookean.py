@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
+from liverjax.core.struct import param, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, struct
 
 
 @struct

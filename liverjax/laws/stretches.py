@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.errors import InputError
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, static, struct
 
 
 @struct

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from liverjax.errors import InputError
+from liverjax.core.errors import InputError
 
 
 def _quadratic(K, J):

@@ -2,8 +2,8 @@
 
 from typing import Any, ClassVar
 
+from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
-from liverjax.struct import param, static, struct
 
 
 @struct

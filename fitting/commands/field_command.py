@@ -1,0 +1,130 @@
+"""``python -m fitting field SCENE.toml DISPLACEMENTS.csv``: a map of stiffness, or a few numbers, of a body."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from fitting.commands.exit_codes import EXIT_CODES
+from fitting.fits import field, inclusion, scene_numbers
+from fitting.fits.scene_numbers import Problem
+from fitting.readers.displacements import read_displacements
+from fitting.reports import field_report
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
+from liverjax.scenes.scene_file import load_scene
+from liverjax.simulation import gradients
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of the command."""
+    command = argparse.ArgumentParser(
+        prog="python -m fitting field",
+        description="Find a map of stiffness, or a few numbers of a scene, from displacements measured at some points. "
+        "Several loads on one body: a scene and a file of displacements for each.",
+        epilog=EXIT_CODES,
+    )
+    command.add_argument(
+        "files",
+        type=Path,
+        nargs="+",
+        metavar="SCENE.toml DISPLACEMENTS.csv",
+        help="x,y,z (or node),ux,uy,uz[,time][,sd]",
+    )
+    command.add_argument("--name", default="law.mu", metavar="NAME", help="number to map (default law.mu)")
+    command.add_argument("--length", type=float, metavar="M", help="over which it varies [m] (default: size / 10)")
+    command.add_argument(
+        "--sphere", action="store_true", help="a sphere of other stiffness as well, begun from the map"
+    )
+    command.add_argument(
+        "--parameters", metavar="NAME,…", help="these numbers instead of a map, e.g. law.mu,viscosity.ratios"
+    )
+    command.add_argument(
+        "--noise", type=float, metavar="M", help="standard deviation [m] where a file has no column sd"
+    )
+    command.add_argument("--unit", default="m", help="of the lengths in the displacement files (default m)")
+    command.add_argument("--iterations", type=int, default=60, help="of L-BFGS for each weight (default 60)")
+    command.add_argument("--resume", action="store_true", help="go on from the last iteration written to --out")
+    command.add_argument(
+        "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
+    )
+    return command
+
+
+def _problem(options: argparse.Namespace) -> Problem:
+    """Scenes and displacements of the command line, checked."""
+    for name in ("length", "noise", "iterations"):
+        value = getattr(options, name)
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"--{name} {value:g} must be above 0: give a larger number")
+    if len(options.files) % 2:
+        raise InputError(f"{len(options.files)} files were given: give a scene and its displacements, in pairs")
+    scenes, data = [], []
+    for scene_file, data_file in zip(options.files[::2], options.files[1::2], strict=True):
+        scene = load_scene(scene_file)
+        scenes.append(scene)
+        data.append(read_displacements(data_file, scene, options.noise, options.unit))
+    return Problem(tuple(scenes), tuple(data))
+
+
+def identify(options: argparse.Namespace) -> int:
+    """Find a map, or a few numbers, of scenes; the exit code."""
+    problem = _problem(options)
+    bar = tqdm(unit=" iterations", disable=None, leave=False)
+
+    def told(_: int, cost: float) -> None:
+        bar.set_postfix(cost=f"{cost:.4g}")
+        bar.update()
+
+    return (_map if options.parameters is None else _numbers)(options, problem, bar, told)
+
+
+def _numbers(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callable) -> int:
+    names = options.parameters.split(",")
+    for name in names:
+        scene_numbers.value_of(problem.scenes[0], name)
+    writable(options.out, ("field.json",))
+    with bar:
+        found = scene_numbers.fit_numbers(problem, names, progress=told)
+    print(field_report.table_of_numbers(found))
+    field_report.write(options.out, problem.scenes[0].mesh, _files(options) | field_report.of_numbers(found), None)
+    print(f"written: {options.out}/field.json")
+    return 0 if found.converged else 1
+
+
+def _map(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callable) -> int:
+    mesh = problem.scenes[0].mesh
+    field.start_of(problem, options.name)
+    writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))
+    kept = sum(gradients.memory(scene) for scene in problem.scenes) / 1e6
+    print(f"gradients keep and work with about {kept:.0f} MB", file=sys.stderr)
+    length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10
+    file = options.out / "progress.h5"
+    limit, resume = options.iterations, options.resume
+    with bar:
+        found = field.estimate(problem, options.name, length, limit, file=file, resume=resume, progress=told)
+    good = all(c == status.CONVERGED for c in found.codes)
+    print(field_report.table_of_field(found))
+    content = _files(options) | {"map": field_report.of_field(found)}
+    if not found.reached:
+        print(
+            f"warning: chi2 stays at {found.chi2 / found.components:.3g} a component: the noise is larger than said, "
+            "or the scene misses something (mesh, supports, loads)",
+            file=sys.stderr,
+        )
+    if options.sphere:
+        sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
+        print(field_report.table_of_numbers(sphere))
+        content["sphere"] = field_report.of_numbers(sphere)
+        good = good and sphere.converged
+    field_report.write(options.out, mesh, content, found)
+    print(f"written: {options.out}/field.json, field.vtu, field.h5, field.png")
+    return 0 if good else 1
+
+
+def _files(options: argparse.Namespace) -> dict:
+    return {"files": [str(f) for f in options.files]}

@@ -1,0 +1,254 @@
+"""A map of stiffness from measured displacements: a smooth field of one number of the law, with its uncertainty.
+
+The number of an element is that of the scene times exp(m), m the mean of a nodal field (V,) with the prior of
+`fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 is sought by L-BFGS in the whitened z, with gradients through
+the runs. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down to the
+number of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty is that of the
+Gauss-Newton Hessian I + J^T J: its largest eigenvalues by Lanczos, each product a run linearised and transposed
+(Bui-Thanh et al. 2013).
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+import scipy.sparse.linalg
+
+from fitting.fits.scene_numbers import Problem, misfit, value_of
+from fitting.methods import prior as smooth
+from liverjax.core import status
+from liverjax.core.errors import InputError
+
+#: Standard deviations of ln(modulus) to try, from a nearly uniform body to a free one.
+DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
+#: A larger one must lower chi^2 by this part, or it is no better.
+_WORTH = 0.02
+#: z beyond this many standard deviations is not sought.
+_BOUND = 8.0
+
+
+class Field(NamedTuple):
+    """What was found."""
+
+    name: str
+    log_factor: np.ndarray  # m (V,)
+    modulus: np.ndarray  # of the elements (E,)
+    sd: np.ndarray  # of m at the nodes (V,), data seen
+    prior_sd: np.ndarray  # (V,), before
+    deviation: float  # the prior's, chosen
+    length: float  # [m] of correlation
+    chi2: float
+    components: int
+    reached: bool  # whether chi^2 came down to the number of components
+    history: list[dict]  # one row a deviation: chi2, iterations, evaluations, seconds
+    eigenvalues: np.ndarray  # of J^T J in whitened z: directions above 1 are known from the data
+    codes: tuple[int, ...]
+    seconds: float
+
+
+def start_of(problem: Problem, name: str) -> jax.Array:
+    """The numbers of the elements (E,) before the fit.
+
+    Raises:
+        InputError: scenes of different meshes, a name that is no positive number.
+    """
+    scene = problem.scenes[0]
+    E = scene.mesh.number_of_elements
+    for other in problem.scenes[1:]:
+        if other.mesh.number_of_elements != E or not np.allclose(other.mesh.points, scene.mesh.points):
+            raise InputError("the scenes have different meshes: a field needs one and the same")
+    base = value_of(scene, name)
+    if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
+        raise InputError(f"a field of {name!r} needs one number: name one of the list, e.g. {name}.0")
+    if not np.all(np.asarray(base) > 0):
+        raise InputError(f"a field of {name!r} needs a positive number to begin with: change it in the scene")
+    return jnp.broadcast_to(base, (E,))
+
+
+def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
+    """Numbers of the scenes at the nodal field m (V,)."""
+    corners = m[problem.scenes[0].mesh.tetrahedra]
+    return {name: base * jnp.exp(jnp.mean(corners, axis=1))}
+
+
+@partial(jax.jit, static_argnames="name")
+def _cost(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
+    """chi^2/2, its gradient by m, and the codes."""
+
+    def half(m):
+        r, codes = misfit(problem, values_at(problem, name, base, m))
+        return 0.5 * jnp.vdot(r, r), codes
+
+    return jax.value_and_grad(half, has_aux=True)(m)
+
+
+class _Search:
+    """The course of a fit: what L-BFGS calls, and what is written to go on from."""
+
+    def __init__(self, problem, name, base, p, file, progress):
+        self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
+        self.history, self.k, self.z = [], 0, np.zeros(len(p.root_mass))
+        self.best, self.evaluations, self.codes = np.inf, 0, ()
+
+    def cost(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """(chi^2 + |z|^2)/2 and its gradient."""
+        deviation = DEVIATIONS[self.k]
+        m = deviation * smooth.to_nodes(self.p, z)
+        (half, codes), g = _cost(self.problem, self.base, jnp.asarray(m), self.name)
+        half, g = float(half), np.asarray(g)
+        self.evaluations += 1
+        if not (np.isfinite(half) and np.all(np.isfinite(g)) and not np.any(np.asarray(codes) == status.NOT_FINITE)):
+            return 1e3 * (1 + z @ z + self.problem.components), z.copy()  # a wall: the line search turns back
+        self.chi2, self.codes = 2 * half, tuple(int(c) for c in codes)
+        return half + 0.5 * float(z @ z), deviation * smooth.to_whitened(self.p, g) + z
+
+    def iterated(self, z: np.ndarray) -> None:
+        """Told of by L-BFGS after every iteration."""
+        self.z = z.copy()
+        self.write()
+        self.progress(self.k, self.chi2 / self.problem.components)
+
+    def write(self) -> None:
+        """The point reached, whole or not at all."""
+        if self.file is None:
+            return
+        part = self.file.with_suffix(".part")
+        with h5py.File(part, "w") as f:
+            f["z"], f["k"] = self.z, self.k
+            f["history"] = np.array([[row[c] for c in _HISTORY] for row in self.history]).reshape(-1, len(_HISTORY))
+            f.attrs["name"], f.attrs["base"] = self.name, float(jnp.sum(self.base))
+            f.attrs["count"] = self.problem.components
+        part.replace(self.file)
+
+    def read(self) -> None:
+        """Go on from what an earlier run wrote.
+
+        Raises:
+            InputError: no such file, or of another problem.
+        """
+        if not self.file.is_file():
+            return
+        with h5py.File(self.file) as f:
+            same = f.attrs["name"] == self.name and f.attrs["count"] == self.problem.components
+            if not (same and len(f["z"]) == len(self.z) and np.isclose(f.attrs["base"], float(jnp.sum(self.base)))):
+                raise InputError(f"{self.file} is of another fit: leave out --resume or name another --out")
+            self.z, self.k = f["z"][:], int(f["k"][()])
+            self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
+
+
+_HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")
+
+
+def estimate(
+    problem: Problem,
+    name: str = "law.mu",
+    length: float = 0.03,
+    max_iterations: int = 60,
+    modes: int = 60,
+    file: Path | None = None,
+    resume: bool = False,
+    progress: Callable[[int, float], None] = lambda weight, chi2: None,
+) -> Field:
+    """The field of `name` that explains the data.
+
+    Args:
+        problem: scenes of one mesh and what was measured.
+        name: dotted name of a positive number of the law; what the scenes have there is where the field begins.
+        length: correlation length of the prior [m].
+        max_iterations: of L-BFGS for each weight.
+        modes: most directions that the data are asked about, for the uncertainty.
+        file: HDF5 file to which every iteration's point is written; None: nowhere.
+        resume: begin from that file if it is there.
+        progress: told of every iteration: number of the weight, chi^2 over the number of components.
+
+    Raises:
+        InputError: see `start_of`; `file` of another fit.
+    """
+    begin = time.perf_counter()
+    base = start_of(problem, name)
+    p = smooth.prior(problem.scenes[0].mesh, length)
+    search = _Search(problem, name, base, p, file, progress)
+    if resume and file is not None:
+        search.read()
+    _weights(search, max_iterations)
+    deviation = DEVIATIONS[search.k]
+    m = deviation * smooth.to_nodes(p, search.z)
+    search.cost(search.z)
+    values, vectors = _known(search, deviation, m, modes)
+    before, after = smooth.variances(p, vectors, 1 / (1 + values))
+    return Field(
+        name=name,
+        log_factor=m,
+        modulus=np.asarray(values_at(problem, name, base, jnp.asarray(m))[name]),
+        sd=deviation * np.sqrt(after),
+        prior_sd=deviation * np.sqrt(before),
+        deviation=deviation,
+        length=length,
+        chi2=search.chi2,
+        components=problem.components,
+        reached=search.chi2 <= problem.components,
+        history=search.history,
+        eigenvalues=values,
+        codes=search.codes,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def _weights(search: _Search, max_iterations: int) -> None:
+    """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
+    while True:
+        begin, before = time.perf_counter(), search.evaluations
+        bounds = [(-_BOUND, _BOUND)] * len(search.z)
+        options = {"maxiter": max_iterations, "maxcor": 20, "ftol": 1e-5}
+        found = scipy.optimize.minimize(
+            search.cost, search.z, jac=True, method="L-BFGS-B", bounds=bounds, options=options, callback=search.iterated
+        )
+        search.z = found.x
+        search.cost(found.x)
+        row = (
+            DEVIATIONS[search.k],
+            search.chi2 / search.problem.components,
+            found.nit,
+            search.evaluations - before,
+            time.perf_counter() - begin,
+        )
+        search.history.append(dict(zip(_HISTORY, map(float, row), strict=True)))
+        search.write()
+        enough = search.chi2 <= search.problem.components
+        last = [h["chi2_per_component"] for h in search.history[-2:]]
+        idle = len(last) == 2 and last[1] > (1 - _WORTH) * last[0]
+        if enough or idle or search.k + 1 == len(DEVIATIONS):
+            return
+        search.k += 1
+        search.z = search.z * DEVIATIONS[search.k - 1] / DEVIATIONS[search.k]
+
+
+def _known(search: _Search, deviation: float, m: np.ndarray, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (V, k)."""
+    problem, name, p = search.problem, search.name, search.p
+
+    @jax.jit
+    def residuals(m, problem, base):
+        return misfit(problem, values_at(problem, name, base, m))[0]
+
+    r, push = jax.linearize(lambda m: residuals(m, problem, search.base), jnp.asarray(m))
+    pull = jax.linear_transpose(push, jnp.asarray(m))
+    push, pull = jax.jit(push), jax.jit(pull)
+
+    def product(z):
+        dm = jnp.asarray(deviation * smooth.to_nodes(p, z.ravel()))
+        return deviation * smooth.to_whitened(p, np.asarray(pull(push(dm))[0]))
+
+    n = len(m)
+    k = min(modes, n - 2, len(r))
+    operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=product, dtype=float)
+    # Directions of eigenvalue far below 1 are the prior's: no digit of them matters.
+    values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
+    return np.maximum(values[::-1], 0.0), vectors[:, ::-1]

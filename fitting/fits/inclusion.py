@@ -1,0 +1,71 @@
+"""A stiff or soft sphere in a uniform body, from measured displacements: where, how large, how stiff.
+
+Few parameters instead of a map: a smooth field spreads what is sharp, so its peak is no measure of an inclusion's
+modulus; a map says where to begin. The edge is as soft as the mesh is coarse, which keeps the sphere's place
+differentiable. Radius and modulus trade off: the elements should be small beside the sphere (`experiments/lesion.py`).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits.field import Field, start_of
+from fitting.fits.scene_numbers import Estimate, Problem, fit
+
+#: Width of the edge over the elements' mean size.
+_EDGE = 0.25
+NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
+
+
+def factor(mesh: Any, centre: jax.Array, radius: Any, width: Any) -> jax.Array:
+    """How much of each element (E,) is inside: 1 within, 0 without, smooth between."""
+    middle = jnp.mean(mesh.points[mesh.tetrahedra], axis=1)
+    distance = jnp.sqrt(jnp.sum((middle - centre[None]) ** 2, axis=1) + 1e-3 * width**2)
+    return jax.nn.sigmoid((radius - distance) / width)
+
+
+def start_from(problem: Problem, field: Field) -> np.ndarray:
+    """u of the sphere that the map suggests: where ln(modulus) is beyond half of its largest departure."""
+    mesh = problem.scenes[0].mesh
+    middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
+    volumes = np.asarray(mesh.volumes)
+    m = field.log_factor[np.asarray(mesh.tetrahedra)].mean(axis=1)
+    order = np.argsort(m)
+    background = m[order[np.searchsorted(np.cumsum(volumes[order]), 0.5 * volumes.sum())]]
+    away = m - background
+    sign = 1.0 if away.max() >= -away.min() else -1.0
+    weight = volumes * np.maximum(sign * away - 0.5 * (sign * away).max(), 0.0)
+    inside = weight > 0
+    centre = (weight[:, None] * middle).sum(axis=0) / weight.sum()
+    radius = np.cbrt(3 * volumes[inside].sum() / (4 * np.pi))
+    contrast = away[inside].mean()
+    return np.array([*centre, np.log(radius), background, contrast])
+
+
+def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> Estimate:
+    """Centre and radius [m] of the sphere, the number `name` outside and inside, with standard errors.
+
+    Args:
+        problem: scenes of one mesh and what was measured.
+        name: dotted name of a positive number of the law.
+        start: centre (3,), ln(radius), and logarithms of the background over the scene's number, and of the sphere's
+            over the background's, (6,).
+        options: of `fitting.fits.scene_numbers.fit`.
+    """
+    base, mesh = start_of(problem, name), problem.scenes[0].mesh
+    width = _EDGE * float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
+    size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
+    scale = jnp.array([size] * 3 + [1.0] * 3)
+
+    def values_of(u):
+        u = u * scale
+        return {name: base * jnp.exp(u[4] + u[5] * factor(mesh, u[:3], jnp.exp(u[3]), width))}
+
+    def natural_of(u):
+        u = u * scale
+        at_rest = jnp.mean(base)
+        return jnp.stack([*u[:3], jnp.exp(u[3]), at_rest * jnp.exp(u[4]), at_rest * jnp.exp(u[4] + u[5])])
+
+    return fit(problem, values_of, natural_of, NAMES, np.asarray(start) / np.asarray(scale), **options)[0]

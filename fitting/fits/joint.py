@@ -1,0 +1,137 @@
+"""One set of Prony parameters from several tests at once: a sweep, creep, tension, indentation, each with its noise.
+
+Residuals of all tests over their noise are minimised together by Levenberg-Marquardt (forward mode through every rig);
+the law is scaled to G0, as in the torsion fit.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits.scene_numbers import Estimate
+from fitting.methods import generalised_maxwell
+from fitting.methods.least_squares import levenberg_marquardt_host
+from fitting.methods.uncertainty import parameter_names, parameter_vector, spread
+from fitting.readers.rheometer import Sweep
+from fitting.rigs import glued, torsion
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.laws import Law
+from liverjax.physics.viscosity import Prony
+
+
+class Test(NamedTuple):
+    """What was measured, and how it is predicted."""
+
+    name: str
+    predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
+    measured: np.ndarray  # (n,)
+    sd: np.ndarray  # (n,) standard deviation of its noise
+
+
+def sweep(data: Sweep) -> Test:
+    """A frequency sweep in closed form; without deviations in the file its noise is taken as that of `data`."""
+    omega = jnp.asarray(data.angular_frequency)
+
+    def predict(law, viscosity, model):
+        return jnp.concatenate(generalised_maxwell.moduli(model, omega)), jnp.zeros((), jnp.int32)
+
+    return Test("sweep", predict, np.concatenate([data.storage, data.loss]), np.concatenate(data.deviations))
+
+
+def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Any, drive: torsion.Drive = torsion.Drive()) -> Test:
+    """The same through the torsion simulation, of fixed or free height, at torque amplitudes [N m]."""
+    omega = jnp.asarray(data.angular_frequency)
+
+    def predict(law, viscosity, model):
+        found = torsion.moduli(rig, law, viscosity, omega, torque, drive)
+        return jnp.concatenate([found.storage, found.loss]), jnp.max(found.statistics.status)
+
+    return Test("torsion", predict, np.concatenate([data.storage, data.loss]), np.concatenate(data.deviations))
+
+
+def through(name: str, rig: glued.Rig, measured: Any, sd: Any) -> Test:
+    """A test in a rig of `fitting.rigs.glued`: readings (T,) [N] or [m] and their noise, a number or (T,).
+
+    Raises:
+        InputError: another number of readings than the rig has steps, noise that is not positive.
+    """
+    measured = np.asarray(measured, float)
+    sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
+    if measured.shape != (rig.scene.solve.steps,):
+        raise InputError(f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one a step")
+    if not (np.all(np.isfinite(measured)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
+        raise InputError(f"{name}: readings and their positive noise must be finite numbers: mend them")
+
+    def predict(law, viscosity, model):
+        readings, codes = glued.read(rig, law, viscosity)
+        return readings, jnp.max(codes)
+
+    return Test(name, predict, measured, sd)
+
+
+def fit(
+    tests: Sequence[Test],
+    start: generalised_maxwell.Maxwell,
+    law: Law,
+    part: str = "all",
+    max_iterations: int = 30,
+    progress: Callable[[int, float], None] = lambda iteration, cost: None,
+) -> Estimate:
+    """The Maxwell parameters that explain all tests, with standard errors (names of `uncertainty.parameter_names`).
+
+    Args:
+        tests: one or more.
+        start: where to begin; its number of modes is kept.
+        law: scaled to G0.
+        part: of the stress that relaxes, as of `Prony`.
+        max_iterations, progress: as of `levenberg_marquardt_host`.
+    """
+    begin = time.perf_counter()
+    worst: list[int] = []
+
+    @jax.jit
+    def with_jacobian(u):
+        def residuals(u):
+            model = generalised_maxwell.natural(u)
+            viscosity = Prony(ratios=model.ratios, relaxation_times=model.relaxation_times, part=part)
+            scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
+            rows, codes = [], []
+            for test in tests:
+                predicted, code = test.predict(scaled, viscosity, model)
+                rows.append((predicted - test.measured) / test.sd)
+                codes.append(code)
+            return jnp.concatenate(rows), (jnp.concatenate(rows), jnp.stack(codes))
+
+        J, (r, codes) = jax.jacfwd(residuals, has_aux=True)(u)
+        return r, J, codes
+
+    def evaluate(u):
+        r, J, codes = with_jacobian(u)
+        worst[:] = np.asarray(codes).tolist()
+        return r, J
+
+    found = levenberg_marquardt_host(evaluate, generalised_maxwell.unconstrained(start), max_iterations, progress)
+    evaluate(found.u)
+    r, n = np.asarray(found.residuals), len(found.u)
+    noise = max(1.0, float(np.sqrt(r @ r / max(1, len(r) - n))))
+    half, _ = spread(np.asarray(found.jacobian), noise, np.asarray(jax.jacfwd(parameter_vector)(found.u)))
+    errors = np.linalg.norm(half, axis=1)
+    return Estimate(
+        names=parameter_names((n - 1) // 2),
+        values=np.asarray(parameter_vector(found.u)),
+        standard_errors=errors,
+        correlation=half @ half.T / np.maximum(np.outer(errors, errors), 1e-300),
+        chi2=float(r @ r),
+        components=len(r),
+        noise=noise,
+        iterations=int(found.iterations),
+        converged=bool(found.converged) and all(c == status.CONVERGED for c in worst),
+        codes=tuple(worst),
+        seconds=time.perf_counter() - begin,
+    )

@@ -1,0 +1,169 @@
+"""Few numbers of one or more scenes from measured displacements: Gauss-Newton, standard errors."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import liverjax as lj
+from fitting.methods.least_squares import Solution, levenberg_marquardt_host
+from fitting.methods.uncertainty import spread
+from fitting.readers.displacements import Displacements, residuals
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.scenes.scene import Scene
+
+
+class Problem(NamedTuple):
+    """Scenes of one body under different loads, and what was measured of each."""
+
+    scenes: tuple[Scene, ...]
+    data: tuple[Displacements, ...]
+
+    @property
+    def components(self) -> int:
+        """Number of measured components."""
+        return sum(d.components for d in self.data)
+
+
+class Estimate(NamedTuple):
+    """Numbers with their uncertainty."""
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    standard_errors: np.ndarray
+    correlation: np.ndarray
+    chi2: float  # sum of squared residuals over the noise
+    components: int  # measured components
+    noise: float  # factor on the errors: 1, or what the misfit asks for
+    iterations: int
+    converged: bool
+    codes: tuple[int, ...]  # worst code of each scene's run
+    seconds: float
+
+
+def misfit(problem: Problem, values: dict[str, Any], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
+    """Residuals of all scenes (n,), and the worst code of each, with their numbers replaced by `values`."""
+    parts, codes = [], []
+    for scene, data in zip(problem.scenes, problem.data, strict=True):
+        result = lj.simulate(lj.with_parameters(scene, values), store=store)
+        parts.append(residuals(data, scene, result.positions))
+        codes.append(jnp.max(result.status))
+    return jnp.concatenate(parts), jnp.stack(codes)
+
+
+def fit(
+    problem: Problem,
+    values_of: Callable[[jax.Array], dict[str, Any]],
+    natural_of: Callable[[jax.Array], jax.Array],
+    names: Sequence[str],
+    start: Any,
+    max_iterations: int = 20,
+    progress: Callable[[int, float], None] = lambda iteration, cost: None,
+) -> tuple[Estimate, Solution]:
+    """Minimise the residuals over u.
+
+    Args:
+        problem: scenes and data.
+        values_of: u -> numbers of the scenes by dotted name.
+        natural_of: u -> the parameters to report (n,), of `names`.
+        start: first u (n,).
+        max_iterations, progress: as of `levenberg_marquardt_host`.
+    """
+    begin, codes = time.perf_counter(), [0] * len(problem.scenes)
+
+    @jax.jit
+    def with_jacobian(problem, u):
+        def twice(u):
+            r, codes = misfit(problem, values_of(u))
+            return r, (r, codes)
+
+        J, (r, codes) = jax.jacfwd(twice, has_aux=True)(u)
+        return r, J, codes
+
+    def evaluate(u):
+        r, J, codes[:] = with_jacobian(problem, u)
+        return r, J
+
+    found = levenberg_marquardt_host(evaluate, jnp.asarray(start, float), max_iterations, progress)
+    ended = tuple(int(c) for c in np.asarray(with_jacobian(problem, found.u)[2]))
+    r = np.asarray(found.residuals)
+    # Components that were not measured have residual 0 and count for nothing.
+    noise = max(1.0, float(np.sqrt(r @ r / max(1, problem.components - len(names)))))
+    half, _ = spread(np.asarray(found.jacobian), noise, np.asarray(jax.jacfwd(natural_of)(found.u)))
+    errors = np.linalg.norm(half, axis=1)
+    estimate = Estimate(
+        names=tuple(names),
+        values=np.asarray(natural_of(found.u)),
+        standard_errors=errors,
+        correlation=half @ half.T / np.maximum(np.outer(errors, errors), 1e-300),
+        chi2=float(r @ r),
+        components=problem.components,
+        noise=noise,
+        iterations=int(found.iterations),
+        converged=bool(found.converged) and all(c == status.CONVERGED for c in ended),
+        codes=ended,
+        seconds=time.perf_counter() - begin,
+    )
+    return estimate, found
+
+
+def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:
+    """Numbers of the scenes by their dotted names; positive ones stay positive.
+
+    Raises:
+        InputError: a name that a scene does not have, or one of no floating-point number.
+    """
+    starts = [value_of(problem.scenes[0], name) for name in names]
+    sizes = [np.size(v) for v in starts]
+    flat = np.concatenate([np.ravel(v) for v in starts])
+    labels = [
+        name if np.ndim(v) == 0 else f"{name}.{i}"
+        for name, v in zip(names, starts, strict=True)
+        for i in range(np.size(v))
+    ]
+    positive = jnp.asarray(flat > 0)
+    base = jnp.asarray(flat)
+
+    def natural_of(u):
+        return jnp.where(positive, base * jnp.exp(jnp.where(positive, u, 0.0)), base + u)
+
+    def values_of(u):
+        p, out, k = natural_of(u), {}, 0
+        for name, value, size in zip(names, starts, sizes, strict=True):
+            part = p[k : k + size]
+            out[name] = part[0] if np.ndim(value) == 0 else tuple(part) if isinstance(value, tuple) else part
+            k += size
+        return out
+
+    lj.with_parameters(problem.scenes[0], dict(zip(names, starts, strict=True)))
+    return fit(problem, values_of, natural_of, labels, np.zeros(len(flat)), **options)[0]
+
+
+def value_of(scene: Scene, name: str) -> Any:
+    """The number, or numbers, of a scene at a dotted name.
+
+    Raises:
+        InputError: a name that the scene does not have, or one of no number.
+    """
+    thing: Any = scene
+    path = name.split(".")
+    for k, key in enumerate(path):
+        rest = ".".join(path[k:])
+        if isinstance(thing, dict) and rest in thing:
+            thing = thing[rest]
+            break
+        if isinstance(thing, lj.laws.Continued):
+            thing = thing.law
+        if isinstance(thing, lj.laws.Sum) and key.isdigit():
+            thing = thing.laws
+        try:
+            thing = thing[int(key)] if key.isdigit() else getattr(thing, key)
+        except (AttributeError, IndexError, KeyError, TypeError):
+            thing = None
+    if thing is None or isinstance(thing, str) or not np.issubdtype(np.asarray(thing).dtype, np.floating):
+        raise InputError(f"parameter {name!r} is no number of the scene: use a name of the scene file, e.g. law.mu")
+    return thing if isinstance(thing, tuple) else jnp.asarray(thing, float)

@@ -1,0 +1,334 @@
+"""Identify a generalised Maxwell model from a frequency sweep, in closed form or through the torsion simulation."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods.generalised_maxwell import Maxwell, Spectrum
+from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt, levenberg_marquardt_host
+from fitting.methods.uncertainty import Uncertainty
+from fitting.readers.rheometer import Sweep
+from fitting.rigs import torsion
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.physics.viscosity import Prony
+
+OPTIMIZERS = ("levenberg-marquardt", "bfgs")
+
+
+class Fit(NamedTuple):
+    """A fitted model with all that a report needs."""
+
+    method: str
+    model: Maxwell
+    solution: Solution
+    uncertainty: Uncertainty
+    converged: bool
+    storage: np.ndarray  # fitted G' at the measured frequencies [Pa]
+    loss: np.ndarray
+    warnings: tuple[str, ...]
+    run_time: float  # [s]
+    compile_time: float
+    details: dict[str, Any]
+
+    @property
+    def modes(self) -> int:
+        """N."""
+        return len(self.model.ratios)
+
+    def relative_errors(self, sweep: Sweep) -> np.ndarray:
+        """|fit / data - 1| of G' then G'' (2n,)."""
+        data = np.concatenate([sweep.storage, sweep.loss])
+        return np.abs(np.concatenate([self.storage, self.loss]) / data - 1)
+
+
+def _timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
+    """Result, seconds of compilation, seconds of the run."""
+    begin = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    middle = time.perf_counter()
+    result = jax.block_until_ready(compiled(*arguments))
+    return result, middle - begin, time.perf_counter() - middle
+
+
+def check_modes(sweep: Sweep, modes: int) -> None:
+    """`InputError` where the sweep has too few points for the parameters, naming the largest number of modes."""
+    largest = generalised_maxwell.largest_number_of_modes(sweep)
+    if modes < 1:
+        raise InputError(f"--modes {modes} must be at least 1, or auto")
+    if modes > largest:
+        raise InputError(
+            f"{sweep.source or 'sweep'}: {largest + 1} different frequencies cannot determine the {2 * modes + 1} "
+            f"parameters of {modes} modes; use at most --modes {largest}"
+        )
+
+
+def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimizer: str = "levenberg-marquardt") -> Fit:
+    """Fit the closed-form moduli from several starts; the best minimum is kept.
+
+    Args:
+        sweep: data; residuals are divided by `sweep.deviations`.
+        modes: N.
+        dense: `generalised_maxwell.spectrum(sweep)` if already there.
+        optimizer: one of `OPTIMIZERS`.
+    """
+    check_modes(sweep, modes)
+    dense = dense or generalised_maxwell.refuse_impossible(sweep)
+    minimise = levenberg_marquardt if optimizer == OPTIMIZERS[0] else bfgs
+    starts = generalised_maxwell.starts(sweep, modes, dense)
+
+    def best(starts, *data):
+        found = jax.vmap(lambda u: minimise(generalised_maxwell.residuals, u, *data))(starts)
+        k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
+        return jax.tree.map(lambda leaf: leaf[k], found)
+
+    data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
+    found, compiling, running = _timed(best, starts, *data)
+    model = generalised_maxwell.natural(found.u)
+    storage, loss = (np.asarray(v) for v in generalised_maxwell.moduli(model, jnp.asarray(sweep.angular_frequency)))
+    return _fit("closed-form", sweep, found, storage, loss, (), running, compiling, {"optimizer": optimizer})
+
+
+def _fit(method, sweep, found, storage, loss, extra, running, compiling, details) -> Fit:
+    spread = uncertainty.estimate(found, sweep.storage_sd is not None)
+    sentences = _misfit(sweep, storage, loss) + tuple(uncertainty.cautions(sweep, spread, found))
+    converged = bool(found.converged)
+    if not converged and not extra:
+        extra = ("try fewer modes",)
+    if not converged:
+        reason = f"the fit did not converge in {int(found.iterations)} iterations; its best point is given"
+        sentences = (f"{reason}: {extra[0]}", *sentences)
+    G0, ratios, times = (np.asarray(v) for v in generalised_maxwell.natural(found.u))
+    model: Any = Maxwell(G0, ratios, times)  # type: ignore[arg-type]  # arrays of the host
+    details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
+    return Fit(method, model, found, spread, converged, storage, loss, sentences, running, compiling, details)
+
+
+def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, ...]:
+    """A sentence where the model does not follow the data, naming the worst point."""
+    e = np.abs(np.concatenate([storage / sweep.storage, loss / sweep.loss]) - 1)
+    if e.mean() < 0.05 and e.max() < 0.3:
+        return ()
+    worst, n = int(np.argmax(e)), len(storage)
+    where = f"{'storage' if worst < n else 'loss'}_modulus at {sweep.angular_frequency[worst % n] / (2 * np.pi):.3g} Hz"
+    return (
+        f"the fit misses the data by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
+        "try more modes, or look at the data",
+    )
+
+
+def identifiable(fit: Fit, sweep: Sweep) -> bool:
+    """Converged, and nothing advises against any of its modes."""
+    return bool(fit.converged and not uncertainty.superfluous(sweep, fit.uncertainty))
+
+
+def information_criterion(fit: Fit) -> float:
+    """Bayesian information criterion with the noise level estimated: m ln(RSS/m) + k ln m."""
+    m, k = len(fit.solution.residuals), len(fit.solution.u)
+    mean_square = max(2 * float(fit.solution.cost) / m, 1e-300)
+    return m * np.log(mean_square) + k * np.log(m)
+
+
+#: Mean relative residual at which a fit is exact to the digits of any data.
+EXACT = 1e-7
+
+
+def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) -> tuple[Fit, list[Fit]]:
+    """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact; all that was tried.
+
+    One failure may be a local minimum: the search ends at the second in a row. A number of modes whose computation
+    breaks down is such a failure, and is named in the warnings; the others stay.
+    """
+    cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
+    tried: list[Fit] = []
+    broken: dict[int, str] = {}
+    chosen, failures = None, 0
+    for modes in range(1, cap + 1):
+        try:
+            fit = closed_form(sweep, modes, dense, optimizer)
+        except (ArithmeticError, RuntimeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            broken[modes] = " ".join(str(error).split())[:100] or type(error).__name__
+            failures += 1
+        else:
+            tried.append(fit)
+            falls = chosen is None or information_criterion(fit) < information_criterion(chosen)
+            if chosen is None or (identifiable(fit, sweep) and falls):
+                chosen, failures = fit, 0
+            else:
+                failures += 1
+            if np.max(fit.relative_errors(sweep)) < EXACT:
+                break
+        if failures == 2:
+            break
+    if chosen is None:
+        raise InputError(f"{sweep.source or 'sweep'}: no number of modes could be fitted ({broken[1]}); check the data")
+    table = [
+        {
+            "modes": f.modes,
+            "information_criterion": float(information_criterion(f)),
+            "identifiable": identifiable(f, sweep),
+            "mean_relative_error": float(np.mean(f.relative_errors(sweep))),
+        }
+        for f in tried
+    ]
+    return (
+        chosen._replace(
+            warnings=(*chosen.warnings, *_other_numbers(sweep, chosen, tried, broken)),
+            compile_time=sum(f.compile_time for f in tried),
+            run_time=sum(f.run_time for f in tried),
+            details=chosen.details | {"modes_tried": table},
+        ),
+        tried,
+    )
+
+
+def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:
+    """Sentences on the numbers of modes that were not chosen: one that is closer, and those that broke down."""
+    out = []
+    closer = min(tried, key=information_criterion)
+    if information_criterion(closer) < information_criterion(chosen) - 10:
+        a, b = (100 * np.mean(f.relative_errors(sweep)) for f in (closer, chosen))
+        out.append(
+            f"{closer.modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but "
+            f"the data leave some of their parameters free; --modes {closer.modes} gives them all the same"
+        )
+    for modes, reason in broken.items():
+        out.append(
+            f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}) and took no part in the choice"
+        )
+    return out
+
+
+class Simulation(NamedTuple):
+    """How the torsion fit simulates: geometry [m], law, recursion and resolution."""
+
+    radius: float = torsion.RADIUS
+    height: float = torsion.HEIGHT
+    law: str = "neo_hookean"
+    scheme: str = "exponential"
+    part: str = "all"
+    steps: int = 50
+    cell_size: float | None = None
+    strain: float = 1e-3  # amplitude at the rim (section 5.2)
+
+
+def simulated_moduli(
+    u: jax.Array, rig: torsion.Rig, law: laws.Law, omega: Any, torque: Any, drive: torsion.Drive, scheme: str, part: str
+) -> torsion.Moduli:
+    """`torsion.moduli` of unconstrained Maxwell parameters u, the law scaled to their G0."""
+    model = generalised_maxwell.natural(u)
+    scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
+    viscosity = Prony(ratios=model.ratios, relaxation_times=model.relaxation_times, scheme=scheme, part=part)
+    return torsion.moduli(rig, scaled, viscosity, omega, torque, drive)
+
+
+def through_torsion(
+    sweep: Sweep,
+    start: Fit,
+    simulation: Simulation = Simulation(),
+    optimizer: str = OPTIMIZERS[0],
+    progress: Callable[[int, float], None] = lambda iteration, cost: None,
+) -> Fit:
+    """Fit the moduli of the simulated rheometer, starting from the closed form.
+
+    Args:
+        sweep: data.
+        start: fit in closed form with the number of modes wanted.
+        simulation: geometry, law and resolution.
+        optimizer: one of `OPTIMIZERS`.
+        progress: told of every evaluation.
+    """
+    from liverjax.physics.viscosity import check
+
+    law = laws.typical(simulation.law)
+    rig = torsion.make_rig(simulation.radius, simulation.height, simulation.cell_size)
+    drive = torsion.Drive(steps=simulation.steps)
+    check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
+    torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
+    measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
+    data = (rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales)
+
+    def residuals(u, rig, law, omega, torque, measured, scales):
+        m = simulated_moduli(u, rig, law, omega, torque, drive, simulation.scheme, simulation.part)
+        return (jnp.concatenate([m.storage, m.loss]) - measured) / scales, m
+
+    def evaluate(u, *data):
+        def twice(u):
+            r, m = residuals(u, *data)
+            return r, (r, m)
+
+        J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
+        return r, J, m
+
+    u0 = start.solution.u
+    begin = time.perf_counter()
+    if optimizer == OPTIMIZERS[0]:
+        compiled = jax.jit(evaluate).lower(u0, *data).compile()
+        compiling = time.perf_counter() - begin
+        seen = {}
+
+        def evaluated(u):
+            r, J, seen[u.tobytes()] = compiled(u, *data)
+            return r, J
+
+        found = levenberg_marquardt_host(lambda u: evaluated(np.asarray(u)), u0, progress=progress)
+        m = seen[np.asarray(found.u).tobytes()]
+        running = time.perf_counter() - begin - compiling
+    else:
+        (found, m), compiling, running = _timed(
+            lambda u, *data: (lambda s: (s, residuals(s.u, *data)[1]))(
+                bfgs(lambda u, *d: residuals(u, *d)[0], u, *data)
+            ),
+            u0,
+            *data,
+        )
+    storage, loss = np.asarray(m.storage), np.asarray(m.loss)
+    worst = int(np.max(m.statistics.status))
+    found = found._replace(converged=jnp.asarray(bool(found.converged) and worst == status.CONVERGED))
+    details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
+    advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
+    fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)
+    more = tuple(w for w in start.warnings if "modes would follow" in w)
+    return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
+
+
+def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
+    """What the simulation was and did, for the report."""
+    return {
+        "law": simulation.law,
+        "radius_m": simulation.radius,
+        "height_m": simulation.height,
+        "nodes": rig.mesh.number_of_nodes,
+        "elements": rig.mesh.number_of_elements,
+        "geometry_factor": float(torsion.geometry_factor(rig, law)),
+        "steps_per_cycle": simulation.steps,
+        "scheme": simulation.scheme,
+        "part": simulation.part,
+        "rim_strain": simulation.strain,
+        "newton_iterations": int(np.max(m.statistics.iterations)),
+        "newton_residual": float(np.max(m.statistics.residual)),
+        "newton_status": status.advice(np.max(m.statistics.status)),
+        "transient": float(np.max(m.defect)),
+    }
+
+
+def _bias(closed: Fit, simulated: Fit) -> list[str]:
+    """Where discretisation moves a parameter by more than its standard error."""
+    shift = simulated.uncertainty.values - closed.uncertainty.values
+    errors = simulated.uncertainty.standard_errors
+    out = []
+    for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):
+        if abs(d) > e and abs(d) > 1e-6 * abs(v):
+            out.append(
+                f"{name}: the simulation's discretisation moves it by {100 * d / v:.2g} %, more than its "
+                f"standard error ({100 * e / v:.2g} %); raise --steps or trust the closed form"
+            )
+    return out

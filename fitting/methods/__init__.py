@@ -1,0 +1,1 @@
+"""Least squares, uncertainty, the generalised Maxwell model, priors."""

@@ -1,0 +1,163 @@
+"""The generalised Maxwell model: closed-form moduli, an unconstrained parametrisation, starting points.
+
+G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), chapter section 5.2; g_i are ratios of G0 (Table 2 prints Pa).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+
+from fitting.readers.rheometer import Sweep
+from liverjax.core.errors import InputError
+
+
+class Maxwell(NamedTuple):
+    """Parameters of a generalised Maxwell solid; relaxation times descend."""
+
+    shear_modulus: jax.Array  # G0, instantaneous [Pa]
+    ratios: jax.Array  # g_i (N,)
+    relaxation_times: jax.Array  # tau_i (N,) [s]
+
+    @property
+    def equilibrium_modulus(self) -> jax.Array:
+        """G0 (1 - sum g_i) [Pa]."""
+        return self.shear_modulus * (1 - jnp.sum(self.ratios))
+
+
+def moduli(model: Maxwell, omega: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """G' and G'' [Pa] at angular frequencies omega (n,) [rad/s]."""
+    x = omega[:, None] * model.relaxation_times[None]
+    ratios = model.ratios[None]
+    loss = jnp.sum(ratios * x / (1 + x * x), axis=-1)
+    storage = 1 - jnp.sum(ratios / (1 + x * x), axis=-1)
+    return model.shear_modulus * storage, model.shear_modulus * loss
+
+
+def natural(u: jax.Array) -> Maxwell:
+    """Model of unconstrained parameters u (2N + 1,).
+
+    u = log G0; logits of the ratios against the equilibrium part (softmax, so every ratio is positive and their sum
+    below one); log of the longest time, then log of the gaps between log times (so they descend).
+    """
+    n = (u.shape[0] - 1) // 2
+    share = jax.nn.softmax(jnp.append(u[1 : n + 1], 0.0))[:n]
+    log_times = u[n + 1] - jnp.append(0.0, jnp.cumsum(jnp.exp(u[n + 2 :])))
+    return Maxwell(jnp.exp(u[0]), share, jnp.exp(log_times))
+
+
+def unconstrained(model: Maxwell) -> jax.Array:
+    """Inverse of `natural`; relaxation times are sorted, ratios must be positive with a sum below one."""
+    order = jnp.argsort(-jnp.asarray(model.relaxation_times))
+    g, log_tau = jnp.asarray(model.ratios)[order], jnp.log(jnp.asarray(model.relaxation_times)[order])
+    gaps = jnp.log(jnp.maximum(-jnp.diff(log_tau), 1e-3))
+    return jnp.concatenate(
+        [jnp.log(jnp.atleast_1d(model.shear_modulus)), jnp.log(g / (1 - g.sum())), log_tau[:1], gaps]
+    )
+
+
+def residuals(u: jax.Array, omega: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array) -> jax.Array:
+    """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
+    return (jnp.concatenate(moduli(natural(u), omega)) - jnp.concatenate([storage, loss])) / scales
+
+
+def largest_number_of_modes(sweep: Sweep) -> int:
+    """N with 2N + 1 parameters below the 2n moduli at n different frequencies."""
+    return len(np.unique(sweep.angular_frequency)) - 1
+
+
+class Spectrum(NamedTuple):
+    """The best that any number of Maxwell modes can do."""
+
+    times: np.ndarray
+    strengths: np.ndarray  # [Pa], >= 0
+    equilibrium: float  # [Pa]
+    misfit: float  # root mean square of |G* - data| / |data| over the frequencies
+
+
+def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
+    """Non-negative least squares over a dense grid of relaxation times two decades wider than the band."""
+    omega = sweep.angular_frequency
+    low, high = np.log10(1 / omega[-1]) - 2, np.log10(1 / omega[0]) + 2
+    times = np.logspace(low, high, int((high - low) * per_decade) + 1)
+    x = omega[:, None] * times
+    size = np.hypot(sweep.storage, sweep.loss)
+    top = np.column_stack([np.ones_like(omega), x**2 / (1 + x**2)]) / size[:, None]
+    bottom = np.column_stack([np.zeros_like(omega), x / (1 + x**2)]) / size[:, None]
+    A, b = np.vstack([top, bottom]), np.concatenate([sweep.storage / size, sweep.loss / size])
+    weights, rest = _non_negative(A, b)
+    return Spectrum(times, weights[1:], float(weights[0]), float(rest / np.sqrt(len(omega))))
+
+
+def _non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
+    """x >= 0 that brings A x nearest to b, and their distance.
+
+    An active set that cycles (columns that are nearly the same, which close relaxation times give) leaves the problem
+    to SciPy's bounded least squares, which always comes back with its best point.
+    """
+    norm = np.linalg.norm(A, axis=0)  # columns of equal length keep the active-set iteration short
+    norm = np.where(norm > 0, norm, 1.0)
+    try:
+        x, rest = scipy.optimize.nnls(A / norm, b, maxiter=50 * A.shape[1])
+    except RuntimeError:
+        x = np.maximum(scipy.optimize.lsq_linear(A / norm, b, bounds=(0, np.inf)).x, 0.0)
+        rest = float(np.linalg.norm(A / norm @ x - b))
+    return x / norm, float(rest)
+
+
+#: Above this misfit no number of modes describes the data even roughly: columns or units are wrong.
+HOPELESS = 0.3
+
+
+def refuse_impossible(sweep: Sweep) -> Spectrum:
+    """The dense spectrum, or `InputError` where no generalised Maxwell solid is near the data."""
+    dense = spectrum(sweep)
+    if dense.misfit > HOPELESS:
+        above = np.median(sweep.loss / sweep.storage)
+        hint = (
+            f"loss_modulus is {above:.1f} times storage_modulus (are the two columns exchanged?)"
+            if above > 1
+            else "check columns and units"
+        )
+        raise InputError(
+            f"{sweep.source or 'sweep'}: no Maxwell model of any number of modes comes closer than "
+            f"{100 * dense.misfit:.0f} % to these moduli; {hint}"
+        )
+    return dense
+
+
+def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int = 0) -> np.ndarray:
+    """Starting points (count, 2N + 1): the dense spectrum cut into N groups, then log-uniform times.
+
+    For given times the strengths are linear, so each start takes them from non-negative least squares.
+    """
+    omega = sweep.angular_frequency
+    low, high = -np.log(omega[-1]) - 0.5, -np.log(omega[0]) + 0.5
+    rng = np.random.default_rng(seed)
+    times = [np.linspace(low, high, modes + 2)[1:-1], _grouped(dense, modes, low, high)]
+    times += [np.sort(rng.uniform(low - 1, high + 1, modes)) for _ in range(count - len(times))]
+    return np.stack([_start(sweep, np.exp(np.sort(t)[::-1])) for t in times])
+
+
+def _grouped(dense: Spectrum, modes: int, low: float, high: float) -> np.ndarray:
+    """Log times that share the spectrum's strength equally."""
+    if dense.strengths.sum() <= 0:
+        return np.linspace(low, high, modes)
+    share = np.cumsum(dense.strengths) / dense.strengths.sum()
+    return np.interp((np.arange(modes) + 0.5) / modes, share, np.log(dense.times))
+
+
+def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
+    for k in range(1, len(times)):  # keep the gaps representable
+        times[k] = min(times[k], times[k - 1] * np.exp(-0.05))
+    x = sweep.angular_frequency[:, None] * times
+    one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
+    scale = np.concatenate(sweep.deviations)
+    A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])]) / scale[:, None]
+    strengths, _ = _non_negative(A, np.concatenate([sweep.storage, sweep.loss]) / scale)
+    total = strengths.sum()
+    share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
+    share = share / share.sum()
+    return np.asarray(unconstrained(Maxwell(jnp.asarray(total), jnp.asarray(share[1:]), jnp.asarray(times))))

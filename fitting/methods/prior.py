@@ -1,0 +1,67 @@
+"""A smooth random field on a mesh (Matern; Lindgren, Rue and Lindstroem 2011): what is thought before any data.
+
+(kappa^2 - Laplace) m = white noise, kappa = 1 / length: in three dimensions a covariance sd^2 exp(-distance / length).
+With lumped mass M and stiffness L of linear tetrahedra, m = A^-1 M^(1/2) z for independent standard normal z, A =
+(kappa^2 M + L) / (sd sqrt(8 pi kappa)). At the boundary, where nothing flows out, sd is larger, in corners most.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+from liverjax.mesh.tetrahedra import TetMesh
+
+
+class Prior(NamedTuple):
+    """Factorised on the host; functions below."""
+
+    solver: Any  # of kappa^2 M + L
+    root_mass: np.ndarray  # (V,)
+    scale: float  # sqrt(8 pi kappa), of a field of standard deviation 1
+
+
+def prior(mesh: TetMesh, length: float) -> Prior:
+    """The field of standard deviation 1 and correlation length `length` [m]."""
+    kappa, n = 1 / length, mesh.number_of_nodes
+    tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
+    D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)
+    grad = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
+    local = volumes[:, None, None] * np.einsum("eac,ebc->eab", grad, grad)
+    rows, columns = np.repeat(tets, 4, axis=1).ravel(), np.tile(tets, (1, 4)).ravel()
+    L = scipy.sparse.coo_matrix((local.ravel(), (rows, columns)), shape=(n, n)).tocsc()
+    mass = np.bincount(tets.ravel(), np.repeat(volumes / 4, 4), minlength=n)
+    A = (kappa**2 * scipy.sparse.diags(mass) + L).tocsc()
+    return Prior(scipy.sparse.linalg.splu(A), np.sqrt(mass), math.sqrt(8 * math.pi * kappa))
+
+
+def to_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
+    """m of z, (V,) or (V, k)."""
+    root = p.root_mass if z.ndim == 1 else p.root_mass[:, None]
+    return p.scale * p.solver.solve(root * z)
+
+
+def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
+    """The transpose of `to_nodes`: derivatives by z of derivatives by m."""
+    root = p.root_mass if g.ndim == 1 else p.root_mass[:, None]
+    return p.scale * root * p.solver.solve(g)
+
+
+def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -> tuple[np.ndarray, np.ndarray]:
+    """Variances (V,) before and after data that leave the part `kept` of the variance of the directions `modes`.
+
+    Args:
+        modes: orthonormal directions of z (V, k).
+        kept: variance that is left in each of them, of 1.
+    """
+    n = len(p.root_mass)
+    before = np.zeros(n)
+    for first in range(0, n, chunk):
+        unit = np.zeros((n, min(chunk, n - first)))
+        unit[np.arange(first, first + unit.shape[1]), np.arange(unit.shape[1])] = 1
+        # Row v of T = scale A^-1 M^(1/2), by the symmetry of A.
+        before[first : first + unit.shape[1]] = np.sum(to_whitened(p, unit) ** 2, axis=0)
+    after = before - to_nodes(p, modes) ** 2 @ (1 - kept)
+    return before, np.maximum(after, 0.0)

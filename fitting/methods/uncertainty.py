@@ -1,0 +1,237 @@
+"""How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+from fitting.methods import generalised_maxwell
+from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.readers.rheometer import Sweep
+
+
+class Uncertainty(NamedTuple):
+    """Of the parameters in the order of `names`: G0, ratios, relaxation times."""
+
+    names: tuple[str, ...]
+    values: np.ndarray  # (2N + 1,)
+    covariance: np.ndarray  # (2N + 1, 2N + 1); huge where the data leave a direction free
+    standard_errors: np.ndarray
+    correlation: np.ndarray
+    equilibrium_error: float  # of G0 (1 - sum g) [Pa]
+    noise: float  # factor on the given scales: 1, or what the residuals ask for
+    quantile: float  # of Student's t for a 95 % interval
+
+
+def parameter_vector(u: jax.Array) -> jax.Array:
+    """G0, ratios, relaxation times (2N + 1,) of unconstrained parameters."""
+    model = generalised_maxwell.natural(u)
+    return jnp.concatenate([model.shear_modulus[None], model.ratios, model.relaxation_times])
+
+
+def parameter_names(modes: int) -> tuple[str, ...]:
+    """Names in the order of `parameter_vector`."""
+    ratios, times = ([f"{n}[{i}]" for i in range(modes)] for n in ("ratios", "relaxation_times"))
+    return ("shear_modulus", *ratios, *times)
+
+
+def noise_factor(residuals: np.ndarray, n_parameters: int, deviations_given: bool) -> float:
+    """Noise over the residual scales.
+
+    Without deviations the residuals estimate it. Given deviations are believed, except where the residuals are larger
+    than they allow: then errors grow with the misfit and never shrink (the rule of the Particle Data Group).
+    """
+    freedom = max(1, len(residuals) - n_parameters)
+    estimate = float(np.sqrt(np.sum(residuals**2) / freedom))
+    return max(1.0, estimate) if deviations_given else estimate
+
+
+def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Square root A of the covariance A A^T of natural parameters (delta method), and scaled singular values.
+
+    Args:
+        jacobian: of the residuals by unconstrained parameters u.
+        noise: standard deviation of a residual.
+        to_natural: derivative of the natural parameters by u.
+    """
+    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # nothing is known: a fit that could not begin
+        return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
+    return noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0]), s
+
+
+def estimate(found: Solution, deviations_given: bool) -> Uncertainty:
+    """Linearised covariance at the minimum, carried to the natural parameters by the delta method."""
+    u, J, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
+    noise = noise_factor(r, len(u), deviations_given)
+    to_natural = np.asarray(jax.jacfwd(parameter_vector)(found.u))
+    half, _ = spread(J, noise, to_natural)
+    values = np.asarray(parameter_vector(found.u))
+    covariance = half @ half.T
+    errors = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.maximum(np.outer(errors, errors), 1e-300)
+    # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
+    stuck = np.abs(to_natural).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
+    errors = np.where(stuck, np.inf, errors)
+    modes = (len(u) - 1) // 2
+    # d(G0 (1 - sum g)): through the square root of the covariance, which keeps it non-negative.
+    slope = np.concatenate([[1 - values[1 : modes + 1].sum()], np.full(modes, -values[0]), np.zeros(modes)])
+    return Uncertainty(
+        parameter_names(modes),
+        values,
+        covariance,
+        errors,
+        correlation,
+        float(np.linalg.norm(slope @ half)) if 1 - values[1 : modes + 1].sum() > 1e-10 else np.inf,
+        noise,
+        float(scipy.stats.t.ppf(0.975, max(1, len(r) - len(u)))),
+    )
+
+
+def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Uncertainty, points: int = 21) -> dict[str, Any]:
+    """95 % intervals by profile likelihood, closed form: all other parameters refitted along each one.
+
+    Returns:
+        name -> [low, high]; `None` for an end that four standard errors do not reach.
+    """
+    data = (jnp.asarray(sweep.angular_frequency), sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
+    best = 2 * float(found.cost)
+
+    def held(u, j, value, weight, *data):
+        penalty = weight * (parameter_vector(u)[j] - value)
+        return jnp.append(generalised_maxwell.residuals(u, *data), penalty)
+
+    @jax.jit
+    def along(j, values, weight):
+        def one(value):
+            s = levenberg_marquardt(held, found.u, j, value, weight, *data)
+            return parameter_vector(s.u)[j], jnp.sum(s.residuals[:-1] ** 2)
+
+        return jax.vmap(one)(values)
+
+    intervals: dict[str, list] = {}
+    for j, name in enumerate(uncertainty.names):
+        center, error = uncertainty.values[j], uncertainty.standard_errors[j]
+        if not np.isfinite(error) or error == 0:
+            intervals[name] = [None, None]
+            continue
+        grid = center + error * np.linspace(-4, 4, points) * uncertainty.quantile / 2
+        # The penalty only steers: wherever it comes to rest, that point is the constrained optimum there.
+        reached, chi2 = (
+            np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
+        )
+        rise = (chi2 - best) / uncertainty.noise**2 - uncertainty.quantile**2
+        middle = points // 2
+        intervals[name] = [
+            _crossing(reached[middle::-1], rise[middle::-1]),
+            _crossing(reached[middle:], rise[middle:]),
+        ]
+    return intervals
+
+
+def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
+    """First zero of `rise` walking outwards, by linear interpolation."""
+    above = np.flatnonzero(rise > 0)
+    if not len(above) or above[0] == 0:
+        return None
+    k = above[0]
+    return float(x[k - 1] + (x[k] - x[k - 1]) * rise[k - 1] / (rise[k - 1] - rise[k]))
+
+
+#: Neighbouring relaxation times closer than this factor act as one mode.
+MERGED = 1.5
+
+
+def _decades(sweep: Sweep) -> float:
+    return float(np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0]))
+
+
+def supported_modes(sweep: Sweep) -> int:
+    """How many modes the band has room for: about one a decade and one more, at least one."""
+    return max(1, int(_decades(sweep) + 1 + 1e-9))  # a decade is a decade in spite of rounding
+
+
+def superfluous(sweep: Sweep, u: Uncertainty) -> list[str]:
+    """Sentences that advise against some of the modes; none for a number of modes that may be chosen."""
+    modes = (len(u.values) - 1) // 2
+    fewer = "use fewer modes or a wider sweep" if modes > 1 else "use a wider sweep"
+    g, tau = u.values[1 : modes + 1], u.values[modes + 1 :]
+    g_err, tau_err = u.standard_errors[1 : modes + 1], u.standard_errors[modes + 1 :]
+    low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
+    out = []
+    for k in range(modes):
+        if not low / 100 <= tau[k] <= 100 * high:
+            product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
+            out.append(
+                f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the measured "
+                f"frequencies resolve: only {product} is determined, no factor of it; "
+                f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
+            )
+        if not g_err[k] < 0.5 * g[k]:
+            out.append(
+                f"ratios[{k}] = {g[k]:.3g} has a standard error of {_percent(g_err[k], g[k])}: "
+                + ("the data do not need this mode; use fewer modes" if modes > 1 else f"it is not determined; {fewer}")
+            )
+        elif not tau_err[k] < 0.5 * tau[k]:
+            out.append(
+                f"relaxation_times[{k}] = {tau[k]:.3g} s has a standard error of {_percent(tau_err[k], tau[k])}: "
+                f"the data leave it nearly free; {fewer}"
+            )
+    for k in range(modes - 1):
+        if tau[k] < MERGED * tau[k + 1]:
+            out.append(
+                f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
+                f"{modes - 1} mode{'s' if modes > 2 else ''}"
+            )
+    if modes > supported_modes(sweep) or _decades(sweep) < 0.3:
+        out.append(
+            f"the sweep spans {_decades(sweep):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
+            f"(about one a decade and one more); {fewer}"
+        )
+    return out
+
+
+def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
+    """Sentences on what the data do not tell, each with the number it rests on and what to do."""
+    modes = (len(u.values) - 1) // 2
+    tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
+    low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
+    out = superfluous(sweep, u)
+    for k in range(modes):
+        if low / 100 <= tau[k] <= 100 * high and not low <= tau[k] <= high:
+            out.append(
+                f"relaxation_times[{k}] = {tau[k]:.3g} s lies outside the {low:.3g}-{high:.3g} s that the measured "
+                f"frequencies resolve: it is extrapolated (standard error {_percent(tau_err[k], tau[k])}); measure at "
+                f"{'higher' if tau[k] < low else 'lower'} frequencies to pin it down"
+            )
+    ratios = u.values[1 : modes + 1].sum()
+    equilibrium = u.values[0] * (1 - ratios)
+    if not equilibrium > 2 * u.equilibrium_error:
+        out.append(
+            f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
+            "from zero (a fluid); measure at lower frequencies"
+        )
+    if sweep.storage_sd is not None:
+        r = np.asarray(found.residuals)
+        actual = float(np.sqrt(np.mean(r**2)))
+        if actual < 0.3:
+            out.append(
+                f"the fit is {1 / max(actual, 1e-12):.2g} times closer than the given deviations: they are "
+                "probably the spread between samples, common to all frequencies; the standard "
+                "errors take them as independent noise"
+            )
+        elif u.noise > 1.5:
+            out.append(
+                f"the residuals are {u.noise:.2g} times the given deviations: the model misses something or the "
+                "deviations are too small; the standard errors are enlarged by that factor"
+            )
+    return out
+
+
+def _percent(error: float, value: float) -> str:
+    ratio = 100 * error / abs(value) if value else np.inf
+    return f"{ratio:.3g} %" if ratio < 1e4 else "more than 10000 %"

@@ -1,0 +1,1 @@
+"""Files of laboratories: sweeps, stress-stretch curves, displacements."""

@@ -1,0 +1,201 @@
+"""Stress-stretch curves of an incompressible sample: tension, compression, shear, equibiaxial and pure-shear data."""
+
+import csv
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers import workbook
+from liverjax.core.errors import InputError
+from liverjax.laws import homogeneous
+
+#: Pascal in the units that a column may name.
+UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
+_INDICES = [f"{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+
+
+class Curve(NamedTuple):
+    """One test of one sample."""
+
+    label: str
+    test: str  # uniaxial, equibiaxial, pure_shear, simple_shear or general
+    F: np.ndarray  # (n, 3, 3), det F = 1, face 3 free
+    component: tuple[int, int]  # of the nominal stress that was measured
+    stress: np.ndarray  # (n,) [Pa]
+
+    @property
+    def driven(self) -> np.ndarray:
+        """The component of F that the stress works on; where it does not vary, the shear or stretch that does."""
+        own, shear = self.F[:, *self.component], self.F[:, 0, 1]
+        return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
+
+    @property
+    def rises(self) -> bool:
+        """Whether the stress of a stable material rises with `driven`: it does all the work of the test."""
+        return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
+
+    @property
+    def scale(self) -> float:
+        """Root mean square of the stress [Pa]: what a relative error is relative to."""
+        return float(np.sqrt(np.mean(self.stress**2)))
+
+
+def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
+    """Curves of CSV files, and notes for the user.
+
+    Two forms, `#` comments in both: columns F11 … F33 and P11 … P33 (components that are zero throughout were not
+    measured), or `test`, `stretch`, `shear`, `nominal_stress_kPa` with `test` one of uniaxial, equibiaxial, pure_shear,
+    simple_shear. A stress column may end in _Pa, _kPa or _MPa; without, it is in `unit`.
+
+    Raises:
+        InputError: no such file, no such columns, values that are no numbers, volume that changes, too few points.
+    """
+    curves, notes = [], []
+    for file in files:
+        rows = _rows(file)
+        found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
+        curves += found
+        if not named:
+            notes.append(f"{file.name}: its stress column names no unit, read as {unit} (--unit Pa, kPa or MPa)")
+    seen: dict[str, int] = {}
+    for k, curve in enumerate(curves):
+        seen[curve.label] = seen.get(curve.label, 0) + 1
+        if seen[curve.label] > 1:
+            curves[k] = curve._replace(label=f"{curve.label} ({seen[curve.label]})")
+    return curves, notes
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    try:
+        data = file.read_bytes()
+        workbook.refuse(file, data, "the sheet of the curves")
+        text = data.decode("utf-8-sig")
+    except IsADirectoryError:
+        raise InputError(f"{file} is a folder: give a CSV file of curves") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{file} is not text: give a CSV file of curves") from None
+    except OSError as error:
+        raise InputError(f"{file} cannot be read ({error.strerror}): give a CSV file of curves") from None
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if len(lines) < 2:
+        raise InputError(f"{file} holds no rows: give a CSV file of curves")
+    rows = [{k.strip(): (v or "").strip() for k, v in r.items() if k} for r in csv.DictReader(lines)]
+    rows = [row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
+    if not rows:
+        raise InputError(f"{file} holds no rows: give a CSV file of curves")
+    if "F11" not in rows[0] and not {"test", "stretch"} <= set(rows[0]):
+        raise InputError(
+            f"{file} has columns {', '.join(list(rows[0])[:-1])[:100]}: give F11 … F33, P11 … P33, "
+            "or test, stretch, shear, nominal_stress_kPa"
+        )
+    return rows
+
+
+def _column(file: Path, rows: list[dict], name: str, default: float | None = None) -> np.ndarray:
+    values = []
+    for row in rows:
+        text = row.get(name, "")
+        if not text and default is not None:
+            values.append(default)
+            continue
+        try:
+            values.append(float(text))
+        except ValueError:
+            where = f"{file}, data row {row['row']}"
+            raise InputError(f"{where}: {name} = {text[:40]!r} is not a number: give one") from None
+        if not np.isfinite(values[-1]):
+            raise InputError(f"{file}, data row {row['row']}: {name} = {text} is not finite: leave the row out")
+    return np.array(values)
+
+
+def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str, float, bool] | None:
+    """Name, factor to Pa, and whether the unit was named."""
+    for name in row:
+        match = re.fullmatch(pattern + r"(?:[_ ]*[\[(]?(Pa|kPa|MPa)[\])]?)?", name)
+        if match:
+            return name, UNITS[match[1] or unit], match[1] is not None
+    return None
+
+
+def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
+    F = np.stack([_column(file, rows, f"F{ij}") for ij in _INDICES], axis=1).reshape(-1, 3, 3)
+    measured, named = {}, True
+    for ij in _INDICES:
+        column = _stress_column(file, rows[0], f"P{ij}", unit)
+        if column is None:
+            continue
+        values = column[1] * _column(file, rows, column[0])
+        if np.any(values != 0):
+            measured[int(ij[0]) - 1, int(ij[1]) - 1] = values
+            named = named and column[2]
+    if not measured:
+        raise InputError(f"{file}: all stresses P11 … P33 are zero or missing: give the measured components")
+    if any(2 in ij for ij in measured):
+        raise InputError(f"{file}: face 3 carries stress (P13 … P33): turn the axes so that it is free")
+    if np.abs(F[:, [0, 1, 2, 2], [2, 2, 0, 1]]).max() > 1e-9:
+        raise InputError(f"{file}: F13, F23, F31, F32 must be 0: turn the axes so that face 3 stays flat")
+    if (1, 1) in measured and (0, 0) in measured and np.allclose(measured[0, 0], measured[1, 1], rtol=1e-6):
+        del measured[1, 1]  # one number, written twice
+    kind = _kind(F)
+    several = len(measured) > 1
+    return [
+        _curve(file, f"{file.stem}{f', P{i + 1}{j + 1}' if several else ''}", kind, F, (i, j), values)
+        for (i, j), values in measured.items()
+    ], named
+
+
+def _kind(F: np.ndarray) -> str:
+    a, b, c = F[:, 0, 0], F[:, 1, 1], F[:, 2, 2]
+    if np.any(F[:, 1, 0] != 0):
+        return "general"
+    if np.any(F[:, 0, 1] != 0):
+        return "simple_shear"
+    for name, one, two in (("uniaxial", b, c), ("equibiaxial", a, b), ("pure_shear", b, np.ones_like(b))):
+        if np.allclose(one, two, rtol=1e-3):
+            return name
+    return "general"
+
+
+def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
+    column = _stress_column(file, rows[0], "nominal_stress", unit)
+    if column is None:
+        raise InputError(f"{file} has no column nominal_stress_Pa (or _kPa, _MPa): name the measured stress so")
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        test = row["test"]
+        if test not in homogeneous.TESTS:
+            raise InputError(f"{file}: test {test!r} is not known: use one of {', '.join(homogeneous.TESTS)}")
+        groups.setdefault((test, row.get("stretch", "") if test == "simple_shear" else ""), []).append(row)
+    curves = []
+    for (test, fixed), group in groups.items():
+        shear = homogeneous.TESTS[test] == "shear"
+        stretch = _column(file, group, "stretch", 1.0 if shear else None)
+        driven = _column(file, group, "shear") if shear else stretch
+        if np.any(stretch <= 0):
+            raise InputError(f"{file}: a stretch of {stretch.min():g} is not possible: give length over rest length")
+        F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
+        label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
+        component = (0, 1) if shear else (0, 0)
+        curves.append(_curve(file, label, test, F, component, column[1] * _column(file, group, column[0])))
+    return curves, column[2]
+
+
+def _curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, stress: np.ndarray) -> Curve:
+    J = np.linalg.det(F)
+    worst = int(np.argmax(np.abs(J - 1)))
+    if abs(J[worst] - 1) > 1e-3:
+        raise InputError(f"{file}: det F = {J[worst]:.4g} in row {worst + 1}: volume must be kept (det F = 1)")
+    if len(stress) < 3:
+        raise InputError(f"{file}: {label} has {len(stress)} points: give at least 3")
+    rms = np.sqrt(np.mean(stress**2))
+    if not 1e-100 < rms < 1e100:
+        raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa: give measured stresses")
+    if np.ptp(F, axis=0).max() == 0:
+        raise InputError(f"{file}: {label} has the same deformation in every row: give a curve")
+    # Rounded digits of F: the volume is made 1 by the free side.
+    F = F.copy()
+    F[:, 2, 2] /= J
+    order = np.argsort(Curve(label, test, F, component, stress).driven, kind="stable")
+    return Curve(label, test, F[order], component, stress[order])

@@ -1,0 +1,172 @@
+"""Measured displacements of points of a body: read from CSV, and what a simulation says at the same points."""
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.tetrahedra import UNITS, TetMesh
+from liverjax.scenes.scene import Scene
+
+#: A point this far from the mesh, in lengths of its longest edges, is not one of the body.
+_FAR = 2.0
+_COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
+
+
+class Displacements(NamedTuple):
+    """n points, each seen at one step of the scene."""
+
+    step: np.ndarray  # (n,) which step, from 0
+    nodes: np.ndarray  # (n, 4) of the element it is in
+    weights: np.ndarray  # (n, 4) its barycentric coordinates
+    measured: np.ndarray  # (n, 3) [m]; 0 where not measured
+    sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
+
+    @property
+    def components(self) -> int:
+        """Number of measured components."""
+        return int(np.isfinite(self.sd).sum())
+
+
+def read_displacements(path: str | Path, scene: Scene, noise: float | None = None, unit: str = "m") -> Displacements:
+    """Displacements of a CSV file with a header.
+
+    Columns: ``node`` (its number), or ``x, y, z`` (place at rest); ``ux, uy, uz``, empty where not measured; ``time``
+    [s] where the scene has time steps (without it: the last step); ``sd``, standard deviation of the noise. `#` begins
+    a comment.
+
+    Args:
+        path: CSV file.
+        scene: the scene that is to explain them.
+        noise: standard deviation [m] where the file has no ``sd``.
+        unit: of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
+
+    Raises:
+        InputError: unreadable file, unknown or missing columns, values that are not finite, a node or point that the
+            mesh has not, a time at which there is no step, no noise level.
+    """
+    path = Path(path)
+    if unit not in UNITS:
+        raise InputError(f"--unit {unit!r} is not known: use one of {', '.join(UNITS)}")
+    table = _table(path)
+    mesh, scale = scene.mesh, UNITS[unit]
+    n = len(table["ux"])
+    measured = scale * np.stack([table[c] for c in ("ux", "uy", "uz")], axis=1)
+    if np.any(np.isinf(measured)):
+        raise InputError(f"{path}: row {int(np.argwhere(np.isinf(measured))[0, 0]) + 1} is infinite: leave it empty")
+    seen = np.isfinite(measured)
+    if not seen.any():
+        raise InputError(f"{path}: no displacement is measured: fill ux, uy, uz")
+    if "sd" in table:
+        sd = scale * table["sd"]
+    elif noise is not None:
+        sd = np.full(n, noise)
+    else:
+        raise InputError(f"{path}: no column sd: add one, or give the noise's standard deviation in metres by --noise")
+    if not (np.all(np.isfinite(sd)) and np.all(sd > 0)):
+        raise InputError(f"{path}: sd must be positive and finite: give the noise's standard deviation")
+    if "node" in table:
+        nodes, weights = _at_nodes(path, mesh, table["node"])
+    else:
+        nodes, weights = _at_points(path, mesh, scale * np.stack([table[c] for c in "xyz"], axis=1))
+    return Displacements(
+        step=_steps(path, scene, table.get("time"), n),
+        nodes=nodes,
+        weights=weights,
+        measured=np.where(seen, measured, 0.0),
+        sd=np.where(seen, sd[:, None], np.inf),
+    )
+
+
+def _table(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty file
+            data = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, comments="#", dtype=float))
+    except (OSError, ValueError, IndexError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path} cannot be read ({reason}): give a CSV with columns x,y,z,ux,uy,uz") from None
+    names = data.dtype.names or ()
+    for name in names:
+        if name not in _COLUMNS:
+            raise InputError(f"{path}: column {name!r} is not known: use {', '.join(_COLUMNS)}")
+    for needed in ("ux", "uy", "uz"):
+        if needed not in names:
+            raise InputError(f"{path} has no column {needed}: give x,y,z (or node) and ux,uy,uz")
+    if ("node" in names) == all(c in names for c in "xyz"):
+        raise InputError(f"{path} needs either a column node or columns x,y,z: give one of them")
+    return {name: np.asarray(data[name], float) for name in names}
+
+
+def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    whole = np.isfinite(node) & (node == np.round(node)) & (node >= 0) & (node < mesh.number_of_nodes)
+    if not whole.all():
+        bad = node[np.flatnonzero(~whole)[0]]
+        raise InputError(
+            f"{path}: node {bad:g} is none of the mesh's: give whole numbers 0 to {mesh.number_of_nodes - 1}"
+        )
+    weights = np.zeros((len(node), 4))
+    weights[:, 0] = 1
+    return np.repeat(node.astype(np.int32)[:, None], 4, axis=1), weights
+
+
+def _at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if not np.all(np.isfinite(points)):
+        raise InputError(f"{path}: a place x,y,z is not finite: give the position at rest of every point")
+    nodes, weights, outside = locate(mesh, points)
+    if np.any(outside > _FAR):
+        bad = int(np.argmax(outside))
+        raise InputError(
+            f"{path}: the point {points[bad].tolist()} m is {outside[bad]:.3g} elements off the mesh: is --unit right?"
+        )
+    return nodes, weights
+
+
+def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The element each point is in, or nearest to being in: its nodes (n, 4), barycentric coordinates (n, 4), and how
+    far outside it is (n,), in sizes of the element; host side."""
+    X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    candidates = min(candidates, len(tets))
+    _, near = cKDTree(X[tets].mean(axis=1)).query(points, k=candidates)
+    near = near.reshape(len(points), candidates)
+    D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)  # (E, 3, 3) gradients of N_1 .. N_3
+    inner = np.einsum("nkac,nkc->nka", D[near], points[:, None] - X[tets[near, 0]])
+    bary = np.concatenate([1 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
+    best = np.argmax(bary.min(axis=-1), axis=1)
+    row = np.arange(len(points))
+    element, weights = near[row, best], bary[row, best]
+    return tets[element], weights, np.maximum(0.0, -weights.min(axis=-1))
+
+
+def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndarray:
+    last = scene.solve.steps - 1
+    if time is None:
+        return np.full(n, last, np.int32)
+    if scene.solve.dt is None:
+        raise InputError(f"{path} has a column time, but [solve] of the scene has no dt: add one or leave time out")
+    dt = float(scene.solve.dt)
+    step = np.round(time / dt) - 1
+    off = ~(np.isfinite(time) & (step >= 0) & (step <= last) & (np.abs(time / dt - 1 - step) < 0.01))
+    if off.any():
+        bad = time[np.flatnonzero(off)[0]]
+        raise InputError(
+            f"{path}: there is no step of the scene at time {bad:g} s: use multiples of dt = {dt:g} s up to "
+            f"{dt * (last + 1):g} s"
+        )
+    return step.astype(np.int32)
+
+
+def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
+    """Displacements (n, 3) [m] of the points in a run's positions (T, V, 3)."""
+    corner = positions[data.step[:, None], data.nodes] - scene.mesh.points[data.nodes]
+    return jnp.sum(data.weights[..., None] * corner, axis=1)
+
+
+def residuals(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
+    """Differences over the noise, flat (3 n,); 0 where nothing was measured."""
+    return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()

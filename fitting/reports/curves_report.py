@@ -1,0 +1,120 @@
+"""What a fit of stress-stretch curves leaves behind: curves.json, curves.png, and a table on the terminal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from fitting.fits.stress_stretch import LawFit
+from fitting.readers.curves import Curve
+from fitting.reports.sweep_report import numbers
+from liverjax.core.plotting import COLOURS, GREY
+from liverjax.core.versions import versions
+from liverjax.laws import homogeneous
+
+
+def best_first(fits: list[LawFit]) -> list[LawFit]:
+    """In the order of Akaike's criterion, corrected for few points."""
+    return sorted(fits, key=lambda f: f.aicc)
+
+
+def summary(fit: LawFit) -> dict[str, Any]:
+    """One law's entry of curves.json."""
+    return {
+        "law": fit.label,
+        "parameters": dict(zip(fit.names, fit.values.tolist(), strict=True)),
+        "units": dict(zip(fit.names, fit.units, strict=True)),
+        "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
+        "correlation": fit.correlation.tolist(),
+        "ground_state_shear_modulus": fit.shear_modulus,
+        "cost": fit.cost,
+        "mean_relative_error": fit.mean_relative_error,
+        "curve_errors": fit.curve_errors,
+        "aicc": fit.aicc,
+        "bic": fit.bic,
+        "converged": fit.converged,
+        "iterations": fit.iterations,
+        "starts_at_minimum": fit.starts_at_minimum,
+        "warnings": fit.warnings,
+        "run_time_s": fit.run_time,
+        "compile_time_s": fit.compile_time,
+    }
+
+
+def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
+    """curves.json and curves.png in the folder `out`, which exists."""
+    ordered = best_first(fits)
+    content = {
+        "best": ordered[0].label,
+        "error_is": "root mean square of (P - P_measured), relative to that of the curve's stress",
+        "curves": [
+            {"label": c.label, "test": c.test, "points": len(c.stress), "rms_stress_Pa": c.scale} for c in curves
+        ],
+        "laws": [summary(f) for f in ordered],
+        "versions": versions(),
+    }
+    (out / "curves.json").write_text(json.dumps(numbers(content), indent=1, allow_nan=False) + "\n")
+    figure(curves, ordered).savefig(out / "curves.png", dpi=150)
+
+
+def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
+    """Every curve with the best laws, and below the error of each law beside its number of parameters."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shown = ordered[: len(COLOURS)]
+    columns = min(4, len(curves))
+    rows = -(-len(curves) // columns)
+    size = (max(7.0, 3.4 * columns), 2.8 * rows + 0.26 * len(ordered) + 1.3)
+    fig = plt.figure(figsize=size, layout="constrained")
+    halves: Any = fig.subfigures(2, 1, height_ratios=(2.8 * rows, 0.26 * len(ordered) + 1.3))
+    top, bottom = halves
+    axes = np.atleast_1d(top.subplots(rows, columns)).ravel()
+    for axis, curve in zip(axes, curves, strict=False):
+        _curve(axis, curve, shown)
+    for axis in axes[len(curves) :]:
+        axis.axis("off")
+    bars = bottom.subplots()
+    at = np.arange(len(ordered))
+    colours = [COLOURS[k] if k < len(COLOURS) else GREY for k in at]
+    bars.barh(at, [100 * f.mean_relative_error for f in ordered], color=colours, height=0.7)
+    for k, f in enumerate(ordered):
+        text = f" {100 * f.mean_relative_error:.3g} %, {len(f.values)} parameters, {1000 * f.run_time:.0f} ms"
+        bars.text(100 * f.mean_relative_error, k, text, va="center", fontsize=8)
+    bars.set(yticks=at, yticklabels=[f.label for f in ordered], xlabel="error, relative to a curve's stress [%]")
+    bars.set_xlim(0, 145 * max(f.mean_relative_error for f in ordered))
+    bars.invert_yaxis()
+    plt.close(fig)
+    return fig
+
+
+def _curve(axis: Any, curve: Curve, fits: list[LawFit]) -> None:
+    unit, name = (1e6, "MPa") if curve.scale > 1e5 else (1e3, "kPa") if curve.scale > 1e2 else (1.0, "Pa")
+    i, j = curve.component
+    for colour, fit in reversed(list(zip(COLOURS, fits, strict=False))):
+        P = np.asarray(jax.jit(lambda F, law=fit.law: homogeneous.nominal_stress(law, F))(curve.F))
+        axis.plot(curve.driven, P[:, i, j] / unit, color=colour, lw=1.2)
+    axis.plot(curve.driven, curve.stress / unit, "o", color="black", ms=3, mfc="none")
+    label = "amount of shear" if curve.test == "simple_shear" else "stretch"
+    axis.set(title=curve.label.replace("_", " "), xlabel=label, ylabel=f"nominal stress [{name}]")
+    axis.title.set_fontsize(8)
+    axis.grid(alpha=0.3)
+
+
+def table(fits: list[LawFit]) -> str:
+    """One line a law, the best first: error, time, criterion, parameters ± standard error."""
+    lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
+    for f in best_first(fits):
+        parameters = ", ".join(
+            f"{n} {v:.4g} ± {e:.1g}{'' if u == '1' else ' ' + u}"
+            for n, v, e, u in zip(f.names, f.values, f.standard_errors, f.units, strict=True)
+        )
+        lines.append(
+            f"{f.label:18s} {100 * f.mean_relative_error:5.2f} % {1000 * f.run_time:5.0f} ms {f.compile_time:6.1f} s "
+            f"{f.aicc:8.1f}  {f.shear_modulus:<9.4g}  {parameters}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,130 @@
+"""What a fit to displacements leaves behind: field.json, and of a map field.vtu, field.h5 and field.png."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import matplotlib
+import numpy as np
+
+from fitting.fits.field import Field
+from fitting.fits.scene_numbers import Estimate
+from fitting.readers.displacements import locate
+from fitting.reports.sweep_report import numbers
+from liverjax.core.status import NAMES
+from liverjax.core.versions import versions
+from liverjax.mesh.tetrahedra import TetMesh, write_mesh
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+
+def of_numbers(found: Estimate) -> dict[str, Any]:
+    """The content of field.json for a few numbers."""
+    return {
+        "values": dict(zip(found.names, found.values.tolist(), strict=True)),
+        "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
+        "correlation": found.correlation.tolist(),
+        "chi2_per_component": found.chi2 / found.components,
+        "noise_factor": found.noise,
+        "components": found.components,
+        "iterations": found.iterations,
+        "converged": found.converged,
+        "status": [NAMES[c] for c in found.codes],
+        "run_time_s": found.seconds,
+    }
+
+
+def of_field(found: Field) -> dict[str, Any]:
+    """The content of field.json for a map."""
+    return {
+        "name": found.name,
+        "smallest": float(found.modulus.min()),
+        "largest": float(found.modulus.max()),
+        "prior_deviation": found.deviation,
+        "correlation_length_m": found.length,
+        "chi2_per_component": found.chi2 / found.components,
+        "discrepancy_reached": found.reached,
+        "components": found.components,
+        "directions_known": int(np.sum(found.eigenvalues > 1)),
+        "history": found.history,
+        "status": [NAMES[c] for c in found.codes],
+        "run_time_s": found.seconds,
+    }
+
+
+def write(out: Path, mesh: TetMesh, content: dict[str, Any], found: Field | None) -> None:
+    """Write all files into the folder `out`."""
+    (out / "field.json").write_text(json.dumps(numbers(content | {"versions": versions()}), indent=1) + "\n")
+    if found is None:
+        return
+    at_nodes = {"factor": np.exp(found.log_factor), "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
+    write_mesh(out / "field.vtu", mesh, at_nodes)
+    with h5py.File(out / "field.h5", "w") as f:
+        f["modulus"], f["reference"], f["tetrahedra"] = found.modulus, mesh.points, mesh.tetrahedra
+        for name, values in at_nodes.items():
+            f[name] = values
+        f["eigenvalues"] = found.eigenvalues
+        f.attrs["name"] = found.name
+    figure = picture(mesh, found)
+    figure.savefig(out / "field.png", dpi=150)
+    plt.close(figure)
+
+
+def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n: int = 200) -> tuple[np.ndarray, tuple]:
+    """Nodal values (V,) on the plane through `middle` normal to an axis, NaN outside, and its extent [cm]."""
+    X = np.asarray(mesh.points)
+    low, high = X.min(axis=0), X.max(axis=0)
+    a, b = (k for k in range(3) if k != axis)
+    grid = np.empty((n, n, 3))
+    grid[..., axis] = middle[axis]
+    grid[..., a], grid[..., b] = np.meshgrid(np.linspace(low[a], high[a], n), np.linspace(low[b], high[b], n))
+    nodes, weights, outside = locate(mesh, grid.reshape(-1, 3))
+    shown = np.where(outside > 0.01, np.nan, np.sum(weights * values[nodes], axis=1))
+    return shown.reshape(n, n), tuple(100 * v for v in (low[a], high[a], low[b], high[b]))
+
+
+def picture(mesh: TetMesh, found: Field) -> plt.Figure:
+    """Sections through the place of the largest departure: the factor on the scene's number, and its uncertainty."""
+    middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
+    figure, axes = plt.subplots(2, 3, figsize=(11, 5.5), layout="constrained")
+    rows = (
+        (np.exp(found.log_factor), f"{found.name} over the scene's [1]", "viridis"),
+        (found.sd, "standard deviation of its logarithm", "magma"),
+    )
+    for row, (values, label, colours) in zip(axes, rows, strict=True):
+        for axis in range(3):
+            shown, extent = section(mesh, values, middle, axis)
+            drawn = row[axis].imshow(
+                shown, origin="lower", extent=extent, cmap=colours, vmin=values.min(), vmax=values.max()
+            )
+            a, b = (name for k, name in enumerate("xyz") if k != axis)
+            row[axis].set(xlabel=f"{a} [cm]", ylabel=f"{b} [cm]", title=f"{'xyz'[axis]} = {100 * middle[axis]:.1f} cm")
+        figure.colorbar(drawn, ax=row, label=label)
+    return figure
+
+
+def table_of_numbers(found: Estimate) -> str:
+    """Names, values, standard errors, for the terminal."""
+    width = max(map(len, found.names))
+    rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}"]
+    for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
+        rows.append(f"{name:{width}}  {value:11.5g}  {error:14.3g}")
+    rows.append(f"chi2 per component {found.chi2 / found.components:.3f} of {found.components}, {found.seconds:.1f} s")
+    return "\n".join(rows)
+
+
+def table_of_field(found: Field) -> str:
+    """What was tried and chosen, for the terminal."""
+    rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
+    for h in found.history:
+        rows.append(
+            f"{h['deviation']:8g}  {h['chi2_per_component']:14.4f}  {h['iterations']:10.0f}  {h['evaluations']:11.0f}  "
+            f"{h['seconds']:7.1f}"
+        )
+    rows.append(
+        f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}; the data know "
+        f"{int(np.sum(found.eigenvalues > 1))} directions of the map; {found.seconds:.1f} s"
+    )
+    return "\n".join(rows)

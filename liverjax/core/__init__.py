@@ -1,0 +1,1 @@
+"""What every room needs: frozen structs, errors, status codes, files, versions, plotting."""

@@ -1,0 +1,123 @@
+"""Bounds stand beside the fields of a struct; here they are read, for every struct, from files and Python alike."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+#: A list of more numbers is not written out in a sentence: the first bad one is named by its place.
+_FEW = 8
+
+
+def check(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
+    """Refuse a struct with a number that is out of bounds, not finite or no number; host side, compiles nothing.
+
+    Args:
+        thing: any struct; structs inside it are looked into. What is None or traced is left alone.
+        name: of the struct, put before the names of its fields: ``law`` gives ``law.mu``.
+        leave: fields that have checks of their own.
+
+    Raises:
+        InputError: one sentence with dotted name, value, bound and remedy.
+    """
+    for dotted, metadata, value in _fields(thing, name, leave):
+        check_value(dotted, metadata, value)
+
+
+def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, Any]]:
+    """Dotted name, metadata and value of every field that has a bound or a unit."""
+    for field in dataclasses.fields(thing):
+        value = getattr(thing, field.name)
+        if value is None or field.name in leave or isinstance(value, dict):
+            continue
+        # Names are those of the scene file: `law.0.mu`, not `law.laws.0.mu`.
+        dotted = name if field.metadata.get("unnamed") else ".".join(filter(None, (name, field.name)))
+        several = isinstance(value, tuple) and any(dataclasses.is_dataclass(v) for v in value)
+        if dataclasses.is_dataclass(value):
+            yield from _fields(value, dotted, ())
+        elif several:
+            for k, one in enumerate(value):
+                yield from _fields(one, f"{dotted}.{k}", ())
+        elif field.metadata:
+            yield dotted, field.metadata, value
+
+
+def check_value(where: str, metadata: Mapping, value: Any) -> None:
+    """Refuse a value that a field's `metadata` does not allow, in one sentence that begins with `where`.
+
+    Args:
+        where: how the value is called.
+        metadata: of `liverjax.core.struct.param` or `liverjax.core.struct.static`.
+        value: a number, an array, or a sequence of such; a traced one passes.
+
+    Raises:
+        InputError: not a number, not finite, out of bounds.
+    """
+    lower = metadata.get("lower")
+    if metadata.get("static"):
+        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        if lower is not None and not (whole and value >= lower):
+            raise InputError(f"{where} = {value!r} must be a whole number above {lower - 1}: give {lower} or more")
+        return
+    if type(value) is float or type(value) is int:  # most are: quick, since every run asks
+        leaves, numbers = [value], None
+        least = most = value
+    else:
+        leaves = jax.tree.leaves(value, is_leaf=lambda v: v is None)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # a number only under jit or grad
+            return
+        numbers = _numbers(where, metadata, value, leaves)
+        if not numbers.size:
+            return
+        least, most = numbers.min(), numbers.max()  # NaN where one number is
+    above, upper = metadata.get("above"), metadata.get("upper")
+    inside = (above is None or least > above) and (lower is None or least >= lower) and (upper is None or most <= upper)
+    if not (inside and math.isfinite(least) and math.isfinite(most)) or metadata.get("nonzero"):
+        _refuse(where, metadata, value, np.asarray([value], float) if numbers is None else numbers)
+
+
+def _refuse(where: str, metadata: Mapping, value: Any, numbers: np.ndarray) -> None:
+    """The sentence of the first bound that a number of (n,) does not keep."""
+    unit, typical = metadata.get("unit", "1"), metadata.get("typical")
+    if not np.isfinite(numbers).all():
+        raise InputError(
+            f"{_shown(where, value, numbers, ~np.isfinite(numbers))} is not finite: give a number in {unit}"
+        )
+    if metadata.get("nonzero") and np.any(numbers == 0):
+        raise InputError(f"{_shown(where, value, numbers, numbers == 0)} must not be 0: give another exponent")
+    example = f"give e.g. {typical:g}" if isinstance(typical, (int, float)) else ""
+    for key, wrong, words, remedy in (
+        ("above", np.less_equal, "be above", "give a larger value"),
+        ("lower", np.less, "be at least", "give a larger value"),
+        ("upper", np.greater, "be at most", "give a smaller value"),
+    ):
+        bound = metadata.get(key)
+        if bound is not None and np.any(wrong(numbers, bound)):
+            said = f"{_shown(where, value, numbers, wrong(numbers, bound))} must {words} {bound:g}"
+            raise InputError(f"{said}{'' if unit == '1' else f' {unit}'}: {example or remedy}")
+
+
+def _numbers(where: str, metadata: Mapping, value: Any, leaves: list) -> np.ndarray:
+    """The numbers of all leaves (n,)."""
+    try:
+        if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):
+            raise TypeError
+        return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves]) if leaves else np.empty(0)
+    except (TypeError, ValueError):
+        unit = metadata.get("unit", "1")
+        raise InputError(f"{where} = {value!r} is not a number: give a value in {unit}") from None
+
+
+def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> str:
+    """Name and value, of many numbers those of the first wrong one."""
+    if numbers.size > _FEW:
+        first = int(np.argmax(wrong))
+        return f"{where}, number {first + 1} of {numbers.size}, = {numbers[first]:g}"
+    if isinstance(value, (tuple, list)):
+        return f"{where} = {numbers.tolist()}"
+    return f"{where} = {np.asarray(value).tolist() if np.ndim(value) else value}"

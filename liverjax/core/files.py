@@ -1,0 +1,25 @@
+"""Folders for results, tried before anything is computed."""
+
+import tempfile
+from pathlib import Path
+
+from liverjax.core.errors import InputError
+
+
+def writable(out: Path, files: tuple[str, ...]) -> None:
+    """Make the folder `out` and try to write into it, where `files` are going to be.
+
+    Raises:
+        InputError: `out` is a file or cannot be written, or one of `files` is a folder.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out {out} is a file: name a folder for the results")
+    for name in files:
+        if (out / name).is_dir():
+            raise InputError(f"--out {out}: {name} in it is a folder; name another folder for the results")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None

@@ -1,0 +1,90 @@
+"""Frozen dataclasses that are JAX pytrees, with unit and bounds beside each parameter."""
+
+import dataclasses
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+
+T = TypeVar("T")
+
+
+def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:
+    """A field that is part of the structure (a tag, a count): changing it compiles anew, it has no gradient.
+
+    With `lower` it is a whole number, at least that (see `liverjax.core.bounds`).
+    """
+    return dataclasses.field(default=default, metadata={"static": True, "about": about, "lower": lower})
+
+
+def param(
+    unit: str,
+    about: str = "",
+    *,
+    lower: float | None = None,
+    upper: float | None = None,
+    above: float | None = None,
+    nonzero: bool = False,
+    each: bool = False,
+    unnamed: bool = False,
+    typical: Any = None,
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """A numeric field, a leaf of the pytree.
+
+    Args:
+        unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
+        about: one line for ``python -m liverjax laws``.
+        lower, upper: inclusive bounds; ``above``: strict lower bound.
+        nonzero: 0 is refused. `liverjax.core.bounds.check` reads all of these.
+        each: a sequence, one number a term (or the components of a direction).
+        unnamed: structs inside it; the dotted names of scene files leave this field out.
+        typical: value for a soft tissue of about 1 kPa shear modulus, used where a law is asked for by name alone.
+        default: as in `dataclasses.field`.
+    """
+    metadata = {
+        "unit": unit,
+        "about": about,
+        "lower": lower,
+        "upper": upper,
+        "above": above,
+        "nonzero": nonzero,
+        "each": each,
+        "unnamed": unnamed,
+        "typical": default if typical is None and default is not dataclasses.MISSING else typical,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(static, param))
+def struct(cls: type[T]) -> type[T]:
+    """Make `cls` a frozen, keyword-only dataclass registered as a pytree; `static` fields are not leaves."""
+    made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+    fields = dataclasses.fields(made)
+    meta = tuple(f.name for f in fields if f.metadata.get("static"))
+    data = tuple(f.name for f in fields if not f.metadata.get("static"))
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
+
+    def flatten(thing: Any) -> tuple[tuple, tuple]:
+        values = thing.__dict__
+        # The class itself is part of the structure. `register_dataclass` of jaxlib 0.10.0 to 0.12.0.1 leaves it out
+        # where structures are compared: a jitted function then may run one law's program on another law's numbers.
+        return tuple(values[name] for name in data), (made, *(values[name] for name in meta))
+
+    def flatten_with_keys(thing: Any) -> tuple[tuple, tuple]:
+        values, structure = flatten(thing)
+        return tuple(zip(keys, values, strict=True)), structure
+
+    def unflatten(structure: tuple, values: Any) -> Any:
+        thing = object.__new__(made)
+        thing.__dict__.update(zip(data, values, strict=True))
+        thing.__dict__.update(zip(meta, structure[1:], strict=True))
+        return thing
+
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    return made
+
+
+def replace(of: T, **changes: Any) -> T:
+    """A copy with other values in some fields."""
+    whole: Any = of
+    return dataclasses.replace(whole, **changes)

@@ -1,0 +1,1 @@
+"""Force and stiffness of elements: MJED, its references, stiffness without negative eigenvalues."""

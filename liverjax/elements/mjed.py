@@ -1,0 +1,149 @@
+"""MJED: force and stiffness of linear tetrahedra from hand-derived terms, all terms of the energy at once.
+
+Chapter, section 4.1.2, with J treated as one more invariant and the scalars summed before anything is assembled:
+
+    f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
+    K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
+
+so the cost does not grow with the number of terms g^k h^k. No matrix is inverted. All functions take the force as the
+gradient of the energy, f = + dW/dx (the chapter's nodal force is its negative).
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from liverjax.core.errors import InputError
+from liverjax.laws.base import Law
+from liverjax.laws.terms import chapter_terms
+from liverjax.laws.terms.invariant_terms import blocks, first_piola, state
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.tensors.matrices import Matrix, deformation_gradient, dot, stored, transpose
+
+#: Blocks that are computed; the others follow.
+_PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
+
+
+def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    """Total strain energy [J] at positions x (V, 3) [m]."""
+    return jnp.sum(mesh.volumes * law.strain_energy(law.measures(deformation_gradient(mesh, x))))
+
+
+def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
+    """Sum over elements of V0 P D_a at their nodes: (V, 3) [N] from first Piola-Kirchhoff stresses [Pa]."""
+    D, V0 = mesh.shape_vectors, mesh.volumes
+    forces = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
+    forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(3)], *forces]
+    columns = []
+    for i in range(3):
+        # Chained scatters: after a concatenate XLA:CPU recomputes the stress for every update (4 times slower).
+        column = jnp.zeros(mesh.points.shape[0], dtype=mesh.points.dtype)
+        for a in range(4):
+            column = column.at[mesh.tetrahedra[:, a]].add(forces[a][i])
+        columns.append(column)
+    return jnp.stack(columns, axis=-1)
+
+
+@jax.jit
+def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    """Gradient of the total energy with respect to the positions, (V, 3) [N]: + dW/dx.
+
+    Args:
+        mesh: `TetMesh`.
+        law: any law; parameters may be traced.
+        x: positions (V, 3) [m].
+    """
+    return nodal_force(mesh, first_piola(law, deformation_gradient(mesh, x)))
+
+
+def element_stiffness(
+    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
+) -> dict[tuple[int, int], Matrix]:
+    """Blocks {(a, b): K_ab} [N/m] of nodes 1 <= a <= b <= 3 of every element, 45 different numbers each.
+
+    `terms` is "contracted", or "chapter" for its six terms a product (`liverjax.laws.terms.chapter_terms`).
+    The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
+    """
+    F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
+    D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
+    if terms not in ("contracted", "chapter"):
+        raise InputError(f"terms = {terms!r} is not known: use contracted or chapter")
+    if terms == "chapter":
+        per_volume = chapter_terms.blocks(law, F, D, pairs, regularised)
+    else:
+        per_volume = blocks(state(law, F), D, pairs, regularised)
+    return {
+        pair: tuple(tuple(mesh.volumes * entry for entry in row) for row in K)
+        for pair, K in zip(_PAIRS, per_volume, strict=True)
+    }
+
+
+def all_blocks(blocks: dict[tuple[int, int], Matrix]) -> list[list[Matrix]]:
+    """The 4 x 4 blocks of every element from the six of `element_stiffness`."""
+
+    def negative_sum(*matrices: Matrix) -> Matrix:
+        return tuple(tuple(-(a + b + c) for a, b, c in zip(*rows, strict=True)) for rows in zip(*matrices, strict=True))
+
+    K: list[list[Any]] = [[None] * 4 for _ in range(4)]
+    for (a, b), block_ab in blocks.items():
+        K[a][b], K[b][a] = block_ab, transpose(block_ab)
+    for b in (1, 2, 3):
+        K[0][b] = negative_sum(K[1][b], K[2][b], K[3][b])
+        K[b][0] = transpose(K[0][b])
+    K[0][0] = negative_sum(K[0][1], K[0][2], K[0][3])
+    return K
+
+
+_ENTRIES = [(a, b, r, c) for a, b in _PAIRS for r in range(3) for c in range(r if a == b else 0, 3)]
+
+
+def _expansion() -> np.ndarray:
+    """(45, 144): the element matrix as sums of its 45 different entries, signs and all."""
+    basis = dict(zip(_ENTRIES, np.eye(45), strict=True))
+    blocks = {
+        (a, b): tuple(
+            tuple(basis[(a, b, min(r, c), max(r, c)) if a == b else (a, b, r, c)] for c in range(3)) for r in range(3)
+        )
+        for a, b in _PAIRS
+    }
+    K = all_blocks(blocks)
+    return np.stack([K[a][b][r][c] for a in range(4) for r in range(3) for b in range(4) for c in range(3)], axis=1)
+
+
+_EXPANSION = _expansion()
+
+
+@partial(jax.jit, static_argnames=("regularised", "terms"))
+def element_matrices(
+    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
+) -> jax.Array:
+    """Element stiffness matrices (E, 144) [N/m], degree of freedom 3 * local node + component."""
+    K = element_stiffness(mesh, law, x, regularised, terms)
+    entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
+    # A product with a constant writes the other 99 entries: stacked one by one they triple the time to compile.
+    return jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
+
+
+def sparse(mesh: TetMesh, entries: np.ndarray) -> scipy.sparse.csr_array:
+    """Global matrix (3V, 3V) of element matrices (E, 12, 12), degree of freedom 3 * node + component."""
+    dofs = (3 * np.asarray(mesh.tetrahedra)[:, :, None] + np.arange(3)).reshape(-1, 12)
+    rows, columns = np.repeat(dofs, 12, axis=1), np.tile(dofs, (1, 12))
+    n = 3 * mesh.number_of_nodes
+    return scipy.sparse.coo_array((np.ravel(entries), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
+
+
+def stiffness_matrix(
+    mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
+) -> scipy.sparse.csr_array:
+    """Second derivative of the total energy, scipy.sparse (3V, 3V) [N/m], degree of freedom 3 * node + component.
+
+    Args:
+        mesh, law, x: as in `internal_force`.
+        regularised: section 4.1.2 iii, trace kept; changes the path of a Newton iteration, never its root.
+        terms: "contracted", or "chapter": its six terms for every product g(I1, I2) h(J), the same to roundoff.
+    """
+    return sparse(mesh, np.asarray(element_matrices(mesh, law, x, regularised, terms)))

@@ -1,0 +1,207 @@
+"""Element stiffness without negative eigenvalues, from the singular values of F: no LAPACK call, no inverse.
+
+For F = U diag(s) V^T an isotropic energy has, in the axes of U and V, a 3 x 3 matrix for the three stretches and one
+2 x 2 matrix [[a, b], [b, a]] for each pair of axes, with the twist a - b and the flip a + b as eigenvalues (Smith,
+De Goes, Kim 2019, Analytic eigensystems for isotropic distortion energies). Negative eigenvalues become their absolute
+value (Chen et al. 2024) and the blocks are turned back.
+
+Fibres, energies of Green's strain and the memory of a viscosity have other axes: of their geometric stiffness, S
+between the nodes, S is projected, of a fibre's own stiffness the negative part is dropped. Each part then has no
+negative eigenvalue, so their sum has none.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from liverjax.laws.base import isochoric_part
+from liverjax.laws.terms import green_terms, invariant_terms
+from liverjax.tensors.matrices import (
+    Matrix,
+    Vector,
+    add,
+    add_matrices,
+    cross,
+    dot,
+    matmul,
+    matvec,
+    outer,
+    scale,
+    scale_matrix,
+    transpose,
+)
+from liverjax.tensors.principal import principal, symmetric_axes
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+class Frame(NamedTuple):
+    """F = U diag(s) V^T with rotations U and V: the last, smallest s is negative where F is inverted."""
+
+    U: Matrix
+    s: Vector
+    V: Matrix
+
+
+def frame(F: Matrix) -> Frame:
+    """Signed singular values of a tuple matrix F, largest first; any axes where some are 0."""
+    _, axes = principal(F)
+    n = list(transpose(axes))
+    f = [matvec(F, a) for a in n]
+    for i, j in ((0, 1), (1, 2), (0, 1)):  # a swap with one sign changed keeps the axes right-handed
+        swap = dot(f[j], f[j]) > dot(f[i], f[i])
+        n[i], n[j] = _chosen(swap, n[j], n[i]), _chosen(swap, scale(-1.0, n[i]), n[j])
+        f[i], f[j] = _chosen(swap, f[j], f[i]), _chosen(swap, scale(-1.0, f[i]), f[j])
+    one, zero = jnp.ones_like(f[0][0]), jnp.zeros_like(f[0][0])
+    u1 = _unit(f[0], (one, zero, zero))
+    # Least along the axis that u1 has least of.
+    small = abs(u1[0]) < 0.8
+    aside = cross(u1, (jnp.where(small, one, zero), jnp.where(small, zero, one), zero))
+    rest = add(f[1], scale(-dot(f[1], u1), u1))
+    enough = dot(rest, rest) > 1e-24 * dot(f[0], f[0])
+    u2 = _unit(_chosen(enough, rest, aside), (zero, one, zero))
+    u: Matrix = (u1, u2, cross(u1, u2))
+    return Frame(transpose(u), tuple(dot(a, b) for a, b in zip(u, f, strict=True)), transpose(tuple(n)))
+
+
+def _chosen(where: Any, a: Vector, b: Vector) -> Vector:
+    return tuple(jnp.where(where, x, y) for x, y in zip(a, b, strict=True))
+
+
+def _unit(a: Vector, otherwise: Vector) -> Vector:
+    size = jnp.sqrt(dot(a, a))
+    return _chosen(size > 0, scale(1 / jnp.where(size > 0, size, 1.0), a), otherwise)
+
+
+class _Scalars(NamedTuple):
+    """Scalar derivatives at F as a law, to be used in the axes of F, where I1, I2 and J are the same."""
+
+    first: dict
+    second: dict
+    invariants: tuple = ("I1", "I2", "J")
+
+    def measures(self, F: Matrix) -> Matrix:
+        """What `energy_derivatives` takes."""
+        return F
+
+    def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
+        """Slopes and curvatures, given beforehand."""
+        return self.first, self.second
+
+
+def blocks(
+    parts: list[tuple[Any, Any]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+) -> list[Matrix]:
+    """Blocks as `invariant_terms.blocks`, of which the element matrix has no negative eigenvalue.
+
+    Args:
+        parts: weights and laws that add up.
+        S: constant second Piola-Kirchhoff stress beside them, or None.
+        F: tuple matrix.
+        D: shape vectors of the nodes.
+        pairs: which blocks, as indices into D.
+    """
+    first: dict[str, Any] = {}
+    second: dict[tuple[str, str], Any] = {}
+    stretched, added = [], []
+    metric = None if S is None else projected(S)
+    for weight, law in parts:
+        slopes, curvatures = law.energy_derivatives(law.measures(F))
+        fibres = invariant_terms.fibre_invariants(law)
+        for key, part in fibres.items():
+            a = green_terms.components(part.fibre, F[0][0])
+            added.append(_fibre(weight, slopes[key], curvatures.get((key, key), 0.0), a, F, D, pairs))
+        _gather(first, weight, {k: v for k, v in slopes.items() if k not in fibres})
+        _gather(second, weight, {k: v for k, v in curvatures.items() if not set(k) & set(fibres)})
+        for part in invariant_terms.summands(law):
+            if hasattr(part, "stretch_energy"):
+                stretched.append((weight, isochoric_part(part)))
+            if hasattr(part, "green_energy"):
+                added.append([scale_matrix(weight, block) for block in green_terms.blocks(part, F, D, pairs)])
+                own = projected(scale_matrix(weight, green_terms.stress(part, F)))
+                metric = own if metric is None else add_matrices(metric, own)
+    result = _isotropic(_Scalars(first, second), stretched, F, D, pairs)
+    if metric is not None:
+        added.append([_diagonal(dot(D[i], matvec(metric, D[j]))) for i, j in pairs])
+    for more in added:
+        result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+    return result
+
+
+def regularised(
+    parts: list[tuple[Any, Any]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+) -> list[Matrix]:
+    """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
+    result = [_diagonal(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
+    for weight, law in parts:
+        K = invariant_terms.blocks(invariant_terms.state(law, F), D, pairs, regularised=True)
+        result = [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
+    return result
+
+
+def _gather(total: dict, weight: Any, values: dict) -> None:
+    for key, value in values.items():
+        total[key] = total[key] + weight * value if key in total else weight * value
+
+
+def _diagonal(value: Any) -> Matrix:
+    zero = jnp.zeros_like(value)
+    return ((value, zero, zero), (zero, value, zero), (zero, zero, value))
+
+
+def _fibre(weight: Any, W4: Any, W44: Any, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+    """2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa, the positive part of each eigenvalue."""
+    Fa = matvec(F, a)
+    across = jnp.maximum(2 * weight * W4, 0.0)
+    along = jnp.maximum(2 * weight * W4 + 4 * weight * W44 * dot(Fa, Fa), 0.0)
+    size = dot(Fa, Fa)
+    line = scale_matrix((along - across) / jnp.where(size > 0, size, 1.0), outer(Fa, Fa))
+    both = add_matrices(_diagonal(across), line)
+    return [scale_matrix(dot(D[i], a) * dot(D[j], a), both) for i, j in pairs]
+
+
+def projected(A: Matrix) -> Matrix:
+    """A symmetric tuple matrix with the absolute value of its eigenvalues."""
+    axes = symmetric_axes(A)
+    n = transpose(axes)
+    return _from_axes([abs(dot(a, matvec(A, a))) for a in n], n)
+
+
+def _from_axes(values: list, n: Matrix) -> Matrix:
+    total = scale_matrix(values[0], outer(n[0], n[0]))
+    for value, a in zip(values[1:], n[1:], strict=True):
+        total = add_matrices(total, scale_matrix(value, outer(a, a)))
+    return total
+
+
+def _isotropic(scalars: _Scalars, stretched: list, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+    at = frame(F)
+    zero = jnp.zeros_like(at.s[0])
+    diagonal = tuple(tuple(at.s[i] if i == j else zero for j in range(3)) for i in range(3))
+    tangents = [(1.0, invariant_terms.tangent(scalars, diagonal))]
+    tangents += [(weight, invariant_terms.tangent(law, diagonal)) for weight, law in stretched]
+
+    def entry(i, J, k, L):
+        return sum((weight * A[J][L][i][k] for weight, A in tangents), 0.0)
+
+    H = tuple(tuple(entry(min(i, k), min(i, k), max(i, k), max(i, k)) for k in range(3)) for i in range(3))
+    H = projected(H)
+    own, crossed = {}, {}
+    for i, j in _PAIRS:
+        a = 0.5 * (entry(i, j, i, j) + entry(j, i, j, i))
+        b = entry(i, j, j, i)
+        flip, twist = abs(a + b), abs(a - b)
+        own[i, j] = own[j, i] = 0.5 * (flip + twist)
+        crossed[i, j] = crossed[j, i] = 0.5 * (flip - twist)
+    turned = [matvec(transpose(at.V), d) for d in D]
+    result = []
+    for p, q in pairs:
+        d, e = turned[p], turned[q]
+        K = [[H[i][k] * d[i] * e[k] for k in range(3)] for i in range(3)]
+        for i in range(3):
+            for j in range(3):
+                if i != j:
+                    K[i][i] = K[i][i] + own[i, j] * d[j] * e[j]
+                    K[i][j] = K[i][j] + crossed[i, j] * d[j] * e[i]
+        result.append(matmul(matmul(at.U, tuple(map(tuple, K))), transpose(at.U)))
+    return result

@@ -1,0 +1,128 @@
+"""The oracle: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
+
+Independent of the hand-derived terms: everything here starts from `law.strain_energy` alone. Slow on purpose.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+
+from liverjax.elements.mjed import sparse
+from liverjax.laws.base import Law
+from liverjax.mesh.tetrahedra import TetMesh
+
+# Voigt order xx, yy, zz, xy, yz, xz.
+_VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+
+
+def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    """Total strain energy [J] at positions x (V, 3) [m], through (E, 3, 3) deformation gradients."""
+    return jnp.sum(mesh.volumes * law.energy(_gradient(mesh, x)))
+
+
+def first_piola(law: Law, F: jax.Array) -> jax.Array:
+    """dW/dF [Pa] of one (3, 3) or many (..., 3, 3) deformation gradients by reverse mode."""
+    return jax.grad(lambda F: jnp.sum(law.energy(F)))(F)
+
+
+def tangent(law: Law, F: jax.Array) -> jax.Array:
+    """d2W/dF dF [Pa] of deformation gradients (..., 3, 3): (..., 3, 3, 3, 3) by forward over reverse mode."""
+    return _derivative(lambda F: first_piola(law, F), F)
+
+
+def _derivative(function, A: jax.Array) -> jax.Array:
+    """Derivative of an element-wise function of matrices (…, n, m): (…, its shape, n, m), by forward mode.
+
+    One direction for all elements at a time, so that a law may have numbers of its own for each element.
+    """
+    n, m = A.shape[-2:]
+    directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)
+    columns = jax.vmap(lambda d: jax.jvp(function, (A,), (jnp.broadcast_to(d, A.shape),))[1])(directions)
+    return jnp.moveaxis(columns, 0, -1).reshape(*columns.shape[1:], n, m)
+
+
+@jax.jit
+def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    """Gradient of the total energy by reverse mode, (V, 3) [N]."""
+    return jax.grad(energy, argnums=2)(mesh, law, x)
+
+
+@jax.jit
+def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    D = _all_shape_vectors(mesh)
+
+    def total(nodes):
+        return jnp.sum(mesh.volumes * law.energy(jnp.einsum("eai,eaj->eij", nodes, D)))
+
+    return _derivative(jax.grad(total), x[mesh.tetrahedra])
+
+
+def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
+    """Hessian of the total energy by forward over reverse mode, element by element, (3V, 3V) [N/m]."""
+    return sparse(mesh, np.asarray(_hessians(mesh, law, x)))
+
+
+@jax.jit
+def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    """Standard finite elements: B^T S with S = 2 dW/dC, (V, 3) [N]."""
+    F = _gradient(mesh, x)
+    S = _second_piola(law, F)
+    B = _strain_displacement(F, _all_shape_vectors(mesh))
+    element = jnp.einsum("e,evad,ev->ead", mesh.volumes, B, _voigt(S))
+    return jnp.zeros_like(x).at[mesh.tetrahedra].add(element)
+
+
+@jax.jit
+def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
+    F, D = _gradient(mesh, x), _all_shape_vectors(mesh)
+    C = jnp.einsum("eki,ekj->eij", F, F)
+    elasticity = 2 * _derivative(lambda C: _second_piola_of(law, C), C)
+    elasticity = 0.5 * (elasticity + jnp.swapaxes(elasticity, -1, -2))
+    rows = jnp.asarray(_VOIGT).T
+    Dm = elasticity[:, rows[0], rows[1]][:, :, rows[0], rows[1]]
+    B = _strain_displacement(F, D)
+    S = _second_piola(law, F)
+    geometric = jnp.einsum("eai,eij,ebj->eab", D, S, D)
+    material = jnp.einsum("evai,evw,ewbj->eaibj", B, Dm, B)
+    return mesh.volumes[:, None, None, None, None] * (material + jnp.einsum("eab,ij->eaibj", geometric, jnp.eye(3)))
+
+
+def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
+    """Standard finite elements: B^T D B plus the geometric term, (3V, 3V) [N/m] (Zienkiewicz and Taylor 2000)."""
+    return sparse(mesh, np.asarray(_standard_entries(mesh, law, x)))
+
+
+def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
+    D = jnp.transpose(mesh.shape_vectors, (2, 0, 1))
+    return jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
+
+
+def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
+    return jnp.einsum("eai,eaj->eij", x[mesh.tetrahedra], _all_shape_vectors(mesh))
+
+
+def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
+    """W of C alone, through the Cholesky factor as deformation gradient (isotropic or not: F^T F = C and J > 0)."""
+    return law.energy(jnp.swapaxes(jnp.linalg.cholesky(0.5 * (C + jnp.swapaxes(C, -1, -2))), -1, -2))
+
+
+def _second_piola(law: Law, F: jax.Array) -> jax.Array:
+    return _second_piola_of(law, jnp.einsum("eki,ekj->eij", F, F))
+
+
+def _second_piola_of(law: Law, C: jax.Array) -> jax.Array:
+    return 2 * jax.grad(lambda C: jnp.sum(_energy_of_C(law, C)))(C)
+
+
+def _voigt(S: jax.Array) -> jax.Array:
+    return jnp.stack([S[:, i, j] for i, j in _VOIGT], axis=1)
+
+
+def _strain_displacement(F: jax.Array, D: jax.Array) -> jax.Array:
+    """B (E, 6, 4, 3): variation of Green's strain (shears doubled) with the position of node a."""
+    rows = []
+    for i, j in _VOIGT:
+        term = jnp.einsum("ek,ea->eak", F[:, :, i], D[:, :, j])
+        rows.append(term if i == j else term + jnp.einsum("ek,ea->eak", F[:, :, j], D[:, :, i]))
+    return jnp.stack(rows, axis=1)

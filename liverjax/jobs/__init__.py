@@ -1,0 +1,1 @@
+"""Long runs, sweeps, designs of experiments and their files."""

@@ -1,0 +1,76 @@
+"""Tables of parameters for a sweep: a grid, a Latin hypercube, a Sobol sequence."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+KINDS = ("grid", "latin", "sobol")
+
+
+def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
+    """``law.mu=500:1000`` as {name: (low, high)}.
+
+    Raises:
+        InputError: no range, not of numbers, from high to low, a name twice.
+    """
+    ranges: dict[str, tuple[float, float]] = {}
+    for text in given:
+        name, _, span = text.partition("=")
+        try:
+            low, high = (float(v) for v in span.split(":"))
+        except ValueError:
+            raise InputError(f"{text!r} is no range: write name=low:high, e.g. law.mu=500:1000") from None
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise InputError(f"{text!r} does not rise: write name=low:high, e.g. law.mu=500:1000")
+        if name in ranges:
+            raise InputError(f"{name} has two ranges: leave one out")
+        ranges[name] = (low, high)
+    return ranges
+
+
+def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol", seed: int = 0) -> np.ndarray:
+    """Rows (N, P) in the box of the ranges.
+
+    Args:
+        ranges: low and high of every parameter.
+        rows: how many; of a grid as many along each parameter as fit into that, two at least.
+        kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2), scipy's.
+        seed: of the random ones.
+
+    Raises:
+        InputError: an unknown kind, no rows.
+    """
+    from scipy.stats import qmc
+
+    if kind not in KINDS:
+        raise InputError(f"--kind {kind} is not known: use {', '.join(KINDS)}")
+    if rows < 1 or not ranges:
+        raise InputError(f"--rows {rows} of {len(ranges)} parameters is nothing: give at least one of each")
+    low, high = np.array(list(ranges.values())).T
+    if kind == "grid":
+        along = max(2, int(np.floor(rows ** (1 / len(low)) + 1e-9)))
+        axes = [np.linspace(a, b, along) for a, b in zip(low, high, strict=True)]
+        return np.stack([g.ravel() for g in np.meshgrid(*axes, indexing="ij")], axis=1)
+    if kind == "latin":
+        return qmc.scale(qmc.LatinHypercube(len(low), rng=seed).random(rows), low, high)
+    exponent = int(np.ceil(np.log2(rows)))
+    return qmc.scale(qmc.Sobol(len(low), rng=seed).random_base2(exponent)[:rows], low, high)
+
+
+def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> None:
+    """A CSV file that `liverjax.jobs.sweep.read_table` reads, with `note` as a comment.
+
+    Raises:
+        InputError: a file that cannot be written.
+    """
+    try:
+        with file.open("w", newline="", encoding="utf-8") as out:
+            out.write(f"# {note}\n")
+            writer = csv.writer(out)
+            writer.writerow(names)
+            writer.writerows([[repr(float(v)) for v in row] for row in rows])
+    except OSError as error:
+        raise InputError(f"{file} cannot be written ({error.strerror}): name another file") from None

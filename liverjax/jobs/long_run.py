@@ -1,0 +1,119 @@
+"""A run in parts of some steps: what is finished stays on disk, and a killed run goes on from there.
+
+Beside the output stands a folder with one file a part: its rows, and the state after its last step. A part begins with
+a tangent of its own, whether the run was stopped before it or not, so a resumed run ends with the same numbers.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import jax
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.versions import versions
+from liverjax.jobs import parts
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.run import Result, prepared, simulate_part
+from liverjax.simulation.step import initial_state
+from liverjax.solvers.continuation import StepStatistics
+
+_ROWS = ("times", "positions", "reactions", "pressure", "status")
+
+
+class Ran(NamedTuple):
+    """A finished run and what it took now: parts found on disk cost nothing."""
+
+    result: Result  # numpy arrays
+    steps: int  # computed now
+    run_time: float  # [s]
+    compile_time: float  # [s]
+
+
+def run(
+    scene: Scene,
+    text: str,
+    out: Path,
+    every: int,
+    resume: bool = False,
+    report: Callable[[int], None] | None = None,
+) -> Ran:
+    """Run a scene in parts of `every` steps; a run of one part leaves nothing beside its output.
+
+    Args:
+        scene: `Scene`.
+        text: the scene file; results of another are not gone on with.
+        out: file of the results, which the caller writes before it removes `parts.beside(out)`.
+        every: steps a part.
+        resume: go on with the parts that are there.
+        report: as of `simulate`; called for steps found on disk as well.
+
+    Raises:
+        InputError: parts that are there without `resume`, of another scene, or in use by another process.
+        OSError: the disk is full; finished parts are kept.
+    """
+    steps, folder = scene.solve.steps, parts.beside(out)
+    if every < 1:
+        raise InputError(f"--every {every} must be above 0: give e.g. 50")
+    if folder.exists() and not resume:
+        raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
+    scene = prepared(scene)
+    if steps <= every and not folder.exists():
+        return _run(scene, steps, None, report)
+    parts.make_folder(folder)
+    with parts.locked(folder / "lock_0"):
+        # The text names files, of a mesh or a history, that may change behind it: so all numbers count as well.
+        numbers = parts.digest(*jax.tree.leaves(scene))
+        parts.same({"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json")
+        return _run(scene, every, folder, report)
+
+
+def _run(scene: Scene, count: int, folder: Path | None, report: Callable[[int], None] | None) -> Ran:
+    """Parts found in the folder, and the others computed and written."""
+    firsts = range(1, scene.solve.steps + 1, count)
+    files = [None if folder is None else parts.part(folder, k) for k in range(len(firsts))]
+    state, results, computed, run_time = initial_state(scene), [], 0, 0.0
+    finished = [file is not None and file.exists() for file in files]
+    begin = time.perf_counter()
+    program: Any = None if all(finished) else _compiled(scene, state, count, report)
+    compile_time = time.perf_counter() - begin
+    for first, file in zip(firsts, files, strict=True):
+        if file is not None and file.exists():
+            result, state = _read(file, state)
+            if report is not None:
+                for step in range(len(result.times)):
+                    report(first + step)
+        else:
+            begin = time.perf_counter()
+            result, state = jax.block_until_ready(program(scene, state, float(first)))
+            run_time += time.perf_counter() - begin
+            done = min(count, scene.solve.steps - first + 1)
+            result, computed = jax.tree.map(lambda a, n=done: np.asarray(a)[:n], result), computed + done
+            if file is not None:
+                parts.write(file, _content(result, state))
+        results.append(result)
+    whole = jax.tree.map(lambda *rows: np.concatenate(rows), *results)
+    return Ran(whole, computed, run_time, compile_time)
+
+
+def _compiled(scene: Scene, state: Any, count: int, report: Callable[[int], None] | None) -> Callable:
+    return jax.jit(partial(simulate_part, count=count, report=report)).lower(scene, state, 1.0).compile()
+
+
+def _content(result: Result, state: Any) -> dict[str, np.ndarray]:
+    rows = {name: getattr(result, name) for name in _ROWS if getattr(result, name) is not None}
+    took = {f"statistics_{name}": value for name, value in result.statistics._asdict().items()}
+    return rows | took | {f"state_{k}": np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
+
+
+def _read(file: Path, like: Any) -> tuple[Result, Any]:
+    leaves, structure = jax.tree.flatten(like)
+    with h5py.File(file) as part:
+        rows: dict[str, Any] = {name: part[name][()] if name in part else None for name in _ROWS}
+        took = StepStatistics(*(part[f"statistics_{name}"][()] for name in StepStatistics._fields))
+        state = [part[f"state_{k}"][()] for k in range(len(leaves))]
+    return Result(**rows, statistics=took), jax.tree.unflatten(structure, state)

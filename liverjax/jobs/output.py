@@ -1,0 +1,92 @@
+"""Results on disk: HDF5, a ParaView series, a picture."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.plotting import BLUE, GREY
+from liverjax.physics.boundary import boundary_triangles
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.run import Result
+
+
+def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, Any]) -> None:
+    """times, positions, reactions, reference, tetrahedra; status, iterations and `attributes` as attributes."""
+    import h5py
+
+    temporary = file.with_suffix(".part")
+    with h5py.File(temporary, "w") as out:
+        for name, unit in (("times", "s"), ("positions", "m"), ("reactions", "N")):
+            out[name] = np.asarray(getattr(result, name))
+            out[name].attrs["unit"] = unit
+        if result.pressure is not None:
+            out["pressure"] = np.asarray(result.pressure)
+            out["pressure"].attrs["unit"] = "Pa"
+        out["times"].attrs["unit"] = "s" if scene.solve.dt is not None else "load step"
+        out["reference"] = np.asarray(scene.mesh.points)
+        out["reference"].attrs["unit"] = "m"
+        out["tetrahedra"] = np.asarray(scene.mesh.tetrahedra)
+        codes = np.asarray(result.status)
+        out.attrs["status"] = codes
+        out.attrs["advice"] = [status.advice(c) for c in sorted(set(codes.tolist()))]
+        for name in ("iterations", "linear_iterations", "cuts", "residual"):
+            out.attrs[name] = np.asarray(getattr(result.statistics, name))
+        for name, value in attributes.items():
+            out.attrs[name] = value if isinstance(value, (str, int, float)) else json.dumps(value)
+    temporary.replace(file)  # a killed run leaves no half-written result
+
+
+def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
+    """One VTU file a step with displacements and reactions, and the series that ParaView opens."""
+    import meshio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    reference, cells = np.asarray(scene.mesh.points), [("tetra", np.asarray(scene.mesh.tetrahedra))]
+    entries = []
+    for k, (time, x, f) in enumerate(
+        zip(*map(np.asarray, (result.times, result.positions, result.reactions)), strict=True)
+    ):
+        name = f"step_{k + 1:05d}.vtu"
+        data = {"displacement": x - reference, "reaction": f}
+        if result.pressure is not None:
+            data["pressure"] = np.asarray(result.pressure[k])
+        meshio.Mesh(reference, cells, point_data=data).write(folder / name)
+        entries.append({"name": name, "time": float(time)})
+    series = folder / "result.vtu.series"
+    series.write_text(json.dumps({"file-series-version": "1.0", "files": entries}, indent=1) + "\n")
+    return series
+
+
+def picture(file: Path, scene: Scene, result: Result) -> None:
+    """The body's surface before (grey) and after, coloured by displacement."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    triangles = boundary_triangles(scene.mesh)
+    before, after = np.asarray(scene.mesh.points), np.asarray(result.positions[-1])
+    moved = np.linalg.norm(after - before, axis=1)[triangles].mean(axis=1)
+    figure = plt.figure(figsize=(6.5, 5.5), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    edges = Poly3DCollection(before[triangles], facecolor="none", edgecolor=GREY, lw=0.15)
+    surface = Poly3DCollection(after[triangles], lw=0.1, edgecolor="black")
+    surface.set_array(moved)
+    surface.set_cmap("viridis")
+    for collection in (edges, surface):
+        axes.add_collection3d(collection)
+    both = np.concatenate([before, after])
+    middle, half = (both.min(axis=0) + both.max(axis=0)) / 2, np.ptp(both, axis=0).max() / 2
+    for k, name in enumerate("xyz"):
+        getattr(axes, f"set_{name}lim")(middle[k] - half, middle[k] + half)
+        getattr(axes, f"set_{name}label")(f"{name} [m]")
+    axes.set_box_aspect((1, 1, 1))
+    figure.colorbar(surface, ax=axes, shrink=0.6, label="displacement [m]")
+    worst = float(np.asarray(result.statistics.residual).max())
+    axes.set_title(f"step {len(result.times)}, largest residual {worst:.1e} of the forces", color=BLUE, fontsize=9)
+    figure.savefig(file, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,115 @@
+"""Results in parts: a finished part is a file of its own beside the output, which a kill at any moment cannot spoil."""
+
+import fcntl
+import hashlib
+import io
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+
+def beside(out: Path) -> Path:
+    """The folder of the parts of `out`."""
+    return out.with_name(out.name + ".parts")
+
+
+def part(folder: Path, k: int) -> Path:
+    """File of part k, from 0."""
+    return folder / f"part_{k:06d}.h5"
+
+
+def write(file: Path, content: dict[str, np.ndarray]) -> None:
+    """Write datasets to an HDF5 file that is there whole or not at all.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    # Made in memory: where a disk is full HDF5 takes the process down, a plain write raises OSError.
+    memory = io.BytesIO()
+    with h5py.File(memory, "w") as datasets:
+        for name, value in content.items():
+            datasets[name] = value
+    temporary = file.with_suffix(f".{os.getpid()}")
+    try:
+        with temporary.open("wb") as out:
+            out.write(memory.getbuffer())
+            out.flush()
+            os.fsync(out.fileno())
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    temporary.replace(file)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder and try it.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f"probe.{os.getpid()}"
+        probe.write_text("")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}: name an --out that can be written") from None
+
+
+@contextmanager
+def locked(file: Path) -> Iterator[None]:
+    """Hold a lock that ends with the process.
+
+    Raises:
+        InputError: another process has it.
+    """
+    with file.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(
+                f"{file.parent} is in use by another process: wait for it, or name another --out"
+            ) from None
+        yield
+
+
+def same(identity: dict[str, Any], file: Path) -> None:
+    """Record all that decides the results, or refuse to go on with other parts.
+
+    Raises:
+        InputError: the parts beside `file` are of something else.
+    """
+    identity = json.loads(json.dumps(identity))
+    if not file.exists():
+        temporary = file.with_suffix(f".{os.getpid()}")
+        temporary.write_text(json.dumps(identity))
+        temporary.replace(file)
+        return
+    for key, value in json.loads(file.read_text()).items():
+        if identity.get(key) != value:
+            raise InputError(
+                f"{file.parent} is of another {file.stem} (its {key} differ): name another --out, or remove it"
+            )
+
+
+def remove(folder: Path) -> None:
+    """Remove the folder and all of its files."""
+    for file in folder.iterdir():
+        file.unlink(missing_ok=True)
+    folder.rmdir()
+
+
+def digest(*arrays: Any) -> str:
+    """SHA-256 of the numbers of some arrays."""
+    sha = hashlib.sha256()
+    for a in arrays:
+        sha.update(np.ascontiguousarray(a).tobytes())
+    return sha.hexdigest()

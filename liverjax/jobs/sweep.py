@@ -1,0 +1,281 @@
+"""Sweeps: one scene, many rows of parameters, results that a kill at any moment cannot spoil.
+
+Rows are run chunk by chunk. A finished chunk is a file of its own in FILE.h5.parts, written beside and renamed; when
+all are there they become FILE.h5. So whatever stops a run, finished chunks stay, and `--resume` computes the others.
+Several processes may work on one sweep: each takes every n-th chunk, and the last to finish joins the parts.
+"""
+
+import csv
+import errno
+import json
+import os
+import shutil
+import tomllib
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.versions import versions
+from liverjax.jobs import parts
+from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.scenes.scene_file import changed_content, check_numbers, load_scene
+from liverjax.simulation.batch import simulate_batch
+
+#: What may be stored of every row, from its result and the reference positions.
+OUTPUTS: dict[str, Callable] = {
+    "final_positions": lambda result, scene: result.positions[-1],
+    "positions": lambda result, scene: result.positions,
+    "largest_displacement": lambda result, scene: jnp.max(
+        jnp.linalg.norm(result.positions - scene.mesh.points[None], axis=-1)
+    ),
+    "final_reactions": lambda result, scene: result.reactions[-1],
+    "largest_pressure": lambda result, scene: jnp.max(result.pressure),
+}
+_UNITS = {"final_reactions": "N", "largest_pressure": "Pa"}
+
+
+class Sweep(NamedTuple):
+    """What is to be run; everything that decides the results is in `identity`."""
+
+    scene: Scene
+    names: tuple[str, ...]
+    rows: np.ndarray  # (N, P) numbers
+    numbers: np.ndarray  # (N,) of the rows in the file, from 1
+    outputs: tuple[str, ...]
+    probes: tuple[int, ...]  # nodes whose positions are kept over time
+    chunk: int
+    identity: dict[str, Any]
+
+
+class Done(NamedTuple):
+    """How a sweep ended."""
+
+    file: Path | None  # None: other processes still have chunks to do
+    failed: dict[int, int]  # number of the row -> code
+    computed: int  # rows, by this process now
+
+
+def read_sweep(
+    scene_file: Path,
+    parameters: Path,
+    outputs: tuple[str, ...] = ("final_positions",),
+    probes: tuple[int, ...] = (),
+    chunk: int = 16,
+    only: tuple[int, ...] = (),
+) -> Sweep:
+    """A sweep from a scene file and a table with a header of dotted names, every row checked before any compile.
+
+    Raises:
+        InputError: an unusable scene or table, a name that the scene does not have, a value out of its bounds.
+    """
+    scene = load_scene(scene_file)
+    names, rows = read_table(parameters)
+    content = tomllib.loads(scene_file.read_text(encoding="utf-8"))
+    with_parameters(scene, dict(zip(names, rows[0], strict=True)))
+    for k, row in enumerate(rows.tolist()):
+        values = dict(zip(names, row, strict=True))
+        try:
+            check_numbers(changed_content(content, values))
+        except InputError as error:
+            raise InputError(f"{parameters}: row {k + 1}: {error}") from None
+    for name in outputs:
+        if name not in OUTPUTS:
+            raise InputError(f"--store {name} is not known: use {', '.join(OUTPUTS)}")
+        if name == "largest_pressure" and scene.porosity is None:
+            raise InputError("--store largest_pressure needs [porosity] in the scene: leave it out")
+    for node in probes:
+        if not 0 <= node < scene.mesh.number_of_nodes:
+            raise InputError(f"--probe {node} is no node of the mesh: give 0 to {scene.mesh.number_of_nodes - 1}")
+    if chunk < 1:
+        raise InputError(f"--chunk {chunk} must be above 0: give e.g. 16")
+    numbers = np.arange(1, len(rows) + 1)
+    for row in only:
+        if not 1 <= row <= len(rows):
+            raise InputError(f"--rows {row} is not in {parameters}: give 1 to {len(rows)}")
+    if only:
+        numbers = np.array(sorted(set(only)))
+    chunk = min(chunk, len(numbers))
+    identity = {
+        "scene": scene_file.read_text(encoding="utf-8"),
+        "numbers": parts.digest(*jax.tree.leaves(scene)),
+        "parameters": parts.digest(rows) + " " + " ".join(names),
+        "rows": parts.digest(numbers),
+        "outputs": [*outputs, *(f"probe {p}" for p in probes)],
+        "chunk": chunk,
+        "versions": versions(),
+    }
+    return Sweep(scene, names, rows[numbers - 1], numbers, outputs, probes, chunk, identity)
+
+
+def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """Header and numbers (N, P) of a CSV file; # begins a comment.
+
+    Raises:
+        InputError: unreadable or empty, a name twice, a row of another length, a value that is no finite number.
+    """
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
+    if len(table) < 2:
+        raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row a run")
+    names = tuple(table[0])
+    if len(set(names)) < len(names):
+        raise InputError(f"{file} names {max(names, key=names.count)} twice: leave one column out")
+    rows = []
+    for k, row in enumerate(table[1:]):
+        if len(row) != len(names):
+            raise InputError(f"{file}: row {k + 1} has {len(row)} values for {len(names)} names: complete it")
+        for name, cell in zip(names, row, strict=True):
+            try:
+                finite = np.isfinite(float(cell))
+            except ValueError:
+                finite = False
+            if not finite:
+                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is no finite number: mend it")
+        rows.append([float(cell) for cell in row])
+    return names, np.array(rows)
+
+
+# -- running ----------------------------------------------------------------------------------------------------------
+
+
+def run(
+    sweep: Sweep,
+    out: Path,
+    resume: bool = False,
+    process: tuple[int, int] = (0, 1),
+    report: Callable[[int], None] = lambda rows: None,
+) -> Done:
+    """Run what is not done yet of a sweep into `out`.
+
+    Args:
+        sweep: `Sweep`.
+        out: file for the results; its parts stand beside it until all are done.
+        resume: go on with what is there.
+        process: number of this process and of all that share the work.
+        report: called with the number of rows finished.
+
+    Raises:
+        InputError: results that are there already, of another sweep, or in use by another process.
+        OSError: the disk is full; finished chunks are kept.
+    """
+    folder = parts.beside(out)
+    if out.exists():
+        return _already(sweep, out, resume)
+    if folder.exists() and not resume and process[1] == 1:
+        raise InputError(f"{folder} holds an unfinished sweep: go on with --resume, or remove it")
+    parts.make_folder(folder)
+    with parts.locked(folder / f"lock_{process[0]}"):
+        parts.same(sweep.identity, folder / "sweep.json")
+        program, computed = _program(sweep.outputs, sweep.probes), 0
+        for k in list(_chunks(sweep))[process[0] :: process[1]]:
+            file = parts.part(folder, k)
+            if not file.exists():
+                _write_part(file, sweep, k, program)
+                computed += len(_of(sweep, k))
+            report(len(_of(sweep, k)))
+    return _joined(sweep, out, folder, computed)
+
+
+def _chunks(sweep: Sweep) -> range:
+    return range(-(-len(sweep.rows) // sweep.chunk))
+
+
+def _of(sweep: Sweep, k: int) -> range:
+    return range(k * sweep.chunk, min((k + 1) * sweep.chunk, len(sweep.rows)))
+
+
+@cache
+def _program(outputs: tuple, probes: tuple) -> Callable:
+    return jax.jit(partial(_rows, outputs, probes))
+
+
+def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    result = simulate_batch(scene, values).result
+    stored = {name: jax.vmap(lambda r, name=name: OUTPUTS[name](r, scene))(result) for name in outputs}
+    if probes:
+        stored["probes"] = result.positions[:, :, np.array(probes, dtype=int)]
+    return stored | {"status": result.status, "residual": result.statistics.residual}
+
+
+def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
+    chosen = _of(sweep, k)
+    # The last chunk is filled up with its last row: one program for all.
+    filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
+    values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
+    result = program(sweep.scene, values)
+    parts.write(file, {name: np.asarray(value)[: len(chosen)] for name, value in result.items()})
+
+
+def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
+    if not resume:
+        raise InputError(f"{out} is there already: name another --out, or remove it")
+    try:
+        with h5py.File(out) as file:
+            identity, codes = json.loads(file.attrs["sweep"]), file["status"][:]
+    except (OSError, KeyError):
+        raise InputError(f"{out} holds no sweep: name another --out, or remove it") from None
+    if identity != json.loads(json.dumps(sweep.identity)):
+        raise InputError(f"{out} is of another sweep: name another --out, or remove it")
+    return Done(out, _failures(sweep, codes), 0)
+
+
+def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
+    """All parts as one file, by whichever process comes last."""
+    files = [parts.part(folder, k) for k in _chunks(sweep)]
+    try:
+        with parts.locked(folder / "lock_join"):
+            if out.exists() or not all(f.exists() for f in files):
+                return Done(out if out.exists() else None, {}, computed)
+            codes = _join(sweep, out, files)
+    except (InputError, FileNotFoundError):  # another process joins them at this moment
+        return Done(None, {}, computed)
+    parts.remove(folder)
+    return Done(out, _failures(sweep, codes), computed)
+
+
+#: Bytes that HDF5 needs beside the datasets.
+_HEADERS = 100_000
+
+
+def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
+    mesh = sweep.scene.mesh
+    needed = sum(f.stat().st_size for f in files) + mesh.points.nbytes + mesh.tetrahedra.nbytes + sweep.rows.nbytes
+    if shutil.disk_usage(out.parent).free < needed + _HEADERS:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    temporary, n = out.with_suffix(".joining"), len(sweep.rows)
+    with h5py.File(temporary, "w") as whole:
+        for k, file in enumerate(files):
+            with h5py.File(file) as part:
+                for name, value in part.items():
+                    if name not in whole:
+                        whole.create_dataset(name, (n, *value.shape[1:]), value.dtype)
+                        whole[name].attrs["unit"] = _UNITS.get(name, "1" if name in ("status", "residual") else "m")
+                    whole[name][_of(sweep, k).start : _of(sweep, k).stop] = value[:]
+        whole["row"], whole["parameters"] = sweep.numbers, sweep.rows
+        whole["parameters"].attrs["names"] = list(sweep.names)
+        if sweep.probes:
+            whole["probe_nodes"] = np.array(sweep.probes, dtype=int)
+        whole["reference"] = np.asarray(sweep.scene.mesh.points)
+        whole["tetrahedra"] = np.asarray(sweep.scene.mesh.tetrahedra)
+        whole.attrs["sweep"] = json.dumps(sweep.identity)
+        codes = whole["status"][:]
+    temporary.replace(out)
+    return codes
+
+
+def _failures(sweep: Sweep, codes: np.ndarray) -> dict[int, int]:
+    worst = np.where(codes != status.CONVERGED, codes, 0).max(axis=1)
+    return {int(sweep.numbers[k]): int(worst[k]) for k in np.flatnonzero(worst != status.CONVERGED)}

@@ -1,0 +1,300 @@
+"""Gradient check of a material law: derivatives, objectivity, rest state, limits and stable ranges."""
+
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax import laws
+from liverjax.core.errors import InputError
+from liverjax.elements import reference
+from liverjax.laws import Law, homogeneous
+
+#: Steps of the difference quotients, relative to F.
+STEPS = 10.0 ** -np.arange(1.0, 10.5, 0.5)
+#: A central difference cannot be better than about eps^(2/3) of its terms; a thousand times that for their size.
+DIFFERENCE_LIMIT = 1e3 * np.finfo(float).eps ** (2 / 3)
+#: Sums of some hundred rounded terms, and their cancellation in deviatoric parts.
+EXACT_LIMIT = 1e-10
+#: As many of each: one program for both.
+STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
+
+
+class Row(NamedTuple):
+    """One line of the table; `passed` is None for what is only told."""
+
+    name: str
+    found: str
+    limit: str
+    passed: bool | None
+
+
+class Check(NamedTuple):
+    """A table, and what the figure shows."""
+
+    law: Law
+    rows: list[Row]
+    steps: np.ndarray
+    difference_errors: dict[str, np.ndarray]
+    stable: dict[str, tuple[float, float]]
+
+    @property
+    def failed(self) -> list[Row]:
+        """Rows that did not pass."""
+        return [row for row in self.rows if row.passed is False]
+
+
+def load(name: str) -> Law:
+    """A shipped law by its name, or FILE.py:LAW, a law object or class of a Python file; typical parameters of a class.
+
+    Raises:
+        InputError: no such law or file, a file that does not run, a parameter without typical value.
+    """
+    if ":" not in name and not name.endswith(".py"):
+        return laws.typical(name)
+    file, _, attribute = name.rpartition(":") if ":" in name else (name, "", "")
+    if not attribute:
+        raise InputError(f"{name} names no law: give FILE.py:LAW")
+    if not Path(file).is_file():
+        raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
+    # Under a private name that is registered: dataclasses look their module up, and the file may be called jax.py.
+    spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
+    if spec is None:
+        raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    sys.path.insert(0, str(Path(file).resolve().parent))
+    try:
+        loader: Any = spec.loader
+        loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise InputError(f"{file} does not run ({_reason(error)}): mend it first") from None
+    finally:
+        sys.path.pop(0)
+    found: Any = getattr(module, attribute, None)
+    if found is None:
+        own = {n: v if inspect.isclass(v) else type(v) for n, v in vars(module).items() if _is_law(v)}
+        offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
+        raise InputError(f"{file} has no {attribute}: {'use ' + ' or '.join(offered) if offered else 'define a law'}")
+    if not _is_law(found):
+        raise InputError(f"{name} is no law: derive it from liverjax.Law and decorate it with liverjax.core.struct")
+    law = _typical(found, name) if inspect.isclass(found) else found
+    _try(law, name)
+    return law
+
+
+def _reason(error: BaseException) -> str:
+    """Kind and first line of an exception, at most 150 characters."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:150]
+
+
+def _try(law: Law, name: str) -> None:
+    """Evaluate the law once: whatever it raises becomes one sentence."""
+    for shape in ((), (2,)):
+        F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
+        for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
+            try:
+                found = jax.eval_shape(getattr(law, what), F).shape
+            except Exception as error:
+                raise InputError(
+                    f"{name}: its {what} cannot be evaluated ({_reason(error)}): mend the law, name every invariant "
+                    "it uses in `invariants`, and give one direction for fibres"
+                ) from None
+            if found != expected:
+                raise InputError(f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: mend the law")
+
+
+def _is_law(value: Any) -> bool:
+    return isinstance(value, Law) or (inspect.isclass(value) and issubclass(value, Law) and value is not Law)
+
+
+def _typical(cls: type, name: str) -> Law:
+    if "__dataclass_fields__" not in vars(cls):
+        raise InputError(f"{name} is not decorated: write @liverjax.core.struct above its class")
+    values = {f.name: f.metadata.get("typical") for f in laws.parameters(cls)}
+    missing = [n for n, v in values.items() if v is None]
+    if missing:
+        raise InputError(f"{name}: parameter {missing[0]} has no typical value: give param(…, typical=…) or an object")
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise InputError(
+            f"{name} cannot be made ({_reason(error)}): give every field a typical value or default"
+        ) from None
+
+
+def check(law: Law) -> Check:
+    """Run every row; nothing is raised for a law that is wrong."""
+    F, D = _samples()
+    energy, stress, tangent = jax.jit(law.energy), jax.jit(law.first_piola), jax.jit(law.tangent)
+    rows, errors = [], {}
+    W, P, A = (_numbers(f, F) for f in (energy, stress, tangent))
+    finite = all(np.isfinite(v).all() for v in (W, P, A))
+    rows.append(Row("finite at moderate stretches", "yes" if finite else "NaN or infinite", "0.7 to 1.4", finite))
+    slope, curved = np.einsum("nij,nij->n", P, D), np.einsum("nijkl,nkl->nij", A, D)
+    for name, function, exact in (("energy to stress", energy, slope), ("stress to tangent", stress, curved)):
+        errors[name] = np.array([_difference(function, F, D, h, exact) for h in STEPS])
+        rows.append(_v_shape(name, errors[name]))
+    for name, by_hand, oracle in (("stress", P, reference.first_piola), ("tangent", A, reference.tangent)):
+        rows.append(_exact(f"{name} by hand against autodiff", by_hand, _numbers(jax.jit(partial(oracle, law)), F)))
+    Q = _rotation(4)
+    size = np.abs(W).max() + np.abs(P).max()
+    rows.append(_exact("objective: W(QF) = W(F)", _numbers(energy, Q @ F), W, size))
+    rows.append(_exact("objective: P(QF) = Q P(F)", _numbers(stress, Q @ F), Q @ P))
+    rows.append(_exact("tangent symmetric", A, np.transpose(A, (0, 3, 4, 1, 2))))
+    rows += _rest(law, energy, stress, tangent)
+    rows += _limits(energy)
+    more, stable = _stability(law, tangent)
+    return Check(law, rows + more, STEPS, errors, stable)
+
+
+def _numbers(function: Callable, F: np.ndarray) -> np.ndarray:
+    return np.asarray(function(jnp.asarray(F)), float)
+
+
+def _rotation(seed: int) -> np.ndarray:
+    Q = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))[0]
+    return Q * np.sign(np.linalg.det(Q))
+
+
+def _samples() -> tuple[np.ndarray, np.ndarray]:
+    """Deformation gradients with stretches 0.7 to 1.4, and directions of unit length."""
+    rng = np.random.default_rng(2)
+    stretches = rng.uniform(0.7, 1.4, (12, 3))
+    stretches[:3, 1] = stretches[:3, 0]  # two equal
+    F = np.stack([_rotation(k) @ np.diag(s) @ _rotation(k + 100) for k, s in enumerate(stretches)])
+    D = rng.standard_normal((12, 3, 3))
+    return F, D / np.linalg.norm(D, axis=(1, 2))[:, None, None]
+
+
+def _difference(function: Callable, F: np.ndarray, D: np.ndarray, h: float, exact: np.ndarray) -> float:
+    """Largest relative error of the central difference with step h."""
+    quotient = (_numbers(function, F + h * D) - _numbers(function, F - h * D)) / (2 * h)
+    return float(np.abs(quotient - exact).max() / max(np.abs(exact).max(), 1e-300))
+
+
+def _v_shape(name: str, errors: np.ndarray) -> Row:
+    limit = f"< {DIFFERENCE_LIMIT:.0e}"
+    if not np.isfinite(errors).any():
+        return Row(f"{name}, differences", "not finite", limit, False)
+    k = int(np.nanargmin(errors))
+    order = np.log10(errors[1] / errors[4]) / np.log10(STEPS[1] / STEPS[4])
+    found = f"fall as h^{order:.1f} to {errors[k]:.1e} at step {STEPS[k]:.0e}"
+    return Row(f"{name}, differences", found, limit, bool(errors[k] < DIFFERENCE_LIMIT))
+
+
+def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None = None) -> Row:
+    scale = np.abs(theirs).max() if size is None else size
+    error = float(np.abs(ours - theirs).max() / scale) if scale > 0 else float(np.abs(ours).max())
+    return Row(name, f"{error:.1e}", f"< {EXACT_LIMIT:.0e}", bool(error < EXACT_LIMIT))
+
+
+def _rest(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
+    """Energy, stress and moduli of the undeformed state; Voigt's means, of an isotropic law every direction's."""
+    W, P, A = (_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
+    normal, coupled = np.trace(np.einsum("iijj->ij", A)), A[0, 0, 1, 1] + A[0, 0, 2, 2] + A[1, 1, 2, 2]
+    shear = (normal - coupled) / 15 + (A[0, 1, 0, 1] + A[0, 2, 0, 2] + A[1, 2, 1, 2]) / 5
+    bulk = (normal + 2 * coupled) / 9
+    scale = np.abs(A).max()
+    rows = []
+    for name, value in (("energy at rest", np.abs(W)), ("stress at rest", np.abs(P).max())):
+        error = value / scale if np.isfinite(scale) and scale > 0 else np.nan
+        rows.append(Row(name, f"{error:.1e} of the tangent", f"< {EXACT_LIMIT:.0e}", bool(error < EXACT_LIMIT)))
+    for name, value, method in (("shear modulus", shear, "shear_modulus"), ("bulk modulus", bulk, "bulk_modulus")):
+        try:
+            stated = float(getattr(law, method)())
+        except Exception:  # not stated, or stated by a function that does not run
+            rows.append(Row(f"ground-state {name}", f"{value:.6g} Pa", "not stated", None))
+            continue
+        agrees = bool(abs(value - stated) < 1e-9 * (abs(shear) + abs(bulk)))
+        rows.append(Row(f"ground-state {name}", f"{value:.6g} Pa", f"stated {stated:.6g}", agrees))
+    return rows
+
+
+def _limits(energy: Callable) -> list[Row]:
+    """What becomes of the energy at J -> 0, J -> infinity, J = 0 and J < 0."""
+
+    def along(*sizes: float) -> np.ndarray:
+        return _numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
+
+    small, large = along(1e-4, 1e-8, 1e-16), along(1e4, 1e8)
+    if not np.isfinite(small).all():
+        crushed = "not finite"
+    elif small[2] > 1.5 * small[1]:
+        crushed = "grows without bound"
+    else:
+        crushed = f"finite ({small[2]:.3g} Pa): nothing stops an element from being crushed flat"
+    grows = "not finite" if not np.isfinite(large).all() else "faster" if large[1] > 1e4 * large[0] else "no faster"
+    swollen = grows if grows == "not finite" else f"grows {grows} than J"
+    flat, inverted = np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 1.0, -0.5])
+    ends = ["finite" if np.isfinite(_numbers(energy, F)).all() else "not finite" for F in (flat, inverted)]
+    return [
+        Row("energy as J -> 0", crushed, "", None),
+        Row("energy as J -> infinity", swollen, "", None),
+        Row("energy at J = 0, J < 0", f"{ends[0]}, {ends[1]}", "", None),
+    ]
+
+
+def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
+    """Ranges about rest in which work is positive and the law strongly elliptic; stable at rest or failed."""
+    rows, ranges = [], {}
+    for test, what in homogeneous.TESTS.items():
+        if test == "pure_shear":
+            continue
+        driven = SHEARS if what == "shear" else STRETCHES
+        F = np.asarray(homogeneous.deformation_gradient(test, driven))
+        P = _numbers(jax.jit(partial(homogeneous.nominal_stress, law)), F)
+        stable = _work_is_positive(test, driven, P) & (ellipticity(_numbers(tangent, F)) > 0)
+        start = int(np.argmin(np.abs(driven - (0.0 if what == "shear" else 1.0))))
+        low, high = _range(driven, stable, start)
+        ranges[test] = (low, high)
+        whole = " and maybe beyond" if (low, high) == (driven[0], driven[-1]) else ""
+        text = f"{what} {low:.3g} to {high:.3g}{whole}" if stable[start] else "not even at rest"
+        rows.append(Row(f"stable in {test.replace('_', ' ')}", text, "", bool(stable[start])))
+    return rows, ranges
+
+
+def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
+    """The nominal stress rises; at the ends by one-sided differences."""
+    stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
+    with np.errstate(all="ignore"):
+        return np.gradient(stress, driven) > 0
+
+
+def ellipticity(A: np.ndarray) -> np.ndarray:
+    """Smallest eigenvalue of the acoustic tensor A_iJkL n_J n_L over 200 directions, relative to the tangent."""
+    k = np.arange(200) + 0.5
+    z, angle = 1 - k / 200, np.pi * (1 + 5**0.5) * k  # Fibonacci's points of the upper half sphere
+    n = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+    n = np.concatenate([n, np.eye(3)])
+    finite = np.isfinite(A).all(axis=(1, 2, 3, 4))
+    acoustic = np.einsum("eijkl,dj,dl->edik", np.where(finite[:, None, None, None, None], A, 0.0), n, n, optimize=True)
+    smallest = np.linalg.eigvalsh(0.5 * (acoustic + np.swapaxes(acoustic, -1, -2)))[..., 0].min(axis=1)
+    return np.where(finite, smallest, -np.inf)
+
+
+def _range(driven: np.ndarray, stable: np.ndarray, start: int) -> tuple[float, float]:
+    low = high = start
+    while low > 0 and stable[low - 1]:
+        low -= 1
+    while high < len(driven) - 1 and stable[high + 1]:
+        high += 1
+    return float(driven[low]), float(driven[high])
+
+
+def table(result: Check) -> str:
+    """The rows as text, below the law's first line of documentation."""
+    width = max(len(row.name) for row in result.rows)
+    mark = {True: "ok", False: "FAILED", None: ""}
+    lines = [(type(result.law).__doc__ or type(result.law).__name__).strip().splitlines()[0]]
+    for row in result.rows:
+        limit = f"   ({row.limit})" if row.limit else ""
+        lines.append(f"{row.name:{width}s}  {mark[row.passed]:6s}  {row.found}{limit}")
+    return "\n".join(lines)

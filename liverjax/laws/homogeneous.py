@@ -1,0 +1,65 @@
+"""Homogeneous tests of an incompressible sample: deformation gradients and the nominal stress that they take."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.errors import InputError
+from liverjax.laws.base import Law, isochoric_part
+from liverjax.laws.terms.stretch_terms import stress_at_constant
+from liverjax.tensors.matrices import pack, unpack
+
+#: Test -> what is driven: a stretch, or the amount of shear.
+TESTS = {"uniaxial": "stretch", "equibiaxial": "stretch", "pure_shear": "stretch", "simple_shear": "shear"}
+
+
+def deformation_gradient(test: str, driven: Any, stretch: Any = 1.0) -> jax.Array:
+    """F (..., 3, 3) with det F = 1; axis 3 is free of traction.
+
+    Args:
+        test: one of `TESTS`.
+        driven: stretches along axis 1 (and 2 in `equibiaxial`) or amounts of shear (...).
+        stretch: `simple_shear` only, a uniaxial stretch along axis 1 before it is sheared.
+    """
+    v = jnp.asarray(driven, float)
+    zero, one = jnp.zeros_like(v), jnp.ones_like(v)
+    if test == "uniaxial":
+        side = v**-0.5
+        rows = ((v, zero, zero), (zero, side, zero), (zero, zero, side))
+    elif test == "equibiaxial":
+        rows = ((v, zero, zero), (zero, v, zero), (zero, zero, v**-2))
+    elif test == "pure_shear":
+        rows = ((v, zero, zero), (zero, one, zero), (zero, zero, 1 / v))
+    elif test == "simple_shear":
+        side = stretch**-0.5 * one
+        rows = ((stretch * one, v, zero), (zero, side, zero), (zero, zero, side))
+    else:
+        raise InputError(f"test {test!r} is not known: use one of {', '.join(TESTS)}")
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
+    """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample whose face 3 is free: P_33 = 0.
+
+    P = dW/dF - p cof F. The volumetric energy of a law has no part in it; a law without such a split is taken at
+    det F = 1 as it is. `constant` says that F is data, with respect to which nothing will be differentiated: a
+    stretch-based law is then much cheaper to differentiate with respect to its parameters.
+    """
+    split = isochoric_part(law)
+    if constant and hasattr(split, "stretch_energy"):
+        P = F @ pack(stress_at_constant(split, unpack(F)))
+    else:
+        P = (law if split is None else split).first_piola(F)
+    cofactor = jnp.stack([jnp.cross(F[..., k - 2, :], F[..., k - 1, :]) for k in range(3)], axis=-2)
+    return P - (P[..., 2, 2] / cofactor[..., 2, 2])[..., None, None] * cofactor
+
+
+def measured(test: str, P: jax.Array) -> jax.Array:
+    """The component that a test measures: P_11, or P_12 of a shear."""
+    return P[..., 0, 1] if test == "simple_shear" else P[..., 0, 0]
+
+
+def response(law: Law, test: str, driven: Any, stretch: Any = 1.0) -> jax.Array:
+    """Nominal stress [Pa] of a test at stretches or amounts of shear (...)."""
+    return measured(test, nominal_stress(law, deformation_gradient(test, driven, stretch)))

@@ -1,0 +1,1 @@
+"""Stress and stiffness of one deformation gradient, by kind of law."""

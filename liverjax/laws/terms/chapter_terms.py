@@ -1,0 +1,167 @@
+"""Stress and stiffness as the chapter writes them (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
+
+A documented variant: `liverjax.laws.terms.invariant_terms` sums the scalars over k first and gives the same numbers to
+roundoff at a cost that does not grow with the number of products. `liverjax.laws.products` has the laws.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from liverjax.laws import products
+from liverjax.laws.base import summands
+from liverjax.tensors.matrices import (
+    IDENTITY,
+    Matrix,
+    Vector,
+    add_matrices,
+    cofactor,
+    cross,
+    dot,
+    invariants,
+    matmul,
+    matvec,
+    outer,
+    right_cauchy_green,
+    scale,
+    scale_matrix,
+    transpose,
+)
+
+
+class _Term(NamedTuple):
+    """One product's scalars: g and its derivatives by I1 and I2, h and its derivatives by J."""
+
+    g: Any
+    g1: Any
+    g2: Any
+    g11: Any
+    g12: Any
+    g22: Any
+    h: Any
+    h1: Any
+    h2: Any
+
+
+def _power(x: Any, n: int) -> Any:
+    return 1.0 if n == 0 else x**n
+
+
+def _term(k: products.Product, I1: Any, I2: Any, J: Any) -> _Term:
+    c, i, j, p = k
+
+    def g(a: int, b: int) -> Any:
+        """The a-th derivative by I1, the b-th by I2."""
+        factor = (1, i, i * (i - 1))[a] * (1, j, j * (j - 1))[b]
+        return 0.0 if factor == 0 else c * factor * _power(I1, i - a) * _power(I2, j - b)
+
+    h = J**p if p else 1.0
+    inverse = 1 / J
+    return _Term(g(0, 0), g(1, 0), g(0, 1), g(2, 0), g(1, 1), g(0, 2), h, p * h * inverse, p * (p - 1) * h * inverse**2)
+
+
+class _At(NamedTuple):
+    F: Matrix
+    C: Matrix
+    B: Matrix  # I1 Id - C
+    cof: Matrix
+    J: Any
+    groups: list  # (terms, phi', phi'')
+
+
+def _at(law: Any, F: Matrix) -> _At:
+    C, I = right_cauchy_green(F), invariants(("I1", "I2", "J"), F)
+    B = tuple(tuple((I.I1 if r == c else 0.0) - C[r][c] for c in range(3)) for r in range(3))
+    groups = []
+    for part in summands(law):
+        for group in products.groups(part):
+            terms = [_term(k, I.I1, I.I2, I.J) for k in group.products]
+            first, second = (1.0, 0.0) if group.slopes is None else group.slopes(sum(t.g * t.h for t in terms))
+            groups.append((terms, first, None if group.slopes is None else second))
+        for h1, h2 in products.functions_of_volume(part, I.J):
+            groups.append(([_Term(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, h1, h2)], 1.0, None))
+    return _At(F, C, B, cofactor(F), I.J, groups)
+
+
+def _stress(t: _Term, s: _At) -> Matrix:
+    """S^k = 2 dg/dC, no inverse."""
+    return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
+
+
+def first_piola(law: Any, F: Matrix) -> Matrix:
+    """sum_k phi' (h' g cof F + h F S^k) [Pa]."""
+    s = _at(law, F)
+    total = scale_matrix(0.0, F)
+    for terms, phi1, _ in s.groups:
+        for t in terms:
+            P = add_matrices(scale_matrix(t.h1 * t.g, s.cof), scale_matrix(t.h, matmul(F, _stress(t, s))))
+            total = add_matrices(total, scale_matrix(phi1, P))
+    return total
+
+
+def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, Any]]:
+    """D_i (x) D_j and D_i . D_j of every pair: of what L and U are made where their A and B are constant."""
+    return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
+
+
+def blocks(
+    law: Any, F: Matrix, D: list[Vector], pairs: tuple, regularised: bool = False, constant: list | None = None
+) -> list[Matrix]:
+    """d2W/dx_i dx_j per reference volume: G + H + I + Lambda + M + R of every k, and phi'' of a function of the sum.
+
+    `regularised` changes the G of every product (not phi''). `constant` is `constant_matrices(D, pairs)`, stored in
+    advance as the chapter proposes; without it they are computed here, which is faster (experiments/fig4_assembly.py).
+    """
+    s = _at(law, F)
+    constant = constant_matrices(D, pairs) if constant is None else constant
+    return [_block(s, D[i], D[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
+
+
+def _block(s: _At, Di: Vector, Dj: Vector, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
+    ji, jj = matvec(s.cof, Di), matvec(s.cof, Dj)
+    K = scale_matrix(0.0, IDENTITY)
+    for terms, phi1, phi2 in s.groups:
+        for t in terms:
+            S = _stress(t, s)
+            FSDi, FSDj = matvec(s.F, matvec(S, Di)), matvec(s.F, matvec(S, Dj))
+            G = scale_matrix(t.h2 * t.g, outer(ji, jj))
+            if regularised:  # eps/3 where the chapter prints eps: the trace is kept
+                eps = jnp.clip(1 - s.J, 0, 1)
+                G = add_matrices(scale_matrix(1 - eps, G), scale_matrix(t.h2 * t.g * eps / 3 * dot(ji, jj), IDENTITY))
+            H = scale_matrix(t.h1 * t.g, _second_derivative_of_J(s.F, Di, Dj))
+            I_ = scale_matrix(t.h1, outer(ji, FSDj))
+            Lambda = scale_matrix(t.h1, outer(FSDi, jj))
+            M = scale_matrix(t.h * dot(Di, matvec(S, Dj)), IDENTITY)
+            R = scale_matrix(t.h, matmul(matmul(s.F, _linear_matrices(t, s, Di, Dj, constant)), transpose(s.F)))
+            for part in (G, H, I_, Lambda, M, R):
+                K = add_matrices(K, scale_matrix(phi1, part))
+        if phi2 is not None:
+            ri, rj = _slope(terms, s, Di), _slope(terms, s, Dj)
+            K = add_matrices(K, scale_matrix(phi2, outer(ri, rj)))
+    return K
+
+
+def _second_derivative_of_J(F: Matrix, Di: Vector, Dj: Vector) -> Matrix:
+    """-[F (D_i x D_j)]_x."""
+    n0, n1, n2 = matvec(F, cross(Di, Dj))
+    return ((0.0, n2, -n1), (-n2, 0.0, n0), (n1, -n0, 0.0))
+
+
+def _linear_matrices(t: _Term, s: _At, Di: Vector, Dj: Vector, constant: tuple[Matrix, Any]) -> Matrix:
+    """L + U of dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C."""
+    BDi, BDj = matvec(s.B, Di), matvec(s.B, Dj)
+    DiDj, product = constant
+    beta = -2 * t.g2
+    L = add_matrices(scale_matrix(beta, transpose(DiDj)), scale_matrix(beta * product, IDENTITY))
+    U = scale_matrix(4 * (t.g11 + t.g2), DiDj)
+    for weight, a, b in ((t.g12, Di, BDj), (t.g12, BDi, Dj), (t.g22, BDi, BDj)):
+        U = add_matrices(U, scale_matrix(4 * weight, outer(a, b)))
+    return add_matrices(L, U)
+
+
+def _slope(terms: list[_Term], s: _At, D: Vector) -> Vector:
+    """d(sum_k g h)/dx of a node."""
+    v = scale(sum(t.h1 * t.g for t in terms), matvec(s.cof, D))
+    for t in terms:
+        v = tuple(a + t.h * b for a, b in zip(v, matvec(s.F, matvec(_stress(t, s), D)), strict=True))
+    return v

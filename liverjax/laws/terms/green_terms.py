@@ -1,0 +1,109 @@
+"""Hand-derived stress and stiffness of laws w(E) of Green's strain in the axes of the material."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.errors import InputError
+from liverjax.tensors.material_axes import (
+    SIX,
+    anisotropic,
+    half_contracted,
+    orthotropic,
+    pushed,
+    rotated,
+    six_of,
+    symmetric,
+)
+from liverjax.tensors.matrices import (
+    IDENTITY,
+    Matrix,
+    Vector,
+    add,
+    add_matrices,
+    cross,
+    dot,
+    green_strain,
+    matmul,
+    matvec,
+    outer,
+    scale,
+    stored,
+    transpose,
+    unit,
+)
+
+
+class Moduli(NamedTuple):
+    """dS/dE = orthotropic moduli + `curvature` S (x) S, all in the axes of the material."""
+
+    normal: Matrix  # C_mmnn
+    shear: Vector  # C_mnmn of the pairs 12, 13, 23
+    curvature: Any
+
+
+def components(direction: Any, like: Any) -> Vector:
+    """A direction (3,), or one an element (E, 3), as a unit vector of components in the precision of `like`."""
+    direction = jnp.asarray(direction, jnp.result_type(like))
+    shape, elements = direction.shape, jnp.shape(like)
+    if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[:-1] != elements):
+        raise InputError(f"a direction has shape {shape}: give (3,) or one row of 3 an element, {(*elements, 3)}")
+    return unit(tuple(direction[..., i] for i in range(3)))
+
+
+def material_axes(law: Any, like: Any) -> Matrix:
+    """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes where a law has no fibre."""
+    if not hasattr(law, "fibre"):
+        return IDENTITY
+    f, s = components(law.fibre, like), components(law.sheet, like)
+    s = unit(add(s, scale(-dot(f, s), f)))
+    return transpose((f, s, cross(f, s)))
+
+
+def stress(law: Any, F: Matrix) -> Matrix:
+    """Second Piola-Kirchhoff stress [Pa] of w alone."""
+    A = material_axes(law, F[0][0])
+    return rotated(_stress(law, green_strain(matmul(F, A))), A)
+
+
+def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+    """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
+    A = material_axes(law, F[0][0])
+    FA = matmul(F, A)
+    E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]
+    if not hasattr(law, "green_derivatives"):
+        half = [half_contracted(_autodiff_moduli(law, E), d) for d in turned]
+        return [pushed(FA, anisotropic(half[j], turned[i])) for i, j in pairs]
+    S, moduli = stored(law.green_derivatives(E))
+    r = stored([matvec(FA, matvec(S, d)) for d in turned])
+    return [
+        add_matrices(
+            pushed(FA, orthotropic(moduli.normal, moduli.shear, turned[i], turned[j])),
+            outer(scale(moduli.curvature, r[i]), r[j]),
+        )
+        for i, j in pairs
+    ]
+
+
+def _stress(law: Any, E: Matrix) -> Matrix:
+    if hasattr(law, "green_derivatives"):
+        return law.green_derivatives(E)[0]
+    return symmetric(tuple(_slopes(lambda six: law.green_energy(symmetric(six)), six_of(E))))
+
+
+def _slopes(function: Any, six: tuple) -> list:
+    """Derivative with respect to each entry E_ij of a symmetric E: half of that to a shear component (two entries)."""
+    result = []
+    for k, (i, j) in enumerate(SIX):
+        weight = 1.0 if i == j else 0.5
+        tangents = tuple(jnp.full_like(v, weight if k == m else 0.0) for m, v in enumerate(six))
+        result.append(jax.jvp(function, (six,), (tangents,))[1])
+    return result
+
+
+def _autodiff_moduli(law: Any, E: Matrix) -> list[list]:
+    six = six_of(E)
+    return [
+        _slopes(lambda six, a=a: _slopes(lambda six: law.green_energy(symmetric(six)), six)[a], six) for a in range(6)
+    ]

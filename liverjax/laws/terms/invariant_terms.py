@@ -1,0 +1,249 @@
+"""The hand-derived terms of one deformation gradient: stress, tangent and the blocks of the stiffness.
+
+Chapter, section 4.1.2, contracted: with J as one more invariant and v_a,i = dI_a/dx_i,
+
+    d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
+
+No matrix is inverted. `law` is anything with `measures` and `energy_derivatives` (see `liverjax.laws.base`).
+Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from liverjax.laws.terms import green_terms, stretch_terms
+from liverjax.tensors.material_axes import anisotropic, half_contracted, pushed
+from liverjax.tensors.matrices import (
+    Matrix,
+    Vector,
+    add,
+    add_matrices,
+    cofactor,
+    cross,
+    dot,
+    matmul,
+    matvec,
+    outer,
+    right_cauchy_green,
+    scale,
+    scale_matrix,
+    stored,
+    transpose,
+)
+from liverjax.tensors.principal import principal
+
+
+class Stress(NamedTuple):
+    """P = F S + p cof F, arrays of shape (E,): `S` a symmetric matrix or, where it is spherical, one array; p = W_J."""
+
+    S: Matrix | Any
+    p: Any
+
+
+class State(NamedTuple):
+    """What force and stiffness share at one deformation gradient."""
+
+    law: Any
+    F: Matrix
+    C: Matrix | None
+    cof: Matrix
+    I1: Any
+    J: Any
+    first: dict
+    second: dict
+    fibres: dict  # invariant I4 of a summand -> its fibre direction
+    frame: Any  # principal stretches and axes, where a summand has an energy of stretches
+
+
+def summands(law: Any) -> tuple:
+    """The laws of a sum, or the law alone."""
+    return getattr(law, "laws", (law,))
+
+
+def state(law: Any, F: Matrix) -> State:
+    """Scalar derivatives of the law at F; C only where I2 needs it."""
+    first, second = law.energy_derivatives(law.measures(F))
+    cof = cofactor(F)
+    C = right_cauchy_green(F) if "I2" in first else None
+    I1 = None if C is None else C[0][0] + C[1][1] + C[2][2]
+    fibres = {key: green_terms.components(part.fibre, F[0][0]) for key, part in fibre_invariants(law).items()}
+    frame = principal(F) if any(hasattr(part, "stretch_energy") for part in summands(law)) else None
+    return State(law, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres, frame)
+
+
+def fibre_invariants(law: Any) -> dict[str, Any]:
+    """Names of the invariants a . C a of a law: each summand has its own fibre."""
+    parts = summands(law)
+    if len(parts) == 1:
+        return {"I4": parts[0]} if "I4" in parts[0].invariants else {}
+    return {f"I4.{k}": part for k, part in enumerate(parts) if "I4" in part.invariants}
+
+
+def stress(s: State) -> Stress:
+    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; absent derivatives leave no term."""
+    W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
+    tensors = [scale_matrix(2 * s.first[key], outer(a, a)) for key, a in s.fibres.items()]
+    tensors += [stretch_terms.stress(part, s.F, s.frame) for part in summands(s.law) if hasattr(part, "stretch_energy")]
+    tensors += [green_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "green_energy")]
+    if W2 is not None:
+        diagonal = 2 * (W1 + s.I1 * W2)
+        assert s.C is not None
+        C = scale_matrix(-2 * W2, s.C)
+        tensors.append(tuple(tuple(C[i][j] + (diagonal if i == j else 0.0) for j in range(3)) for i in range(3)))
+    if not tensors:
+        return Stress(2 * W1, p)
+    S = tensors[0]
+    for other in tensors[1:]:
+        S = add_matrices(S, other)
+    if W2 is None and "I1" in s.first:
+        S = tuple(tuple(S[i][j] + (2 * W1 if i == j else 0.0) for j in range(3)) for i in range(3))
+    return Stress(S, p)
+
+
+def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
+    """P = F S + p cof F."""
+    S, p = resultant
+    FS = matmul(F, S) if isinstance(S, tuple) else scale_matrix(S, F)
+    return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
+
+
+#: |J| of the flattest element that a second Piola-Kirchhoff stress is computed of.
+_FLAT = 1e-3
+
+
+def second_piola(F: Matrix, resultant: Stress) -> Matrix:
+    """S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
+
+    Section 4.2 needs F^-1 here, so it is not defined at J = 0: an element flatter than |J| = 1e-3 counts as that flat.
+    """
+    S, p = resultant
+    cof = cofactor(F)
+    columns = transpose(cof)
+    J = dot(F[0], cof[0])
+    p_over_J = p / jnp.where(abs(J) < _FLAT, jnp.copysign(_FLAT, J), J)
+
+    def entry(i: int, j: int) -> Any:
+        s = S[i][j] if isinstance(S, tuple) else (S if i == j else 0.0)
+        return s + p_over_J * dot(columns[i], columns[j])
+
+    return tuple(tuple(entry(min(i, j), max(i, j)) for j in range(3)) for i in range(3))
+
+
+def first_piola(law: Any, F: Matrix) -> Matrix:
+    """First Piola-Kirchhoff stress [Pa] of a tuple matrix F."""
+    s = state(law, F)
+    return piola(F, s.cof, stress(s))
+
+
+def slopes(s: State, D: Vector) -> dict[str, Vector]:
+    """dJ/dx of a node with shape vector D, and half of the slopes of I1, I2 and I4: F D, F (I1 Id - C) D, (a.D) F a."""
+    FD = matvec(s.F, D)
+    v = {"I1": FD, **{key: scale(dot(a, D), matvec(s.F, a)) for key, a in s.fibres.items()}}
+    if "J" in s.first:
+        v["J"] = matvec(s.cof, D)
+    if s.C is not None:
+        v["I2"] = add(scale(s.I1, FD), scale(-1.0, matvec(s.F, matvec(s.C, D))))
+    return v
+
+
+def _weight(invariant: str) -> float:
+    return 1.0 if invariant == "J" else 2.0
+
+
+class _Parts(NamedTuple):
+    """What the blocks are put together from."""
+
+    J: Any
+    first: dict
+    second: dict
+    slopes: list[dict]  # of every node
+    diagonal: dict  # (i, j) -> D_i . S D_j
+    turning: dict  # (i, j) -> W_J F (D_i x D_j), where it is not 0
+    metric: dict  # (i, j) -> D_i . D_j, where I2 needs it
+    left: Matrix | None  # F F^T, there
+
+
+def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Parts:
+    """Written to memory: without that XLA:CPU computes most of it again in every entry (a fifth of the time more)."""
+    S, p = stress(s)
+    metric = {(i, j): dot(D[i], D[j]) for i, j in pairs}
+    tensor = isinstance(S, tuple)
+    diagonal = {(i, j): dot(D[i], matvec(S, D[j])) if tensor else S * metric[i, j] for i, j in pairs}
+    turning = {(i, j): scale(p, matvec(s.F, cross(D[i], D[j]))) for i, j in pairs if i != j and "J" in s.first}
+    left = right_cauchy_green(transpose(s.F)) if "I2" in s.first else None
+    v = [slopes(s, d) for d in D]
+    return stored(_Parts(s.J, s.first, s.second, v, diagonal, turning, metric if left else {}, left))
+
+
+def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
+    """The block of two nodes, without stretches and Green's strain."""
+    vi, vj = s.slopes[pair[0]], s.slopes[pair[1]]
+    second = dict(s.second)
+    W_JJ = second.pop(("J", "J"), None) if regularised else None
+    # v_a,i (x) sum_b W_ab v_b,j: one outer product an invariant.
+    partner: dict[str, Vector] = {}
+    for (a, b), W in second.items():
+        for row, column in dict.fromkeys(((a, b), (b, a))):
+            term = scale(W * (_weight(row) * _weight(column)), vj[column])
+            partner[row] = add(partner[row], term) if row in partner else term
+    W2 = s.first.get("I2")
+    if W2 is not None:  # W_2 d2I2 = 2 W_2 (… + 2 FDi (x) FDj - FDj (x) FDi - (Di.Dj) F F^T)
+        term = scale(4 * W2, vj["I1"])
+        partner["I1"] = add(partner["I1"], term) if "I1" in partner else term
+    K = [[sum((vi[a][r] * q[c] for a, q in partner.items()), 0.0) for c in range(3)] for r in range(3)]
+    if W2 is not None and s.left is not None:
+        swapped, metric = scale(-2 * W2, vj["I1"]), -2 * W2 * s.metric[pair]
+        for r in range(3):
+            for c in range(3):
+                K[r][c] = K[r][c] + swapped[r] * vi["I1"][c] + metric * s.left[r][c]
+    # W_1 d2I1 and the first part of W_2 d2I2 together: D_i . S D_j Id.
+    diagonal = s.diagonal[pair]
+    if W_JJ is not None:
+        eps = jnp.clip(1 - s.J, 0, 1)
+        diagonal = diagonal + W_JJ * eps / 3 * dot(vi["J"], vj["J"])
+        for r in range(3):
+            for c in range(3):
+                K[r][c] = K[r][c] + W_JJ * (1 - eps) * vi["J"][r] * vj["J"][c]
+    for r in range(3):
+        K[r][r] = K[r][r] + diagonal
+    if pair in s.turning:  # W_J d2J = -W_J [F (D_i x D_j)]_x
+        n = s.turning[pair]
+        for r, c, q in ((0, 1, n[2]), (2, 0, n[1]), (1, 2, n[0])):
+            K[r][c], K[c][r] = K[r][c] + q, K[c][r] - q
+    return tuple(tuple(row) for row in K)
+
+
+def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regularised: bool = False) -> list[Matrix]:
+    """d2W/dx_i dx_j per reference volume: the chapter's G, H, I, Lambda, M and R of all terms at once.
+
+    Args:
+        s: `state` of the element.
+        D: shape vectors of its nodes [1/m].
+        pairs: which blocks, as indices (i, j) into D.
+        regularised: replace G as in section 4.1.2 iii, with eps/3 where the chapter prints eps (the trace is kept).
+    """
+    if s.frame is not None:
+        s = s._replace(frame=stored(s.frame))
+    parts = _parts(s, D, pairs)
+    result = [_block(parts, pair, regularised) for pair in pairs]
+    for part in summands(s.law):
+        if hasattr(part, "stretch_energy"):
+            C = stored(stretch_terms.moduli(part, s.F, s.frame))
+            half = stored([half_contracted(C, d) for d in D])
+            more = [pushed(s.F, anisotropic(half[j], D[i])) for i, j in pairs]
+            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+        if hasattr(part, "green_energy"):
+            more = green_terms.blocks(part, s.F, D, pairs)
+            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+    return result
+
+
+_UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def tangent(law: Any, F: Matrix, regularised: bool = False) -> list[list[Matrix]]:
+    """d2W/dF dF [Pa] as nested [J][L] of matrices (i, k): the blocks of shape vectors e_J and e_L."""
+    pairs = tuple((J, L) for J in range(3) for L in range(3))
+    A = blocks(state(law, F), list(_UNIT_VECTORS), pairs, regularised)
+    return [A[3 * J : 3 * J + 3] for J in range(3)]

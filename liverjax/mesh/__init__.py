@@ -1,0 +1,1 @@
+"""Meshes of tetrahedra: geometry, files, shapes, neighbours of nodes."""

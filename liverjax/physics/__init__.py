@@ -1,0 +1,1 @@
+"""One file a physics: viscosity, porosity, averaged volumes, supports, loads and prescribed motion."""

@@ -1,0 +1,193 @@
+"""Prony viscohyperelasticity (chapter, section 4.2): S_v = S_h - sum_k gamma_k, one symmetric tensor of memory a mode.
+
+Both recursions have the form gamma^n = a S^n + c S^(n-1) + b gamma^(n-1):
+
+* ``"exponential"``: exact for a stress linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
+  c = g (q - e), b = e. Second order in dt.
+* ``"chapter"``: backward Euler as printed, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). First order in dt.
+
+The memory advances once an accepted step; inside a step `recall` is a constant.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core import bounds
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law, isochoric_part, volumetric_part
+from liverjax.laws.terms import invariant_terms
+from liverjax.tensors.material_axes import SIX, symmetric
+from liverjax.tensors.matrices import Matrix, Vector, add_matrices, dot, matmul, matvec, scale_matrix
+
+SCHEMES = ("exponential", "chapter")
+PARTS = ("all", "isochoric")
+
+
+@struct
+class Prony:
+    """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the instantaneous law relaxes to 1 - sum g_k of its stress."""
+
+    ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,)", lower=0.0, upper=1.0)
+    relaxation_times: Any = param("s", "tau_k (N,)", above=0.0)
+    part: str = static(
+        default="all", about="all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)"
+    )
+    scheme: str = static(default="exponential", about="exponential or chapter")
+
+
+class History(NamedTuple):
+    """Memory of every element at the end of a step."""
+
+    gamma: jax.Array  # (N, 6, E) [Pa]
+    stress: jax.Array | None  # S^n (6, E) [Pa]; the chapter's scheme does not need it
+
+
+class Recall(NamedTuple):
+    """What the memory contributes to a step, constant during its Newton iterations."""
+
+    past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
+    now: Any  # 1 - sum_k a_k
+
+
+def check(prony: Prony, law: Law) -> None:
+    """Refuse a viscosity that no step can use; host side.
+
+    Raises:
+        InputError: unknown scheme or part, lengths that differ, values out of bounds, ratios adding up to 1 or more,
+            isochoric relaxation of a law without isochoric split.
+    """
+    import numpy as np
+
+    bounds.check(prony, "viscosity")
+    g, tau = np.atleast_1d(np.asarray(prony.ratios, float)), np.atleast_1d(np.asarray(prony.relaxation_times, float))
+    if prony.scheme not in SCHEMES:
+        raise InputError(f"viscosity scheme = {prony.scheme!r} is not known: use one of {', '.join(SCHEMES)}")
+    if prony.part not in PARTS:
+        raise InputError(f"viscosity part = {prony.part!r} is not known: use one of {', '.join(PARTS)}")
+    if g.shape != tau.shape:
+        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one of each a mode")
+    if not g.sum() < 1:
+        raise InputError(f"viscosity.ratios = {g.tolist()} must add up to less than 1: lower them")
+    if prony.part == "isochoric" and isochoric_part(law) is None:
+        raise InputError(
+            f"viscosity part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
+            "use part = 'all' or a law with bulk"
+        )
+
+
+def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """a, b, c (N,) of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s]."""
+    g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
+    r = dt / tau
+    if prony.scheme == "chapter":
+        return g * r / (1 + r), 1 / (1 + r), jnp.zeros_like(g)
+    one_minus_q, q_minus_e = _weights(r)
+    return g * one_minus_q, jnp.exp(-r), g * q_minus_e
+
+
+def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """1 - q and q - e without cancellation; below r = 1 by the Taylor series of 1 - q (truncated at 1/20!)."""
+    small, large = jnp.minimum(r, 1.0), jnp.maximum(r, 1.0)
+    series = jnp.zeros_like(r)
+    for k in range(18, 0, -1):
+        series = small / (k + 1) * (1 - series)
+    q = -jnp.expm1(-large) / large
+    one_minus_q = jnp.where(r < 1, series, 1 - q)
+    return one_minus_q, jnp.where(r < 1, -jnp.expm1(-small) - series, q - jnp.exp(-large))
+
+
+def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array:
+    """gamma_k / S_h at angular frequency omega [rad/s] on the steady cycle, complex, shape (N, ...).
+
+    With `dt` [s] that of the recursion (the discrete formula, exact for it), without that of continuous time,
+    g/(1 + i omega tau). The modulus is G*/G0 = 1 - sum over modes.
+    """
+    omega = jnp.asarray(omega)[None]
+    column = (-1,) + (1,) * (omega.ndim - 1)
+    g, tau = (jnp.reshape(jnp.asarray(v), column) for v in (prony.ratios, prony.relaxation_times))
+    if dt is None:
+        return g / (1 + 1j * omega * tau)
+    dt = jnp.broadcast_to(dt, omega.shape[1:])[None]
+    a, b, c = coefficients(Prony(ratios=g, relaxation_times=tau, scheme=prony.scheme), dt)
+    back = jnp.exp(-1j * omega * dt)
+    return (a + c * back) / (1 - b * back)
+
+
+def initial_history(prony: Prony, number_of_elements: int, dtype: Any = float) -> History:
+    """Memory of a body at rest: zero."""
+    modes = jnp.asarray(prony.ratios).shape[0]
+    gamma = jnp.zeros((modes, 6, number_of_elements), dtype)
+    return History(gamma, None if prony.scheme == "chapter" else jnp.zeros((6, number_of_elements), dtype))
+
+
+def recall(prony: Prony, history: History, dt: Any) -> Recall:
+    """The constant part of the next step's stress, from the memory at its beginning."""
+    a, b, c = coefficients(prony, dt)
+    past: Any = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
+    if history.stress is not None:
+        past = past + jnp.sum(c) * history.stress
+    return Recall(symmetric(tuple(past)), 1 - jnp.sum(a))
+
+
+def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> History:
+    """Memory at the end of an accepted step with deformation gradient F."""
+    a, b, c = coefficients(prony, dt)
+    S = relaxing_stress(prony, law, F)
+    columns = (slice(None), None, None)
+    gamma = a[columns] * S[None] + b[columns] * history.gamma
+    if history.stress is None:
+        return History(gamma, None)
+    return History(gamma + c[columns] * history.stress[None], S)
+
+
+def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:
+    """The second Piola-Kirchhoff stress that relaxes, (6, E) [Pa]: S_h, or its isochoric part."""
+    s = invariant_terms.state(relaxing(prony, law), F)
+    S = invariant_terms.second_piola(F, invariant_terms.stress(s))
+    return jnp.stack([S[i][j] for i, j in SIX])
+
+
+def first_piola(prony: Prony, memory: Recall, law: Law, F: Matrix) -> Matrix:
+    """P_v = (1 - sum a) P_h - F past (part "all"), or with the volumetric stress added in full ("isochoric")."""
+    P = invariant_terms.first_piola(relaxing(prony, law), F)
+    remembered = matmul(F, memory.past)
+    P = tuple(tuple(memory.now * P[i][j] - remembered[i][j] for j in range(3)) for i in range(3))
+    rest = volumetric_part(law) if prony.part == "isochoric" else None
+    if rest is None:
+        return P
+    U = invariant_terms.first_piola(rest, F)
+    return tuple(tuple(P[i][j] + U[i][j] for j in range(3)) for i in range(3))
+
+
+def blocks(
+    prony: Prony, memory: Recall, law: Law, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+) -> list[Matrix]:
+    """Derivative of `first_piola`, as `invariant_terms.blocks`: (1 - sum a) K_h - (D_i . past D_j) Id, per volume."""
+    K = invariant_terms.blocks(invariant_terms.state(relaxing(prony, law), F), D, pairs)
+    K = [scale_matrix(memory.now, block) for block in K]
+    result = []
+    for (i, j), block in zip(pairs, K, strict=True):
+        metric = dot(D[i], matvec(memory.past, D[j]))
+        result.append(tuple(tuple(block[r][c] - (metric if r == c else 0.0) for c in range(3)) for r in range(3)))
+    rest = volumetric_part(law) if prony.part == "isochoric" else None
+    if rest is None:
+        return result
+    return [
+        add_matrices(a, b)
+        for a, b in zip(result, invariant_terms.blocks(invariant_terms.state(rest, F), D, pairs), strict=True)
+    ]
+
+
+def summands(prony: Prony, memory: Recall, law: Law) -> tuple[list[tuple[Any, Law]], Matrix]:
+    """Laws with weights and a constant second Piola-Kirchhoff stress that `first_piola` is the sum of."""
+    rest = volumetric_part(law) if prony.part == "isochoric" else None
+    parts = [(memory.now, relaxing(prony, law))]
+    return parts if rest is None else [*parts, (1.0, rest)], scale_matrix(-1.0, memory.past)
+
+
+def relaxing(prony: Prony, law: Law) -> Law:
+    """What relaxes of a law: all of it, or its isochoric part."""
+    return law if prony.part == "all" else isochoric_part(law)

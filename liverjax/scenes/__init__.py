@@ -1,0 +1,1 @@
+"""A scene: what it is made of, read from a file, checked."""

@@ -1,0 +1,127 @@
+"""A scene: a mesh, a law, the physics it has and no other, and what holds, moves and loads it."""
+
+import dataclasses
+import difflib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax import laws
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, static, struct
+from liverjax.laws import Law
+from liverjax.mesh.tetrahedra import TetMesh, with_points
+from liverjax.physics import porosity
+from liverjax.physics.boundary import Displaced, Fixed, Traction
+from liverjax.physics.porosity import Porosity
+from liverjax.physics.viscosity import Prony
+from liverjax.scenes.regions import Region
+
+
+@struct
+class Body:
+    """Mass and weight: a node has its density times a quarter of every element around it."""
+
+    density: Any = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0, typical=1060.0)
+    gravity: Any = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
+
+
+@struct
+class Solve:
+    """How the scene is solved; all but the time step and the tolerance is static."""
+
+    dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
+    kind: str = static(default="static", about="static: no inertia; dynamic")
+    steps: int = static(default=1, about="load steps, or time steps of dt", lower=1)
+    tolerance: Any = param("1", "of the residual, relative to the forces at work", above=0.0, default=1e-8)
+    newton: str = static(
+        default="converged",
+        about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "
+        "solve a step (not for derivatives)",
+    )
+    newton_iterations: int = static(default=25, about="the most of a step; 1 means newton = one_step", lower=1)
+    integrator: str = static(
+        default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
+    )
+    precision: str = static(default="float64", about="float64 or float32")
+    linear_solver: str = static(
+        default="auto", about="cg; direct: factorised on the host; auto: by size and stiffness (`choice`)"
+    )
+    volumetric: str = static(
+        default="element", about="element, or nodal: volume changes averaged at nodes, against locking"
+    )
+    robust: str = static(
+        default="off", about="projected or regularised: make the energy least where a step cannot be followed"
+    )
+
+
+@struct
+class Scene:
+    """What `simulate` runs; parts that a scene lacks are None or empty and cost nothing."""
+
+    mesh: TetMesh = param("1", "the body")
+    law: Law = param("1", "its hyperelastic law")
+    region: tuple[Region, ...] = param("1", "parts of the body with other numbers in the law", default=())
+    viscosity: Prony | None = param("1", "Prony series", default=None)
+    porosity: Porosity | None = param("1", "sponge and fluid", default=None)
+    body: Body | None = param("1", "density and gravity", default=None)
+    fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
+    displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
+    traction: tuple[Traction, ...] = param("1", "loads", default=())
+    solve: Solve = param("1", "how", default=Solve())
+
+
+def element_law(scene: Scene) -> Law:
+    """The law that acts element by element: without its volumetric energy where a sponge or the nodes have that."""
+    if scene.solve.volumetric == "nodal":
+        return laws.isochoric_part(scene.law)
+    return porosity.law_in_force(scene.porosity, scene.law)
+
+
+def with_parameters(scene: Scene, values: dict[str, Any]) -> Scene:
+    """The scene with numbers changed; values may be traced.
+
+    Args:
+        scene: `Scene`.
+        values: dotted names as in the scene file -> values: ``law.mu`` (``law.1.mu`` of several laws),
+            ``viscosity.relaxation_times``, ``viscosity.ratios.0``, ``body.density``, ``displaced.0.by``, ``solve.dt``,
+            ``mesh.points``, ``region.0.law.mu``; a number of a law may be one an element (E,).
+
+    Raises:
+        InputError: a name that the scene does not have.
+    """
+    for name, value in values.items():
+        scene = _with(scene, name.split("."), value, name)
+    return scene
+
+
+def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
+    if not path:
+        if isinstance(thing, tuple):
+            return tuple(value)
+        return jnp.array(value, float) if isinstance(thing, jax.Array) else value
+    key, rest = path[0], path[1:]
+    if isinstance(thing, dict) and ".".join(path) in thing:
+        return thing | {".".join(path): value}
+    if isinstance(thing, TetMesh) and path == ["points"]:
+        return with_points(thing, value)
+    if isinstance(thing, laws.Continued):
+        return replace(thing, law=_with(thing.law, path, value, name))
+    if isinstance(thing, laws.Sum) and key.isdigit():
+        return replace(thing, laws=_with(thing.laws, path, value, name))
+    if isinstance(thing, tuple) and key.isdigit() and int(key) < len(thing):
+        k = int(key)
+        return (*thing[:k], _with(thing[k], rest, value, name), *thing[k + 1 :])
+    if key.isdigit() and hasattr(thing, "shape") and thing.ndim and int(key) < thing.shape[0] and not rest:
+        return thing.at[int(key)].set(value)
+    if dataclasses.is_dataclass(thing):
+        known = {f.name: f for f in dataclasses.fields(thing)}
+        if key in known and not known[key].metadata.get("static") and getattr(thing, key) is not None:
+            return replace(thing, **{key: _with(getattr(thing, key), rest, value, name)})
+        offered = [n for n, f in known.items() if not f.metadata.get("static") and getattr(thing, n) is not None]
+        near = difflib.get_close_matches(key, offered, n=1, cutoff=0.0)
+        raise InputError(
+            f"parameter {name!r}: the scene has no {key!r} there: did you mean {near[0] if near else '?'}?"
+        )
+    raise InputError(f"parameter {name!r}: {key!r} leads nowhere: use the names of the scene file")

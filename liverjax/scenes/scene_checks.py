@@ -1,0 +1,167 @@
+"""What is refused of a scene, in one sentence each, before anything is compiled."""
+
+import warnings
+
+import numpy as np
+
+from liverjax import laws
+from liverjax.core import bounds
+from liverjax.core.errors import InputError
+from liverjax.mesh.tetrahedra import check_mesh
+from liverjax.physics import boundary, porosity, viscosity
+from liverjax.scenes import regions
+from liverjax.scenes.scene import Body, Scene
+
+#: What the choices of [solve] may be.
+CHOICES = {
+    "kind": ("static", "dynamic"),
+    "newton": ("converged", "one_step"),
+    "integrator": ("euler", "newmark"),
+    "precision": ("float64", "float32"),
+    "linear_solver": ("auto", "cg", "direct"),
+    "volumetric": ("element", "nodal"),
+    "robust": ("off", "projected", "regularised"),
+}
+
+
+def check_choices(scene: Scene) -> None:
+    """Refuse choices that mean nothing; looks at no numbers, so that a traced scene passes as well.
+
+    Raises:
+        InputError: unknown choices; a load or motion given twice, not at all, of wrong shape.
+    """
+    for key, allowed in CHOICES.items():
+        value = getattr(scene.solve, key)
+        if value not in allowed:
+            raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
+    if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
+        raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
+    if scene.solve.volumetric == "nodal":
+        _nodal(scene)
+    if scene.solve.robust != "off" and any(load.pressure is not None for load in scene.traction):
+        raise InputError("[solve] robust needs forces with an energy: leave it out where a pressure follows the body")
+    for k, load in enumerate(scene.traction):
+        if (load.value is None) == (load.pressure is None):
+            raise InputError(f"traction.{k} needs either value (3,) or pressure, in Pa: give one of them")
+        name, shape = ("pressure", ()) if load.value is None else ("value", (3,))
+        if np.shape(getattr(load, name)) != shape:
+            raise InputError(f"traction.{k} {name} has shape {np.shape(getattr(load, name))}: give shape {shape}")
+    if scene.body is not None:
+        _body(scene.body, scene.mesh.number_of_nodes)
+    for k, motion in enumerate(scene.displaced):
+        if (motion.by is None) == (motion.history is None):
+            raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
+
+
+def _body(body: Body, nodes: int) -> None:
+    density, gravity = np.shape(body.density), np.shape(body.gravity)
+    if density not in ((), (nodes,)):
+        raise InputError(f"body density has shape {density}: give one number, or one a node ({nodes},), in kg/m^3")
+    if gravity != (3,):
+        raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")
+
+
+def _nodal(scene: Scene) -> None:
+    name = "[solve] volumetric = 'nodal'"
+    if scene.porosity is not None:
+        raise InputError(f"{name} averages a law's own volumetric energy, a sponge has another: use 'element'")
+    if laws.isochoric_part(scene.law) is None or laws.volumetric_part(scene.law) is None:
+        raise InputError(f"{name} needs a law with bulk apart from its shear, {type(scene.law).__name__} is none")
+    if scene.viscosity is not None and scene.viscosity.part != "isochoric":
+        raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
+
+
+def check_bounds(scene: Scene) -> None:
+    """Refuse numbers out of bounds, but for those of the mesh (`check_mesh`); traced ones pass. Compiles nothing.
+
+    Raises:
+        InputError: one sentence with the number's dotted name, value, bound and remedy.
+    """
+    bounds.check(scene, leave=("mesh",))
+    regions.check_numbers(scene.law, scene.region)
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse a scene that cannot be simulated; host side, before any compile.
+
+    Raises:
+        InputError: an unusable mesh or viscosity, missing time step or mass, contradicting conditions, a loose body.
+    """
+    check_choices(scene)
+    check_bounds(scene)
+    check_mesh(scene.mesh)
+    for part in laws.summands(scene.law):
+        if hasattr(part, "check"):
+            part.check()
+    regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
+    if scene.viscosity is not None:
+        viscosity.check(scene.viscosity, scene.law)
+    if scene.porosity is not None:
+        porosity.check(scene.porosity)
+    solve = scene.solve
+    histories = any(d.history is not None for d in scene.displaced)
+    if solve.dt is None:
+        for present, what in (
+            (scene.viscosity is not None, "viscosity"),
+            (scene.porosity is not None, "porosity"),
+            (histories, "a history"),
+        ):
+            if present:
+                raise InputError(f"[solve] has no dt, which {what} needs: give the time step in seconds")
+        if solve.kind == "dynamic":
+            raise InputError("[solve] kind = 'dynamic' needs dt: give the time step in seconds")
+    if solve.kind == "dynamic" and scene.body is None:
+        raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
+    _no_contradiction(scene)
+    if not np.any(np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, ()))):
+        warnings.warn(
+            "fixed holds every node along every axis, so nothing can move: a place like where = {z_min = 0} takes all "
+            "nodes at and above it, {z_max = 0} those at and below",
+            stacklevel=2,
+        )
+    if solve.kind == "static":
+        _held(scene)
+
+
+def _no_contradiction(scene: Scene) -> None:
+    taken: dict[tuple[int, str], str] = {}
+    for kind in ("fixed", "displaced"):
+        for k, condition in enumerate(getattr(scene, kind)):
+            for axis in condition.axes:
+                for node in np.asarray(condition.nodes).tolist():
+                    other = taken.setdefault((node, axis), f"{kind}.{k}")
+                    if other != f"{kind}.{k}" and "displaced" in (kind, other.partition(".")[0]):
+                        raise InputError(
+                            f"{other} and {kind}.{k} both prescribe node {node} along {axis}: make their places differ"
+                        )
+
+
+def _held(scene: Scene) -> None:
+    """Every connected piece needs something that holds it, else a static solution does not exist."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tets, n = np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_nodes
+    rows, columns = np.repeat(tets, 4, axis=1).ravel(), np.tile(tets, (1, 4)).ravel()
+    pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
+    mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
+    for piece in range(pieces):
+        nodes = np.flatnonzero(label == piece)
+        held = [(node, axis) for node, axis in np.argwhere(mask[nodes] == 0)]
+        points = np.asarray(scene.mesh.points)[nodes]
+        if _rigid_rank(points - points.mean(axis=0), held) < 6:
+            which = f"piece {piece} ({len(nodes)} nodes)" if pieces > 1 else "the body"
+            raise InputError(f"nothing holds {which} against every rigid motion: add [[fixed]] or kind = 'dynamic'")
+
+
+def _rigid_rank(points: np.ndarray, held: list) -> int:
+    """Rank of the six rigid motions as seen by the held degrees of freedom."""
+    if not held:
+        return 0
+    size = max(np.abs(points).max(), 1e-300)
+    motions = []
+    for node, axis in held:
+        x = points[node] / size
+        turns = [np.cross(e, x)[axis] for e in np.eye(3)]
+        motions.append([*np.eye(3)[axis], *turns])
+    return int(np.linalg.matrix_rank(np.array(motions), tol=1e-6))

@@ -1,0 +1,325 @@
+"""Scenes from TOML files; every key is known, every number checked."""
+
+import copy
+import dataclasses
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax import laws
+from liverjax.core import bounds
+from liverjax.core.errors import InputError
+from liverjax.laws import Law
+from liverjax.mesh import shapes
+from liverjax.mesh.tetrahedra import UNITS, TetMesh, read_mesh
+from liverjax.physics import boundary, porosity, viscosity
+from liverjax.physics.boundary import Displaced, Fixed, Traction
+from liverjax.physics.porosity import Porosity
+from liverjax.physics.viscosity import Prony
+from liverjax.scenes import regions
+from liverjax.scenes.regions import Region
+from liverjax.scenes.scene import Body, Scene, Solve
+from liverjax.scenes.scene_checks import CHOICES, check_scene
+
+_KEYS = {
+    "mesh": ("file", "unit", "shape", "size", "cells", "radius", "height", "cell_size"),
+    "region": ("where", "set", "law"),
+    "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
+    "porosity": ("bulk", "limit_bulk", "fluid_fraction", "permeability", "drained", "scheme", "keep_bulk"),
+    "body": ("density", "gravity"),
+    "fixed": ("where", "set", "axes"),
+    "displaced": ("where", "set", "axes", "by", "history"),
+    "traction": ("where", "set", "value", "pressure"),
+    "solve": tuple(f.name for f in dataclasses.fields(Solve)),
+}
+_SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
+
+
+def load_scene(path: str | Path) -> Scene:
+    """A scene from a TOML file; relative paths in it are relative to it.
+
+    Raises:
+        InputError: unreadable file, unknown or missing keys, values that cannot be used, checked before any compile.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except IsADirectoryError:
+        raise InputError(f"{path} is a folder: give a scene file (TOML)") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): give a scene file (TOML)") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text: give a scene file (TOML)") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is not TOML ({error}): mend that line") from None
+    try:
+        return scene_from(content, path.parent)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
+    """A scene from the content of a scene file as nested dictionaries."""
+    _known("scene", content, _SECTIONS)
+    for name in ("mesh", "law"):
+        if name not in content:
+            raise InputError(f"the scene has no [{name}]: add it")
+    mesh = _mesh(_table("mesh", content["mesh"]), folder)
+    prony = _section(content, "viscosity", _prony)
+    scene = Scene(
+        mesh=mesh,
+        law=_law(content["law"]),
+        region=tuple(_region(mesh, k, t) for k, t in enumerate(_tables(content, "region"))),
+        viscosity=prony,
+        porosity=_section(content, "porosity", lambda table: _porosity(mesh, table)),
+        body=_section(content, "body", _body),
+        fixed=tuple(_fixed(mesh, k, t) for k, t in enumerate(_tables(content, "fixed"))),
+        displaced=tuple(_displaced(mesh, k, t, folder) for k, t in enumerate(_tables(content, "displaced"))),
+        traction=tuple(_traction(mesh, k, t) for k, t in enumerate(_tables(content, "traction"))),
+        solve=_solve(_table("solve", content.get("solve", {}))),
+    )
+    check_scene(scene)
+    return scene
+
+
+def _known(name: str, table: dict, keys: tuple) -> None:
+    for key in table:
+        if key not in keys:
+            near = difflib.get_close_matches(key, keys, n=1, cutoff=0.0)[0]
+            raise InputError(f"{name} has an unknown key {key!r}: did you mean {near}?")
+
+
+def _table(name: str, value: Any) -> dict:
+    if not isinstance(value, dict):
+        raise InputError(f"{name} must be a table: write [{name}] and its keys below")
+    if name in _KEYS:
+        _known(f"[{name}]", value, _KEYS[name])
+    return value
+
+
+def _tables(content: dict, name: str) -> list[dict]:
+    value = content.get(name, [])
+    return [_table(name, t) for t in (value if isinstance(value, list) else [value])]
+
+
+def _section(content: dict, name: str, make: Any) -> Any:
+    return make(_table(name, content[name])) if name in content else None
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise InputError(f"{name} = {value!r} is not a number: give one")
+    return float(value)
+
+
+def _numbers(name: str, value: Any, length: int | None = None) -> np.ndarray:
+    if not isinstance(value, list) or (length is not None and len(value) != length):
+        raise InputError(f"{name} = {value!r} must be a list of {length or 'some'} numbers: give one")
+    return np.array([_number(name, v) for v in value])
+
+
+def _mesh(table: dict, folder: Path) -> TetMesh:
+    unit = table.get("unit", "m")
+    if unit not in UNITS:
+        raise InputError(f"[mesh] unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
+    if ("file" in table) == ("shape" in table):
+        raise InputError('[mesh] needs either file = "liver.vtu" or shape = "box" (or "cylinder"): give one of them')
+    if "file" in table:
+        return read_mesh(folder / str(table["file"]), unit)
+    scale = UNITS[unit]
+    if table["shape"] == "box":
+        for key in ("size", "cells"):
+            if key not in table:
+                raise InputError(f"[mesh] shape = 'box' needs {key}: give three numbers")
+        return shapes.box(
+            list(scale * _numbers("[mesh] size", table["size"], 3)), list(_numbers("[mesh] cells", table["cells"], 3))
+        )
+    if table["shape"] == "cylinder":
+        for key in ("radius", "height", "cell_size"):
+            if key not in table:
+                raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
+        return shapes.cylinder(*(scale * _number(f"[mesh] {k}", table[k]) for k in ("radius", "height", "cell_size")))
+    raise InputError(f"[mesh] shape = {table['shape']!r} is not known: use box or cylinder, or give a file")
+
+
+def _law(value: Any) -> Law:
+    tables = value if isinstance(value, list) else [value]
+    made = []
+    for table in tables:
+        if not isinstance(table, dict) or "name" not in table:
+            raise InputError('[law] needs name = "…": python -m liverjax laws lists them')
+        law = laws.create(table["name"], **{k: v for k, v in table.items() if k not in ("name", "continued_below")})
+        made.append(laws.continued(law, table["continued_below"]) if "continued_below" in table else law)
+    return made[0] if len(made) == 1 else laws.Sum(laws=tuple(made))
+
+
+def _region(mesh: TetMesh, k: int, table: dict) -> Region:
+    name = f"region.{k}"
+    where, given = table.get("where"), table.get("law")
+    if where is not None and not isinstance(where, dict):
+        raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
+    if not isinstance(given, dict) or not given:
+        raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
+    elements = regions.select(mesh, where, table.get("set"), name)
+    return Region(elements=jnp.asarray(elements, jnp.int32), law=dict(_dotted(f"{name} law", given)))
+
+
+def _dotted(name: str, table: dict) -> list[tuple[str, float]]:
+    """Numbers of nested tables and lists, by dotted names."""
+    out = []
+    for key, value in table.items():
+        if isinstance(value, (dict, list)):
+            inner = value if isinstance(value, dict) else {str(k): v for k, v in enumerate(value)}
+            out += [(f"{key}.{rest}", v) for rest, v in _dotted(f"{name}.{key}", inner)]
+        else:
+            out.append((key, _number(f"{name}.{key}", value)))
+    return out
+
+
+def _prony(table: dict) -> Prony:
+    for key in ("ratios", "relaxation_times"):
+        if key not in table:
+            raise InputError(f"[viscosity] needs {key}: give a list of numbers, one a mode")
+    g, tau = (jnp.asarray(_numbers(f"[viscosity] {k}", table[k])) for k in ("ratios", "relaxation_times"))
+    return Prony(ratios=g, relaxation_times=tau, **{k: table[k] for k in ("part", "scheme") if k in table})
+
+
+def _porosity(mesh: Any, table: dict) -> Porosity:
+    values: dict[str, Any] = {}
+    for key in ("bulk", "limit_bulk", "fluid_fraction", "permeability"):
+        if key not in table:
+            raise InputError(f"[porosity] needs {key}: give a number")
+        values[key] = _number(f"[porosity] {key}", table[key])
+    if not isinstance(table.get("keep_bulk", False), bool):
+        raise InputError(f"[porosity] keep_bulk = {table['keep_bulk']!r} must be true or false: give one of them")
+    if "drained" in table:
+        values["drained"] = _drained(mesh, table["drained"])
+    values |= {k: table[k] for k in ("scheme", "keep_bulk") if k in table}
+    return Porosity(**values)
+
+
+def _drained(mesh: Any, given: Any) -> jax.Array:
+    """Nodes of one place, or of any place of a list."""
+    if given == []:
+        raise InputError("porosity.drained = [] names no place: give [{z_max = 0.0}], or leave it out (sealed)")
+    name = "porosity.drained"
+    places = {f"{name}.{k}": p for k, p in enumerate(given)} if isinstance(given, list) else {name: given}
+    nodes = []
+    for place, table in places.items():
+        by_set = isinstance(table, dict) and set(table) == {"set"}
+        nodes.append(_nodes(mesh, place, table if by_set else {"where": table}))
+    return jnp.asarray(np.unique(np.concatenate(nodes)))
+
+
+def _body(table: dict) -> Body:
+    if "density" not in table:
+        raise InputError("[body] needs density in kg/m^3: give e.g. density = 1060.0")
+    gravity = _numbers("[body] gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3)
+    return Body(density=_number("[body] density", table["density"]), gravity=jnp.asarray(gravity))
+
+
+def _nodes(mesh: TetMesh, name: str, table: dict) -> jax.Array:
+    where = table.get("where")
+    if where is not None and not isinstance(where, dict):
+        raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
+    return jnp.asarray(boundary.select(mesh, where, table.get("set"), f"{name} where"), jnp.int32)
+
+
+def _axes(name: str, table: dict) -> str:
+    axes = table.get("axes", "xyz")
+    if not isinstance(axes, str) or not axes or set(axes) - set("xyz") or len(set(axes)) != len(axes):
+        raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
+    return axes
+
+
+def _fixed(mesh: TetMesh, k: int, table: dict) -> Fixed:
+    name = f"fixed.{k}"
+    return Fixed(nodes=_nodes(mesh, name, table), axes=_axes(name, table))
+
+
+def _displaced(mesh: TetMesh, k: int, table: dict, folder: Path) -> Displaced:
+    name = f"displaced.{k}"
+    if ("by" in table) == ("history" in table):
+        raise InputError(f'{name} needs either by = [x, y, z] or history = "ramp.csv": give one of them')
+    nodes, axes = _nodes(mesh, name, table), _axes(name, table)
+    if "by" in table:
+        return Displaced(nodes=nodes, by=jnp.asarray(_numbers(f"{name} by", table["by"], 3)), axes=axes)
+    file = folder / str(table["history"])
+    try:
+        data = np.atleast_1d(np.genfromtxt(file, delimiter=",", names=True, comments="#"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{name} history {file} cannot be read ({error}): give columns time,x,y,z") from None
+    if not data.dtype.names or not {"time", "x", "y", "z"} <= set(data.dtype.names):
+        raise InputError(f"{name} history {file} has columns {data.dtype.names}: give time,x,y,z")
+    times, values = data["time"], np.stack([data[a] for a in "xyz"], axis=1)
+    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values)) and np.all(np.diff(times) > 0)):
+        raise InputError(f"{name} history {file} must hold finite numbers at increasing times: sort and fill it")
+    return Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(values), axes=axes)
+
+
+def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
+    name = f"traction.{k}"
+    if ("value" in table) == ("pressure" in table):
+        raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
+    triangles: Any = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
+    if len(triangles) == 0:
+        raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
+    triangles = jnp.asarray(triangles, jnp.int32)
+    if "pressure" in table:
+        return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]))
+    return Traction(triangles=triangles, value=jnp.asarray(_numbers(f"{name} value", table["value"], 3)))
+
+
+def _solve(table: dict) -> Solve:
+    values = dict(table)
+    for key, allowed in CHOICES.items():
+        if key in values and values[key] not in allowed:
+            raise InputError(f"[solve] {key} = {values[key]!r} is not known: use {' or '.join(allowed)}")
+    values |= {key: _number(f"[solve] {key}", values[key]) for key in ("dt", "tolerance") if key in values}
+    return Solve(**values)
+
+
+# -- checks and changes ------------------------------------------------------------------------------------------------
+
+
+def changed_content(content: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """The content of a scene file with values at dotted names."""
+    content = copy.deepcopy(content)
+    for name, value in values.items():
+        *path, last = [int(key) if key.isdigit() else key for key in name.split(".")]
+        table: Any = content if path[:1] != ["mesh"] else None  # the mesh is one for all
+        try:
+            for k, key in enumerate(path):
+                if k == 1 and isinstance(key, int) and isinstance(table, dict):
+                    continue  # [traction] for [[traction]]: one table stands for a list of one
+                table = table[key] if isinstance(key, int) else table.setdefault(key, {})
+            if path == ["law"] and isinstance(table, list) and len(table) == 1:
+                table = table[0]
+            table[last] = value
+        except (KeyError, IndexError, TypeError, AttributeError):
+            raise InputError(f"parameter {name!r} is no number of the scene file: name one that stands there") from None
+    return content
+
+
+def check_numbers(content: dict[str, Any]) -> None:
+    """Refuse numbers of a scene's content that are out of bounds; looks at no mesh.
+
+    Raises:
+        InputError: a parameter of law, viscosity, porosity, body or solve that cannot be used.
+    """
+    law = _law(content["law"])
+    prony = _section(content, "viscosity", _prony)
+    if prony is not None:
+        viscosity.check(prony, law)
+    if "porosity" in content:
+        sponge = {k: v for k, v in content["porosity"].items() if k != "drained"}
+        porosity.check(_porosity(None, sponge))
+    body = _section(content, "body", _body)
+    if body is not None:
+        bounds.check(body, "body")
+    bounds.check(_solve(_table("solve", content.get("solve", {}))), "solve")

@@ -1,0 +1,40 @@
+"""Which linear solver `linear_solver = "auto"` means: a rule on size and stiffness, measured in `experiments/`.
+
+Conjugate gradients; a factorisation for static bodies of at most 10,000 tetrahedra whose bulk modulus exceeds the shear
+modulus by more than a thousand, or whose worst element is a sliver, and where no pressure follows the body.
+"""
+
+import jax
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.scenes.scene import Scene
+
+LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
+
+
+def linear_solver(scene: Scene) -> str:
+    """cg or direct; where the numbers are traced, and so not known, cg."""
+    mesh, solve = scene.mesh, scene.solve
+    small = mesh.number_of_elements <= LARGEST
+    if solve.kind != "static" or not small or any(load.pressure is not None for load in scene.traction):
+        return "cg"
+    try:
+        shear = scene.law.shear_modulus()
+        bulk = scene.law.bulk_modulus() if scene.porosity is None else scene.porosity.limit_bulk
+    except InputError:  # a law need not state its moduli: how stiff it is in bulk is then not known
+        shear, bulk = 1.0, 0.0
+    numbers = (shear, bulk, mesh.points, mesh.volumes)
+    if any(isinstance(a, jax.core.Tracer) for a in numbers):
+        return "cg"
+    shear, bulk, points, volumes = (np.asarray(a, float) for a in numbers)
+    stiff = bool(np.any(bulk > STIFFEST * shear))
+    return "direct" if stiff or thinnest(points, np.asarray(mesh.tetrahedra), volumes) < THINNEST else "cg"
+
+
+def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:
+    """Least quality of an element: its volume over that of the regular one with the same mean square edge."""
+    corners = points[tetrahedra]
+    edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
+    length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))
+    return float(np.min(6 * np.sqrt(2) * np.abs(volumes) / length**3))

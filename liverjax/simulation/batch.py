@@ -1,0 +1,89 @@
+"""Many runs of one scene with other numbers: one compiled program, lanes spread over the devices of the process.
+
+On a CPU one lane after another per device (a vectorised step is slower: loops run to the slowest lane); on a GPU all
+lanes of a device at once.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.simulation.run import Result, simulate
+
+STRATEGIES = ("map", "vmap")
+
+
+@struct
+class Batch:
+    """Results of many lanes; `result.status` is (N, T), and a lane that failed spoils no other."""
+
+    result: Result = param("1", "every field with a leading axis of N lanes")
+    strategy: str = static(
+        default="map", about="map: one lane after another per device; vmap: all lanes of a device at once"
+    )
+    devices: int = static(default=1, about="lanes were spread over so many")
+
+
+def strategy_for(platform: str) -> str:
+    """What is fastest on a platform: map on cpu, vmap elsewhere."""
+    return "map" if platform == "cpu" else "vmap"
+
+
+def simulate_batch(
+    scene: Scene, parameters: dict[str, Any], strategy: str | None = None, devices: list | None = None
+) -> Batch:
+    """Run a scene for every lane of its parameters; may be jitted and differentiated.
+
+    Args:
+        scene: `Scene`.
+        parameters: dotted names, as of `with_parameters` -> values with a leading axis of N lanes.
+        strategy: "map" or "vmap"; None: by the platform.
+        devices: to spread the lanes over; None: all of the process.
+
+    Raises:
+        InputError: no parameters, different numbers of lanes, a name that the scene does not have.
+    """
+    devices = jax.local_devices() if devices is None else devices
+    strategy = strategy_for(devices[0].platform) if strategy is None else strategy
+    if strategy not in STRATEGIES:
+        raise InputError(f"strategy = {strategy!r} is not known: use {' or '.join(STRATEGIES)}")
+    parameters = {name: jnp.asarray(value, float) for name, value in parameters.items()}
+    lanes = _lanes(parameters)
+
+    def part(scene, values):
+        def run(values):
+            return simulate(with_parameters(scene, values))
+
+        return jax.lax.map(run, values) if strategy == "map" else jax.vmap(run)(values)
+
+    number = min(len(devices), lanes)
+    if number > 1:
+        # The last lane fills up, so that every device has as many.
+        fill = -lanes % number
+        parameters = {n: jnp.concatenate([v, jnp.repeat(v[-1:], fill, axis=0)]) for n, v in parameters.items()}
+        spread = PartitionSpec("lane")
+        mesh = Mesh(np.array(devices[:number]), ("lane",))
+        specs = (PartitionSpec(), spread)
+        part = jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
+    result = part(scene, parameters)
+    result = jax.tree.map(lambda a: a[:lanes], result) if number > 1 else result
+    return Batch(result=result, strategy=strategy, devices=number)
+
+
+def _lanes(parameters: dict[str, jax.Array]) -> int:
+    if not parameters:
+        raise InputError("a batch needs parameters: give e.g. {'law.mu': [700.0, 800.0]}")
+    lengths = {name: value.shape[0] if value.ndim else None for name, value in parameters.items()}
+    first = next(iter(lengths))
+    for name, length in lengths.items():
+        if length is None or length == 0:
+            raise InputError(f"{name} has no lanes: give one value a lane, e.g. [700.0, 800.0]")
+        if length != lengths[first]:
+            raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give as many of each")
+    return int(lengths[first] or 0)

@@ -1,0 +1,65 @@
+"""What reverse mode keeps of a run: the state and the root of every step, or a few states and the rest made again.
+
+A step's root, named in `liverjax.solvers.continuation`, stays; forces and tangent there are evaluated again when the
+derivative comes by, Newton's iterations are not. With fewer states kept than steps (Griewank and Walther 2008, 12) the
+steps between two of them are run a second time, in whole.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from liverjax.core.errors import InputError
+from liverjax.solvers.continuation import ROOT
+
+
+def number_kept(store: str | int, steps: int) -> int:
+    """How many states are kept of so many steps.
+
+    Args:
+        store: "all", "sqrt", or a number above 0.
+
+    Raises:
+        InputError: anything else.
+    """
+    if store == "all":
+        return steps
+    if store == "sqrt":
+        return max(1, round(math.sqrt(steps)))
+    if isinstance(store, bool) or not isinstance(store, int) or store < 1:
+        raise InputError(f"store = {store!r} is not known: give 'all', 'sqrt' or a number of states above 0")
+    return min(store, steps)
+
+
+def lengths(steps: int, kept: int) -> tuple[int, int, int]:
+    """Number of segments, steps in each of them, and steps left over for a last one."""
+    length = math.ceil(steps / kept)
+    return steps // length, length, steps % length
+
+
+def one_step(step: Callable) -> Callable:
+    """`step` of which reverse mode keeps arguments and root only."""
+    policy = jax.checkpoint_policies.save_only_these_names(ROOT)
+    return jax.checkpoint(step, policy=policy, prevent_cse=False)
+
+
+def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
+    """What `step` (carry, k) gives beside the carry, stacked over `numbers` (T,); see the module for `kept`."""
+    steps = len(numbers)
+    if kept >= steps:
+        return jax.lax.scan(step, start, numbers)[1]
+    count, length, rest = lengths(steps, kept)
+
+    # Nothing of a segment but its beginning stays.
+    @jax.checkpoint
+    def segment(carry, numbers):
+        return jax.lax.scan(step, carry, numbers)
+
+    carry, out = jax.lax.scan(segment, start, numbers[: count * length].reshape(count, length))
+    out = jax.tree.map(lambda a: a.reshape(count * length, *a.shape[2:]), out)
+    if rest:
+        _, last = segment(carry, numbers[count * length :])
+        out = jax.tree.map(lambda a, b: jax.numpy.concatenate([a, b]), out, last)
+    return out

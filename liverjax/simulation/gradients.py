@@ -1,0 +1,117 @@
+"""Derivatives of what a run leads to, by any number of a scene: with what they cost in memory, and a code.
+
+    found = lj.value_and_gradient(lambda result: loss(result.positions), scene, {"law.mu": 770.0})
+
+`jax.grad` through `simulate` gives the same numbers; this adds the code, the choice between reverse and forward mode
+and the memory known beforehand.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, struct
+from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.simulation import checkpoints
+from liverjax.simulation.run import Result, simulate
+from liverjax.simulation.step import equations, initial_state, method_of
+from liverjax.solvers import continuation
+from liverjax.solvers.block_matrix import flat
+
+MODES = ("reverse", "forward")
+#: The scene's positions at the beginning, beside the dotted names of `with_parameters`.
+START = "start"
+
+
+@struct
+class Gradient:
+    """A number that a run leads to, and its derivatives."""
+
+    value: jax.Array = param("1", "()")
+    gradient: dict = param("1", "by name, each of the shape of its value")
+    status: jax.Array = param("1", "of `liverjax.core.status`: GRADIENT_UNCONVERGED, ADJOINT_FAILED or CONVERGED")
+
+
+def value_and_gradient(
+    loss: Callable[[Result], jax.Array],
+    scene: Scene,
+    at: dict[str, Any],
+    store: str | int = "all",
+    mode: str = "reverse",
+) -> Gradient:
+    """Value of `loss` (Result -> number) and its gradient by the numbers `at` which it is taken.
+
+    Args:
+        loss: a function that JAX can differentiate; give the same one again to use its compiled program again.
+        scene: `Scene`.
+        at: dotted names as of `with_parameters` -> values, which replace the scene's; "start": positions (V, 3) [m] to
+            begin at, at rest.
+        store: what reverse mode keeps: "all" steps, "sqrt" or a number of states (`checkpointing`, `memory`).
+        mode: "reverse", at a cost that does not grow with the number of parameters; "forward", without memory for the
+            steps, at a run a parameter.
+
+    Raises:
+        InputError: unknown mode or store, no parameters, a name that the scene does not have.
+    """
+    if mode not in MODES:
+        raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
+    if not at:
+        raise InputError("no parameters to differentiate by: give some, e.g. {'law.mu': 770.0}")
+    checkpoints.number_kept(store, scene.solve.steps)
+    values = {name: jnp.asarray(value, float) for name, value in at.items()}
+    with_parameters(scene, {name: value for name, value in values.items() if name != START})
+    return _program(loss, store, mode)(scene, values)
+
+
+@functools.lru_cache(maxsize=32)
+def _program(loss: Callable[[Result], jax.Array], store: str | int, mode: str) -> Callable:
+    def run(values, scene):
+        numbers = {name: value for name, value in values.items() if name != START}
+        result = simulate(with_parameters(scene, numbers), start=values.get(START), store=store)
+        value = loss(result)
+        return value, (value, result.status)
+
+    def both(scene, values):
+        derivative = jax.grad if mode == "reverse" else jax.jacfwd
+        gradient, (value, codes) = derivative(run, has_aux=True)(values, scene)
+        finite = jnp.array([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient)]).all()
+        unconverged = jnp.any(codes != status.CONVERGED)
+        code = jnp.where(finite, status.CONVERGED, status.ADJOINT_FAILED)
+        code = jnp.where(unconverged, status.GRADIENT_UNCONVERGED, code)
+        return Gradient(value=value, gradient=gradient, status=code)
+
+    return jax.jit(both)
+
+
+#: Numbers an element that one step's derivative works with, beside tangents; measured.
+_WORK = 440
+
+
+def memory(scene: Scene, store: str | int = "all") -> int:
+    """Bytes that a derivative in reverse mode will keep and work with, known before anything is compiled."""
+    steps = scene.solve.steps
+    kept = checkpoints.number_kept(store, steps)
+
+    def carry(scene):
+        start = initial_state(scene)
+        method = method_of(equations(scene, start, jnp.ones(())))
+        return start, continuation.nothing_kept(method, flat(start.x))
+
+    state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
+    root = _bytes(scene.mesh.points)
+    # Tangents of a step, and of the run's beginning.
+    work = 2 * tangent + _WORK * scene.mesh.number_of_elements * scene.mesh.points.dtype.itemsize
+    if kept >= steps:
+        return steps * (state + root) + work
+    count, length, rest = checkpoints.lengths(steps, kept)
+    # Beside the states, what the run returns; not all of it at once.
+    return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
+
+
+def _bytes(tree: Any) -> int:
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))

@@ -1,0 +1,185 @@
+"""Run a scene: load steps or time steps, each a Newton solve with implicit differentiation."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, struct
+from liverjax.scenes import regions
+from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene_checks import check_bounds, check_choices
+from liverjax.simulation import automatic, checkpoints
+from liverjax.simulation.step import Sizes, State, equations, force_sizes, initial_state, method_of, step
+from liverjax.solvers import continuation
+from liverjax.solvers.block_matrix import flat
+from liverjax.solvers.continuation import StepStatistics
+
+
+@struct
+class Result:
+    """What a run leaves; arrays over the T steps, all of them differentiable but the statistics."""
+
+    times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
+    positions: jax.Array = param("m", "(T, V, 3)")
+    reactions: jax.Array = param("N", "(T, V, 3), force of the support on the body, 0 where nothing is prescribed")
+    status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
+    pressure: jax.Array | None = param("Pa", "(T, V), of a porous scene", default=None)
+    statistics: StepStatistics = param("1", "per step: Newton and CG iterations, cuts, residual")
+
+    def check(self) -> "Result":
+        """The result itself, or `RuntimeError` with advice where a step failed; host side."""
+        codes = np.asarray(self.status)
+        if np.any(codes != status.CONVERGED):
+            step = int(np.argmax(codes != status.CONVERGED))
+            raise RuntimeError(f"step {step + 1}: {status.advice(codes.ravel()[step])}")
+        return self
+
+
+def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any) -> Callable:
+    """(state and tangent, k) -> those after step k, and what `_result` takes."""
+
+    def physics(carry, k):
+        state, kept = carry
+        new, reactions, statistics, kept = step(equations(scene, state, k, sizes), kept, near)
+        # A state that is not finite spoils nothing further: the run stays where it last was.
+        finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
+        good = finite & (statistics.status != status.NOT_FINITE)
+        statistics = statistics._replace(status=jnp.where(finite, statistics.status, status.NOT_FINITE))
+        new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
+        P = None if new.fluid is None else new.fluid.pressure
+        kept = kept._replace(made=kept.made & good)
+        return (new, kept), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
+
+    def advance(carry, k):
+        new = checkpoints.one_step(physics)(carry, k)
+        if report is not None:
+            jax.debug.callback(report, k)
+        return new
+
+    return advance
+
+
+def _result(scene: Scene, numbers: jax.Array, out: Any) -> Result:
+    x, reactions, P, statistics = out
+    times, code = numbers * (1.0 if scene.solve.dt is None else scene.solve.dt), statistics.status
+    return Result(times=times, positions=x, reactions=reactions, pressure=P, status=code, statistics=statistics)
+
+
+@partial(jax.jit, static_argnames=("report", "store"))
+def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | None, store: Any) -> Result:
+    steps, dtype = scene.solve.steps, scene.mesh.points.dtype
+    sizes = force_sizes(scene)
+    numbers = jnp.arange(1, steps + 1, dtype=dtype)
+    start = initial_state(scene, begin)
+    method, q = method_of(equations(scene, start, numbers[0], sizes)), flat(start.x)
+    kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
+    # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
+    near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
+    advance = _step_by_step(scene, sizes, report, near)
+    return _result(scene, numbers, checkpoints.scan(advance, (start, kept), numbers, store))
+
+
+@partial(jax.jit, static_argnames="report")
+def _run_part(
+    scene: Scene, state: State, numbers: jax.Array, report: Callable[[int], None] | None
+) -> tuple[Result, State]:
+    sizes = force_sizes(scene)
+    kept = continuation.nothing_kept(method_of(equations(scene, state, numbers[0], sizes)), flat(state.x))
+    advance = _step_by_step(scene, sizes, report, None)
+
+    def unless_over(carry, k):
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(advance, carry, k)[1])
+        return jax.lax.cond(k <= scene.solve.steps, advance, lambda carry, _: (carry, nothing), carry, k)
+
+    (state, _), out = jax.lax.scan(unless_over, (state, kept), numbers)
+    return _result(scene, numbers, out), state
+
+
+def simulate(
+    scene: Scene,
+    report: Callable[[int], None] | None = None,
+    start: jax.Array | None = None,
+    store: str | int = "all",
+) -> Result:
+    """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
+
+    Args:
+        scene: `Scene`.
+        start: positions (V, 3) [m] to begin at, at rest, with the pressure and memory of the reference; None: the
+            reference positions. Inverted elements need robust = "projected", which takes the start of a static scene
+            for a guess: where it is inverted or leads nowhere, the load is followed from the reference positions.
+        report: called on the host with the number of every finished step, for progress.
+        store: of a derivative in reverse mode: "all" keeps what every step ended with; "sqrt", or a number, keeps as
+            many states (the root of the number of steps) and runs what lies between a second time. Without a
+            derivative it does nothing. See `liverjax.simulation.gradients`.
+
+    Raises:
+        InputError: choices that mean nothing; numbers out of bounds, unless traced; precision "float64" where JAX's
+            64-bit mode is off. `check_scene` checks more, the mesh above all; reading a scene file calls it.
+    """
+    scene = prepared(scene)
+    if start is not None:
+        start = jnp.array(start, scene.mesh.points.dtype)
+        if start.shape != scene.mesh.points.shape:
+            raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
+    return _run(scene, start, report, checkpoints.number_kept(store, scene.solve.steps))
+
+
+def simulate_part(
+    scene: Scene,
+    state: State,
+    first: Any,
+    count: int,
+    report: Callable[[int], None] | None = None,
+) -> tuple[Result, State]:
+    """Some steps of a run, and the state to go on from, so that a long run can be kept in parts. Not differentiable.
+
+    Args:
+        scene: `Scene`.
+        state: what the steps before left; `initial_state(prepared(scene))` at the beginning.
+        first: number of the first step, from 1; may be traced.
+        count: how many steps. Those beyond the last of the scene are skipped; their rows are zeros.
+        report: as of `simulate`.
+
+    A part begins with a tangent of its own, so that going on from a state that was stored changes no bit.
+
+    Raises:
+        InputError: as `simulate`.
+    """
+    scene = prepared(scene)
+    numbers = first + jnp.arange(count, dtype=scene.mesh.points.dtype)
+    return _run_part(scene, state, numbers, report)
+
+
+def prepared(scene: Scene) -> Scene:
+    """The scene as it is run: numbers by element, a linear solver chosen, in its precision. Runs do it themselves.
+
+    Inside `jax.jit` numbers are not known, and `linear_solver = "auto"` iterates: call this before, to let it choose.
+
+    Raises:
+        InputError: as `simulate`.
+    """
+    check_choices(scene)
+    check_bounds(scene)
+    if scene.solve.newton_iterations == 1:
+        scene = replace(scene, solve=replace(scene.solve, newton="one_step"))
+    if scene.region:
+        per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
+        scene = replace(scene, law=per_element, region=())
+    if scene.solve.linear_solver == "auto":
+        scene = replace(scene, solve=replace(scene.solve, linear_solver=automatic.linear_solver(scene)))
+    if scene.solve.precision == "float32":
+        scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
+    elif jnp.result_type(float) != jnp.float64:  # 64-bit mode is off
+        raise InputError("precision = 'float64' needs JAX's 64-bit mode: unset JAX_ENABLE_X64 or ask for float32")
+    return scene
+
+
+def _cast(value: Any, dtype: Any) -> Any:
+    return jnp.asarray(value, dtype) if jnp.issubdtype(jnp.result_type(value), jnp.floating) else value

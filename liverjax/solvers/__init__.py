@@ -1,0 +1,1 @@
+"""Block matrices, Krylov methods, factorisation, preconditioner, Newton, continuation, minimisation."""

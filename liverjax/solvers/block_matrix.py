@@ -1,0 +1,119 @@
+"""Symmetric matrices of node blocks in padded rows: assembled from element blocks, multiplied without a search.
+
+Only the blocks of edges are scattered, each once: a matrix of forces that do not change under translation has its
+diagonal blocks as minus the sum of its rows, and what else stands there is given.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.mesh.adjacency import PAIRS, Pattern
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.tensors.matrices import cofactor, dot, stored
+
+#: An m x m matrix as nested tuples of arrays.
+Block = tuple[tuple[Any, ...], ...]
+
+
+class BlockMatrix(NamedTuple):
+    """A symmetric matrix (V m, V m) of m x m blocks, every entry an array over the nodes."""
+
+    rows: Block  # of arrays (W, V): blocks of a node and its neighbours
+    diagonal: Block  # of arrays (V,)
+    nodes: jax.Array  # (W, V)
+
+
+def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
+    """Blocks of nodes and their neighbours, m x m of (W, V), from those of `PAIRS` of every element, m x m of (E,).
+
+    An entry that is None in every block stays None.
+    """
+    pattern: Pattern = mesh.pattern
+    m = len(blocks[PAIRS[0]])
+    # Without that XLA:CPU computes every entry again in each of its scatters.
+    blocks = stored(blocks)
+    number = pattern.edges.shape[1]
+    swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
+    edge: list[list[Any]] = [[None] * m for _ in range(m)]
+    for r in range(m):
+        for c in range(m):
+            if blocks[PAIRS[0]][r][c] is None:
+                continue
+            total = jnp.zeros(number + 1, mesh.points.dtype)
+            for k, pair in enumerate(PAIRS):
+                K = blocks[pair]
+                value = K[r][c] if r == c else jnp.where(swapped[pair], K[c][r], K[r][c])
+                total = total.at[pattern.element_edges[k]].add(value)
+            edge[r][c] = total
+    gathered: list[list[Any]] = [[None if e is None else e[pattern.row_edges] for e in row] for row in edge]
+    upward = jnp.arange(mesh.number_of_nodes, dtype=jnp.int32)[None] < pattern.row_nodes
+    return tuple(
+        tuple(gathered[r][c] if r == c else jnp.where(upward, gathered[r][c], gathered[c][r]) for c in range(m))
+        for r in range(m)
+    )
+
+
+def row_sums(rows: Block) -> Block:
+    """Sums over the neighbours, m x m of (V,)."""
+    return tuple(tuple(jnp.sum(entry, axis=0) for entry in row) for row in rows)
+
+
+def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], inertia: Any = None) -> BlockMatrix:
+    """The matrix of forces (3 x 3 blocks, without the elements' own diagonal ones) and of `inertia` (V,), or None."""
+    rows = off_diagonal(mesh, blocks)
+    sums = row_sums(rows)
+    own = [[-sums[min(r, c)][max(r, c)] for c in range(3)] for r in range(3)]
+    if inertia is not None:
+        own = [[own[r][c] + (inertia if r == c else 0.0) for c in range(3)] for r in range(3)]
+    return BlockMatrix(rows, tuple(map(tuple, own)), mesh.pattern.row_nodes)
+
+
+def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
+    """Inverse 3 x 3 blocks; unit rows where `mask` (V, 3) is 0, that of the mean where one is not positive definite."""
+    A = [
+        [diagonal[r][c] * mask[:, r] * mask[:, c] + (1 - mask[:, r] if r == c else 0.0) for c in range(3)]
+        for r in range(3)
+    ]
+    rows = tuple(map(tuple, A))
+    cof = cofactor(rows)
+    det = dot(rows[0], cof[0])
+    positive = (A[0][0] > 0) & (cof[2][2] > 0) & (det > 0) & jnp.isfinite(det)
+    size = jnp.abs(A[0][0]) + jnp.abs(A[1][1]) + jnp.abs(A[2][2])
+    mean = jnp.where((size > 0) & jnp.isfinite(size), size / 3, 1.0)
+    safe = jnp.where(positive, det, 1.0)
+    return tuple(
+        tuple(jnp.where(positive, cof[r][c] / safe, 1 / mean if r == c else 0.0) for c in range(3)) for r in range(3)
+    )
+
+
+def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """A block a node, m x k of (V,), times its part of the vector with these k columns (V,)."""
+    return tuple(_row(row, columns) for row in blocks)
+
+
+def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """A v as columns (V,), for the k columns (V,) of v: the first k columns of the blocks, all of their rows."""
+
+    def add(slot, total):
+        near = [column[A.nodes[slot]] for column in columns]
+        return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
+
+    # One neighbour after the other, in a loop: what is gathered stays in cache.
+    return jax.lax.fori_loop(0, A.nodes.shape[0], add, applied(A.diagonal, columns))
+
+
+def _row(entries: Any, columns: Sequence[jax.Array]) -> jax.Array:
+    return sum(entry * column for entry, column in zip(entries, columns, strict=False))
+
+
+def columns(vector: jax.Array) -> tuple[jax.Array, ...]:
+    """x, y and z (V,) of a flat vector (3 V,), in which all x come first."""
+    return tuple(vector.reshape(3, -1))
+
+
+def flat(field: jax.Array) -> jax.Array:
+    """The flat vector (3 V,) of a field (V, 3)."""
+    return field.T.ravel()

@@ -1,0 +1,123 @@
+"""Newton's method with a linear solve by conjugate gradients, differentiated implicitly at its root."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core import status
+from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
+
+
+class NewtonStatistics(NamedTuple):
+    """What a solve did; every field an array (one a lane under vmap)."""
+
+    status: jax.Array
+    iterations: jax.Array
+    linear_iterations: jax.Array
+    residual: jax.Array  # |r| / scale at the point returned
+
+
+class NewtonOptions(NamedTuple):
+    """How hard to try; all static."""
+
+    tolerance: float = 1e-8  # of |r| relative to the scale given
+    max_iterations: int = 25
+    linear_tolerance: float = 1e-4  # of each Newton step
+    adjoint_tolerance: float = 1e-10  # of the solves that carry derivatives
+    max_linear_iterations: int = 2000
+    max_halvings: int = 10
+
+
+def solve(
+    residual: Callable[[jax.Array], jax.Array],
+    start: jax.Array,
+    precondition: Callable[[jax.Array], jax.Array],
+    scale: Any,
+    options: NewtonOptions = NewtonOptions(),
+) -> tuple[jax.Array, NewtonStatistics]:
+    """Root of `residual`, a function of a flat vector (n,) with a symmetric derivative.
+
+    Args:
+        residual: may close over traced parameters; derivatives with respect to them are exact at the root (implicit
+            function theorem with the true tangent).
+        start: first guess; carries no derivative.
+        precondition: approximate inverse of the tangent; carries no derivative.
+        scale: force [N] that the tolerance is relative to.
+        options: tolerances and limits.
+    """
+
+    def iterate(residual, start):
+        return _iterate(residual, start, precondition, jax.lax.stop_gradient(scale), options)
+
+    def tangent_solve(linear, y):
+        return differentiable_solve(linear, y, precondition, options.adjoint_tolerance, options.max_linear_iterations)
+
+    root, statistics = jax.lax.custom_root(residual, jax.lax.stop_gradient(start), iterate, tangent_solve, has_aux=True)
+    code, iterations, linear = (n.astype(jnp.int32) for n in statistics[:3])
+    return root, NewtonStatistics(code, iterations, linear, statistics.residual)
+
+
+class _Point(NamedTuple):
+    """State of the iteration: `q` is the best point so far, `q + t dq` the one to try next."""
+
+    q: jax.Array
+    r: jax.Array
+    dq: jax.Array
+    t: jax.Array
+    halvings: jax.Array
+    iterations: jax.Array
+    linear_iterations: jax.Array
+    done: jax.Array
+
+
+def _iterate(residual, start, precondition, scale, options):
+    """Newton with step halving on |r|. Residual and tangent stand in the program once: it compiles twice as fast."""
+    goal = options.tolerance * scale
+
+    def norm(r):
+        return jnp.linalg.norm(r)
+
+    def step(c: _Point) -> _Point:
+        trial = c.q + c.t * c.dq
+        r, matvec = jax.linearize(residual, trial)
+        first = c.iterations == 0
+        better = (norm(r) < norm(c.r)) | first  # false for NaN
+        q, r = jnp.where(better, trial, c.q), jnp.where(better, r, c.r)
+        halvings = jnp.where(better, 0, c.halvings + 1)
+        converged = norm(r) <= goal
+        spent = (c.iterations > options.max_iterations) | (halvings > options.max_halvings)
+        done = converged | spent | ~jnp.isfinite(norm(r))
+        # No more accurate than the last Newton step can use, no less than the forcing term.
+        forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
+        load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a zero load costs no iteration
+        dq, s = conjugate_gradients(matvec, load, precondition, forcing, options.max_linear_iterations)
+        return _Point(
+            q=q,
+            r=r,
+            dq=jnp.where(better, dq, c.dq),
+            t=jnp.where(better, 1.0, 0.5 * c.t),
+            halvings=halvings,
+            iterations=c.iterations + better,
+            linear_iterations=c.linear_iterations + s.iterations,
+            done=done,
+        )
+
+    zero = jnp.zeros((), jnp.int32)
+    begin = _Point(
+        q=start,
+        r=jnp.full_like(start, jnp.inf),
+        dq=jnp.zeros_like(start),
+        t=jnp.ones((), start.dtype),
+        halvings=zero,
+        iterations=zero,
+        linear_iterations=zero,
+        done=jnp.array(False),
+    )
+    end = jax.lax.while_loop(lambda c: ~c.done, step, begin)
+    size = norm(end.r)
+    code = jnp.where(size <= goal, status.CONVERGED, jnp.where(jnp.isfinite(size), status.STALLED, status.NOT_FINITE))
+    # Counts leave as floating-point numbers: implicit differentiation gives every output a tangent.
+    counts = (code, end.iterations - 1, end.linear_iterations)
+    return end.q, NewtonStatistics(*(n.astype(start.dtype) for n in counts), size / scale)

@@ -1,0 +1,107 @@
+"""A coarse space for the linear solves: on each of some tens of patches of nodes, the affine motions.
+
+Block-Jacobi removes short waves; the motions that vary slowly over the body are solved for directly. The two together,
+added, are a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers.block_matrix import BlockMatrix
+
+#: A vector, one array (V,) a component.
+Columns = Sequence[jax.Array]
+
+
+class Coarse(NamedTuple):
+    """The inverse of a matrix as the coarse space sees it."""
+
+    inverse: jax.Array  # (4 m P, 4 m P)
+    used: jax.Array  # False: left out
+
+
+def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
+    """Set up for the leading m x m blocks; where they are not positive definite, or `used` is false, left out.
+
+    Args:
+        mesh: `TetMesh`.
+        A: the matrix; carries no derivative.
+        mask: (V, m) 1 where free: m = 3 for forces, 1 for a pressure.
+        used: whether it is worth its cost (see `worthwhile`).
+    """
+    f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
+
+    def invert(A):
+        E = _galerkin(mesh, A, f, mask, number)
+        d = jnp.diagonal(E)
+        # A patch without free nodes along an axis, or a flat one, has motions that vanish: kept out of the inverse.
+        E = E + jnp.diag(jnp.where(d > 0, max(1e-9, 100 * float(jnp.finfo(d.dtype).eps)) * d, 1.0))
+        factor = jax.scipy.linalg.cho_factor(E)
+        inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(len(E), dtype=E.dtype))
+        return jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0.0)
+
+    size = 4 * mask.shape[1] * number
+    inverse = jax.lax.cond(used, invert, lambda A: jnp.zeros((size, size), f.dtype), A)
+    return Coarse(inverse, jnp.asarray(used))
+
+
+def worthwhile(A: BlockMatrix, inertia: Any) -> Any:
+    """Whether slow motions hold up block-Jacobi: where inertia is less than a thirtieth of the diagonal."""
+    if inertia is None:
+        return jnp.array(True)
+    total = sum(jnp.sum(A.diagonal[r][r]) for r in range(3)) / 3
+    return jnp.sum(inertia) < total / 30
+
+
+def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Columns], Columns]:
+    """Z (Z^T A Z)^-1 Z^T, Z the coarse motions, as a function of a vector's m columns (V,); `mask` is (V, m)."""
+    f, patch = mesh.pattern.patch_functions.T, mesh.pattern.patches
+    masks, number = mask.T, mesh.pattern.number_of_patches
+    m = len(masks)
+
+    def apply(columns):
+        weighted = jnp.stack([fk * free * r for fk in f for free, r in zip(masks, columns, strict=True)], axis=-1)
+        sums = jnp.zeros((number, 4 * m), weighted.dtype).at[patch].add(weighted)
+        motion = (coarse.inverse @ sums.ravel()).reshape(number, 4, m)
+        # Written out: a sum over an axis of four costs XLA:CPU more than all the rest.
+        return tuple(masks[i] * sum(f[k] * motion[:, k, i][patch] for k in range(4)) for i in range(m))
+
+    return apply
+
+
+def corrected(
+    mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[Columns], Columns]
+) -> Callable[[Columns], Columns]:
+    """The preconditioner `fine` of columns with the coarse solution added where it is used."""
+    apply = correction(mesh, coarse, mask)
+
+    def both(columns):
+        return tuple(a + b for a, b in zip(fine(columns), apply(columns), strict=True))
+
+    return lambda columns: jax.lax.cond(coarse.used, both, fine, columns)
+
+
+def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, number: int) -> jax.Array:
+    """Z^T A Z (4 m P, 4 m P): every edge once, then its transpose, then the diagonal."""
+    pattern, m = mesh.pattern, mask.shape[1]
+    size = 4 * m * number
+    low, high = pattern.edges
+    patch, slot = pattern.patches, pattern.edge_slots
+
+    def pairs(blocks, i, j):
+        B = jnp.stack([blocks[r][c] * mask[i, r] * mask[j, c] for r in range(m) for c in range(m)], axis=1)
+        both = (f[i][:, :, None] * f[j][:, None, :]).reshape(-1, 16)
+        entries = (both[:, :, None] * B[:, None, :]).reshape(-1, 16 * m * m)
+        return jnp.zeros((number * number, 16 * m * m), f.dtype).at[patch[i] * number + patch[j]].add(entries)
+
+    once = pairs([[entry.ravel()[slot] for entry in row[:m]] for row in A.rows[:m]], low, high)
+    every = jnp.arange(mesh.number_of_nodes)
+    once, own = (
+        jnp.transpose(E.reshape(number, number, 4, 4, m, m), (0, 2, 4, 1, 3, 5)).reshape(size, size)
+        for E in (once, pairs(A.diagonal, every, every))
+    )
+    return once + once.T + own

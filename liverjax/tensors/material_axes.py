@@ -1,0 +1,71 @@
+"""Stress and stiffness in material axes A (columns a_m): principal directions, or fibre, sheet and normal.
+
+With f_m = F a_m and D' = A^T D the material part of the stiffness of two nodes is sum_mn kappa_mn f_m (x) f_n.
+"""
+
+from typing import Any
+
+from liverjax.tensors.matrices import Matrix, Vector, dot, matmul, stored, transpose
+
+#: Pairs of different axes, and where the six components of a symmetric matrix stand.
+PAIRS = ((0, 1), (0, 2), (1, 2))
+SIX = ((0, 0), (1, 1), (2, 2), *PAIRS)
+
+
+def symmetric(six: tuple) -> Matrix:
+    """Six components 11, 22, 33, 12, 13, 23 as a matrix."""
+    xx, yy, zz, xy, xz, yz = six
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+
+def six_of(S: Matrix) -> tuple:
+    """A symmetric matrix as its components 11, 22, 33, 12, 13, 23."""
+    return tuple(S[i][j] for i, j in SIX)
+
+
+def rotated(S: Matrix, A: Matrix) -> Matrix:
+    """A S A^T of a symmetric S, its six entries computed once."""
+    AS = matmul(A, S)
+    return symmetric(tuple(dot(AS[i], A[j]) for i, j in SIX))
+
+
+def orthotropic(normal: Matrix, shear: Vector, a: Vector, b: Vector) -> Matrix:
+    """kappa of nodes with shape vectors a, b: moduli C_mmnn = `normal`, C_mnmn = `shear` (pairs 12, 13, 23)."""
+    kappa = [[normal[m][n] * (a[m] * b[n]) for n in range(3)] for m in range(3)]
+    for (m, n), G in zip(PAIRS, shear, strict=True):
+        kappa[m][n] = kappa[m][n] + G * (a[n] * b[m])
+        kappa[n][m] = kappa[n][m] + G * (a[m] * b[n])
+        kappa[m][m] = kappa[m][m] + G * (a[n] * b[n])
+        kappa[n][n] = kappa[n][n] + G * (a[m] * b[m])
+    return tuple(map(tuple, kappa))
+
+
+_INDEX = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+
+
+def half_contracted(moduli: Any, b: Vector) -> list:
+    """T_mpn = sum_q C_mpnq b_q of moduli over six components each; a node's part of `anisotropic`."""
+    return [
+        [[_contract([moduli[_INDEX[m][p]][_INDEX[n][q]] for q in range(3)], b) for n in range(3)] for p in range(3)]
+        for m in range(3)
+    ]
+
+
+def anisotropic(T: list, a: Vector) -> Matrix:
+    """kappa_mn = sum_p a_p T_mpn of two nodes, with `half_contracted` of the second."""
+    return tuple(tuple(_contract([T[m][p][n] for p in range(3)], a) for n in range(3)) for m in range(3))
+
+
+def _contract(values: list, a: Vector) -> Any:
+    """Scalar product that leaves out components of `a` that are the number 0, as in the coordinate directions."""
+    terms = [v if isinstance(c, float) and c == 1 else v * c for v, c in zip(values, a, strict=True) if not _is_zero(c)]
+    return sum(terms[1:], terms[0])
+
+
+def _is_zero(c: Any) -> bool:
+    return isinstance(c, float) and c == 0
+
+
+def pushed(FA: Matrix, kappa: Matrix) -> Matrix:
+    """sum_mn kappa_mn f_m (x) f_n."""
+    return matmul(stored(matmul(FA, kappa)), transpose(FA))

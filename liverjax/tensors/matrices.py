@@ -1,0 +1,166 @@
+"""Deformation gradients and invariants, every component an array over the elements.
+
+A vector is a tuple of three arrays and a matrix a tuple of three such rows, each array of shape (E,). Written out
+like this XLA vectorises over elements; batched 3 x 3 products would not (tiny matrices, no fusion).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.errors import InputError
+
+Vector = tuple[Any, ...]
+Matrix = tuple[Vector, ...]
+
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Invariants(NamedTuple):
+    """What a strain energy may depend on, each of shape (E,); `None` where the law does not ask for it."""
+
+    I1: Any = None  # tr C
+    I2: Any = None  # (I1^2 - tr C^2) / 2
+    I4: Any = None  # a . C a of the law's fibre direction a
+    J: Any = None  # det F
+    stretches: Any = None  # `liverjax.tensors.principal.Stretches`
+    E: Any = None  # Green's strain, a tuple matrix in the axes of the law
+
+
+def dot(a: Vector, b: Vector) -> Any:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def add(*vectors: Vector) -> Vector:
+    """Sum of vectors."""
+    return tuple(sum(c[1:], c[0]) for c in zip(*vectors, strict=True))
+
+
+def scale(s: Any, a: Vector) -> Vector:
+    """Scalar times vector."""
+    return (s * a[0], s * a[1], s * a[2])
+
+
+def scale_matrix(w: Any, A: Matrix) -> Matrix:
+    """Scalar times matrix."""
+    return tuple(scale(w, row) for row in A)
+
+
+def matvec(A: Matrix, v: Vector) -> Vector:
+    """Matrix times vector."""
+    return (dot(A[0], v), dot(A[1], v), dot(A[2], v))
+
+
+def transpose(A: Matrix) -> Matrix:
+    """Transposed matrix."""
+    return tuple(zip(*A, strict=True))
+
+
+def matmul(A: Matrix, B: Matrix) -> Matrix:
+    """Matrix product."""
+    columns = transpose(B)
+    return tuple(tuple(dot(row, c) for c in columns) for row in A)
+
+
+def cofactor(F: Matrix) -> Matrix:
+    """cof F = J F^-T from three cross products of the columns of F: no inverse, finite at J = 0."""
+    c0, c1, c2 = transpose(F)
+    return transpose((cross(c1, c2), cross(c2, c0), cross(c0, c1)))
+
+
+def determinant(F: Matrix) -> Any:
+    """J = det F."""
+    c0, c1, c2 = transpose(F)
+    return dot(c0, cross(c1, c2))
+
+
+def right_cauchy_green(F: Matrix) -> Matrix:
+    """C = F^T F, its six entries computed once."""
+    c = transpose(F)
+    xx, yy, zz, xy, xz, yz = (dot(c[a], c[b]) for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)))
+    return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+
+def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
+    """The invariants I1, I2 and J in `names` and no other."""
+    values = {}
+    if "I1" in names or "I2" in names:
+        values["I1"] = sum(dot(row, row) for row in F)
+    if "I2" in names:
+        trace_C2 = sum(dot(row, row) for row in right_cauchy_green(F))
+        values["I2"] = 0.5 * (values["I1"] * values["I1"] - trace_C2)
+    if "J" in names:
+        values["J"] = determinant(F)
+    return Invariants(**{n: values[n] for n in names if n in values})
+
+
+def green_strain(FA: Matrix) -> Matrix:
+    """E = (C - Id) / 2 in the axes A, from F A."""
+    C = right_cauchy_green(FA)
+    return tuple(tuple(0.5 * (C[i][j] - (1.0 if i == j else 0.0)) for j in range(3)) for i in range(3))
+
+
+def outer(a: Vector, b: Vector) -> Matrix:
+    """a (x) b."""
+    return tuple(scale(x, b) for x in a)
+
+
+def unit(a: Vector) -> Vector:
+    """a / |a|."""
+    return scale(1 / jnp.sqrt(dot(a, a)), a)
+
+
+def add_matrices(A: Matrix, B: Matrix) -> Matrix:
+    """A + B."""
+    return tuple(add(a, b) for a, b in zip(A, B, strict=True))
+
+
+def unpack(F: jax.Array) -> Matrix:
+    """Array (..., 3, 3) to a tuple matrix of arrays (...)."""
+    return tuple(tuple(F[..., i, j] for j in range(3)) for i in range(3))
+
+
+def pack(A: Matrix) -> jax.Array:
+    """Tuple matrix of arrays (...) to an array (..., 3, 3)."""
+    return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in A], axis=-2)
+
+
+def stored(values: Any) -> Any:
+    """The same pytree, written to memory: a branch keeps XLA:CPU from computing it again for every use.
+
+    Its leaves are one number, or arrays of which the first has numbers.
+    """
+    values = jax.tree.map(jnp.asarray, values)
+    number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]
+    always = (number != -jnp.inf) | (number < 0)  # of any number, NaN too; not known when compiling
+    return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+
+
+def node_values(x: jax.Array, tetrahedra: jax.Array) -> Matrix:
+    """Values (V, 3) at the four nodes of every element."""
+    return tuple(tuple(x[:, c][tetrahedra[:, a]] for c in range(3)) for a in range(4))
+
+
+def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
+    """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, since the shape vectors of an element add up to zero.
+
+    Args:
+        mesh: `TetMesh`.
+        x: current positions (V, 3) [m]. A difference of displacements works as well (the gradient of a field).
+
+    Raises:
+        InputError: x of another shape (an index beyond its end would be the last node's, silently).
+    """
+    if jnp.shape(x) != mesh.points.shape:
+        raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 a node, {mesh.points.shape}")
+    x0, *others = node_values(x, mesh.tetrahedra)
+    edges = [tuple(a - b for a, b in zip(node, x0, strict=True)) for node in others]
+    D = mesh.shape_vectors
+    return tuple(tuple(sum(edges[a][i] * D[a, j] for a in range(3)) for j in range(3)) for i in range(3))
