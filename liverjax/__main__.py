@@ -80,6 +80,7 @@ def run_scene(options: argparse.Namespace) -> int:
     from liverjax.jobs import long_run, output, parts
     from liverjax.physics import porosity
     from liverjax.scenes import scene_file
+    from liverjax.scenes.cautions import cautions
 
     file, out = options.scene, options.out
     read, text = scene_file.load_scene(file), file.read_text(encoding="utf-8")
@@ -98,7 +99,8 @@ def run_scene(options: argparse.Namespace) -> int:
     if read.porosity is not None:
         attributes["bulk"] = porosity.bulk_in_force(read.porosity, read.law)
         print(attributes["bulk"])
-    output.write_hdf5(target, read, result, attributes | {"versions": versions()})
+    said = cautions(read, result)
+    output.write_hdf5(target, read, result, attributes | {"warnings": said, "versions": versions()})
     if parts.beside(target).exists():
         parts.remove(parts.beside(target))
     s = result.statistics
@@ -110,6 +112,8 @@ def run_scene(options: argparse.Namespace) -> int:
         + f"compile {ran.compile_time:.3g} s"
         + (f"; {len(codes) - ran.steps} steps found on disk" if ran.steps < len(codes) else "")
     )
+    for sentence in said:
+        print(f"caution: {sentence}")
     written = [str(target)]
     if options.vtu:
         written.append(str(output.write_vtu(out / "vtu", read, result)))

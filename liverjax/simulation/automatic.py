@@ -33,8 +33,13 @@ def linear_solver(scene: Scene) -> str:
 
 
 def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:
-    """Least quality of an element: its volume over that of the regular one with the same mean square edge."""
+    """Least quality of an element."""
+    return float(np.min(qualities(points, tetrahedra, volumes)))
+
+
+def qualities(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> np.ndarray:
+    """Quality (E,) of elements: volume over that of the regular one with the same mean square edge."""
     corners = points[tetrahedra]
     edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
     length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))
-    return float(np.min(6 * np.sqrt(2) * np.abs(volumes) / length**3))
+    return 6 * np.sqrt(2) * np.abs(volumes) / length**3

@@ -1,0 +1,71 @@
+"""What a run should be read with care for, though it converged: one sentence each, on the host."""
+
+import numpy as np
+
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.automatic import qualities
+from liverjax.simulation.run import Result
+
+#: No organ is longer [m]: numbers in millimetres read as centimetres make a liver of 2 m.
+LONGEST = 1.0
+#: An element with a hundredth of the volume of the regular one of the same edges: errors of its gradients grow as much.
+SLIVER = 0.01
+#: A soft tissue is about four fifths fluid: below this J not even its solid has room. The reciprocal likewise.
+LEAST_J, MOST_J = 0.2, 5.0
+
+
+def cautions(scene: Scene, result: Result) -> list[str]:
+    """Sentences on the mesh and on the volumes of a run, none where all is well.
+
+    Args:
+        scene: `Scene`, not traced.
+        result: of it.
+    """
+    return [*_of_mesh(scene.mesh), *_of_volumes(scene, result)]
+
+
+def _of_mesh(mesh: TetMesh) -> list[str]:
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))
+    said = []
+    if size > LONGEST:
+        said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'mm'")
+    slivers = np.flatnonzero(quality < SLIVER)
+    if len(slivers):
+        worst = int(np.argmin(quality))
+        said.append(
+            f"{len(slivers)} of {len(tets)} elements are slivers, of quality below {SLIVER:g} (worst: element {worst}, "
+            f"{quality[worst]:.2g}; regular: 1): do not trust stresses there, or remesh"
+        )
+    return said
+
+
+def _of_volumes(scene: Scene, result: Result) -> list[str]:
+    """Elements beyond `LEAST_J` or `MOST_J` at any step."""
+    positions, said = np.asarray(result.positions), []
+    for beyond, bound, words in ((np.less, LEAST_J, "shrank below"), (np.greater, MOST_J, "grew above")):
+        J, step = _extreme(scene.mesh, positions, beyond)
+        out = beyond(J, bound)
+        if not out.any():
+            continue
+        worst = int(np.argmin(J) if beyond is np.less else np.argmax(J))
+        time = float(np.asarray(result.times)[step[worst]])
+        when = f"load step {time:g}" if scene.solve.dt is None else f"{time:.4g} s"
+        said.append(
+            f"{int(out.sum())} of {len(J)} elements {words} J = {bound:g} (worst: element {worst}, J = {J[worst]:.2g} "
+            f"at {when}), which no tissue does: take a stiffer bulk modulus or smaller loads"
+        )
+    return said
+
+
+def _extreme(mesh: TetMesh, positions: np.ndarray, beyond: np.ufunc) -> tuple[np.ndarray, np.ndarray]:
+    """J (E,) of every element at the step where it is least or greatest, and these steps (E,), from 0."""
+    tets, six_volumes = np.asarray(mesh.tetrahedra), 6 * np.asarray(mesh.volumes)
+    J, step = np.ones(len(tets)), np.zeros(len(tets), int)
+    for k, x in enumerate(positions):
+        corner = x[tets].astype(float)
+        now = np.linalg.det(corner[:, 1:] - corner[:, :1]) / six_volumes
+        further = beyond(now, J)
+        J, step = np.where(further, now, J), np.where(further, k, step)
+    return J, step
