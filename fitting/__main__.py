@@ -140,7 +140,7 @@ def identify_laws(options: argparse.Namespace) -> int:
     if options.law == "all":
         left = [n for n in laws.LAWS if not stress_stretch.incompressible_form(n)]
         notes.append(f"left out, being no isochoric energy plus U(J): {', '.join(left)}")
-    for note in notes:
+    for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)
     writable(options.out, ("curves.json", "curves.png"))
@@ -151,6 +151,8 @@ def identify_laws(options: argparse.Namespace) -> int:
     for fit in curves_report.best_first(fits):
         for sentence in fit.warnings:
             print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
+    for sentence in stress_stretch.unfollowed(found, fits):
+        print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/curves.json, curves.png")
     return 0 if curves_report.best_first(fits)[0].converged else 1
 

@@ -80,7 +80,7 @@ def run_scene(options: argparse.Namespace) -> int:
     from liverjax.jobs import long_run, output, parts
     from liverjax.physics import porosity
     from liverjax.scenes import scene_file
-    from liverjax.scenes.cautions import cautions
+    from liverjax.simulation.cautions import cautions
 
     file, out = options.scene, options.out
     read, text = scene_file.load_scene(file), file.read_text(encoding="utf-8")

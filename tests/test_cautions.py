@@ -9,7 +9,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
-from liverjax.scenes.cautions import cautions
+from liverjax.simulation.cautions import cautions
 from liverjax.simulation.run import Result
 
 pytestmark = pytest.mark.quick_to_compile

@@ -1,8 +1,10 @@
 """Laws from stress-stretch curves: known parameters come back, SciPy finds nothing better, bad files are refused."""
 
 import json
+import warnings
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import liverjax as lj
 from fitting.__main__ import main
 from fitting.fits import stress_stretch
 from fitting.readers import curves
+from fitting.reports import curves_report
 from liverjax.laws import homogeneous
 
 pytestmark = pytest.mark.quick_to_compile
@@ -95,6 +98,94 @@ def test_a_law_of_ones_own_is_fitted_from_its_file(tmp_path, capsys):
     assert "is not an isochoric energy plus U(J)" in capsys.readouterr().err
     assert main(["curves", f"{file}:Gnt", str(DATA / "rubber_curves.csv")]) == 2
     assert "has no Gnt: use Gent or Blatz" in capsys.readouterr().err
+
+
+SEVERAL = """
+import liverjax as lj
+
+several = lj.laws.NeoHookean(mu=300.0, bulk=1e4) + lj.laws.FungDemiray(c1=100.0, c2=1.0, bulk=1e4)
+third = lj.laws.MooneyRivlin(c10=300.0, c01=50.0, c20=20.0, c11=0.0, c30=10.0, bulk=1e4)
+nothing = lj.laws.MooneyRivlin(c10=0.0, c01=0.0, bulk=1e4)
+continued = lj.laws.Continued(law=lj.laws.NeoHookean(mu=300.0, bulk=1e4))
+"""
+
+
+def test_laws_that_add_up_are_fitted_together(tmp_path, capsys):
+    file = tmp_path / "several.py"
+    file.write_text(SEVERAL)
+    (candidate,) = stress_stretch.candidates(f"{file}:several")
+    assert candidate.names == ("0.mu", "1.c1", "1.c2") and candidate.units == ("Pa", "Pa", "1")
+    truth = lj.laws.NeoHookean(mu=400.0, bulk=None) + lj.laws.FungDemiray(c1=200.0, c2=3.0, bulk=None)
+    found = stress_stretch.fit(candidate, synthetic(truth))
+    assert np.allclose(found.values, [400.0, 200.0, 3.0], rtol=1e-5)
+    assert not found.limits and np.isclose(found.shear_modulus, 600.0, rtol=1e-5)
+    for name, sentence in (("nothing", "none of its parameters has a value"), ("continued", "law of Continued is not")):
+        assert main(["curves", f"{file}:{name}", str(DATA / "rubber_curves.csv")]) == 2
+        error = capsys.readouterr().err
+        assert sentence in error and error.count("\n") == 1
+
+
+def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):
+    file = tmp_path / "third.py"
+    file.write_text(SEVERAL)
+    (candidate,) = stress_stretch.candidates(f"{file}:third")
+    assert candidate.names == ("c10", "c01", "c20", "c30")
+    (note,) = candidate.notes
+    assert "c11 held at 0 as given" in note and "c02, c21, c12, c03 left out" in note
+    truth = lj.laws.MooneyRivlin(c10=250.0, c01=90.0, c20=30.0, c30=60.0, bulk=None)
+    found = stress_stretch.fit(candidate, synthetic(truth))
+    assert np.allclose(found.values, [250.0, 90.0, 30.0, 60.0], rtol=1e-4)
+    (shipped,) = stress_stretch.candidates("mooney_rivlin")
+    assert "mooney_rivlin: fitted are c10, c01; c20" in shipped.notes[0]
+    assert not stress_stretch.candidates("yeoh")[0].notes
+
+
+def test_a_law_at_its_limit_says_so_without_warnings_of_numpy():
+    """Eight chains of infinite length are neo-Hookean."""
+    (candidate,) = stress_stretch.candidates("arruda_boyce")
+    data = [c for c in synthetic(lj.laws.NeoHookean(mu=770.0, bulk=None), 0.01, 2) if c.test == "uniaxial"]
+    softening = data[0]._replace(stress=data[0].stress * (1 - 0.2 * np.abs(data[0].driven - 1)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        found = stress_stretch.fit(candidate, [softening])
+    assert found.limits == {"chain_length": "infinity"} and np.isfinite(found.standard_errors[0])
+    told = " ".join(found.warnings)
+    assert "runs into its limit (chain_length to infinity): the limit is the answer" in told
+    assert "leave chain_length free" not in told
+    assert "chain_length → infinity" in curves_report.table([found])
+
+
+def test_a_curve_that_no_law_follows_is_named():
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    tension, shear, _ = synthetic(KNOWN["neo_hookean"])
+    foreign = shear._replace(stress=3 * shear.stress, label="another unit")
+    found = stress_stretch.fit(candidate, [tension, tension._replace(label="again"), foreign])
+    (sentence,) = stress_stretch.unfollowed([tension, tension._replace(label="again"), foreign], [found])
+    assert sentence.startswith("another unit: no law follows this curve, the nearest (neo_hookean) misses it by")
+
+
+def test_lines_of_the_picture_are_fine_and_compiled_once_a_law():
+    curves_of = synthetic(KNOWN["yeoh"])
+    for curve in curves_of:
+        dense = curves_report.fine(curve)
+        exact = homogeneous.deformation_gradient(curve.test, dense.driven)
+        assert len(dense.driven) == 200 and np.ptp(dense.driven) == np.ptp(curve.driven)
+        # Roundoff of logarithm and exponential; a chord between two points would be off by 1e-4.
+        assert np.allclose(dense.F, exact, atol=1e-14)
+    fits = [stress_stretch.fit(stress_stretch.candidates(n)[0], curves_of, starts=2) for n in ("yeoh", "neo_hookean")]
+    made: list[str] = []
+    monitored = True
+
+    def count(event: str, seconds: float, **_) -> None:
+        if monitored and event.endswith("backend_compile_duration"):
+            made.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    curves_report.figure(curves_of, fits)
+    first = len(made)
+    curves_report.figure(curves_of, fits)
+    monitored = False
+    assert first <= len(fits) and len(made) == first
 
 
 @pytest.mark.slow

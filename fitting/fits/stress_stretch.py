@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
+from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.methods.uncertainty import spread
 from fitting.readers.curves import Curve
@@ -32,6 +33,7 @@ class Candidate(NamedTuple):
     values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
     law: Callable[[jax.Array], Law]  # of these values, without volumetric energy
     random: Callable[[np.random.Generator, int], np.ndarray]  # starts (n, len(u))
+    notes: tuple[str, ...] = ()  # what is not fitted, sentences
 
 
 class LawFit(NamedTuple):
@@ -56,6 +58,12 @@ class LawFit(NamedTuple):
     warnings: list[str]
     run_time: float
     compile_time: float
+    limits: dict[str, str]  # parameters that ran away to 0 or infinity
+
+
+#: A positive parameter so many times above or below its typical size ran into the limit of its law.
+RUNAWAY = 1e6
+_tangents = jax.jit(lambda law, F: law.tangent(F))
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
@@ -73,9 +81,44 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
     if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
         raise InputError(f"law {name} is not an isochoric energy plus U(J), so its curves need more: use {usable}")
-    if isinstance(typical, laws.Ogden):
+    if isinstance(typical, laws.Ogden) and ":" not in name:
         return [_ogden(k) for k in ((1, 2, 3) if terms is None else (terms,))]
-    return [_bogen() if isinstance(typical, laws.Bogen) else _single(name.rpartition(":")[2], typical)]
+    return [_candidate(name.rpartition(":")[2], typical)]
+
+
+def _candidate(label: str, law: Law) -> Candidate:
+    """Of one law, or of several that add up."""
+    parts = [s for s in laws.summands(law) if not isinstance(s, laws.Volumetric)]
+    if len(parts) > 1:
+        return _sum(label, [_candidate(f"{label}, summand {k}", s) for k, s in enumerate(parts)])
+    (law,) = parts
+    if isinstance(law, laws.Ogden):
+        return _ogden(len(law.alpha))._replace(label=label)
+    return _bogen()._replace(label=label) if isinstance(law, laws.Bogen) else _single(label, law)
+
+
+def _sum(label: str, parts: list[Candidate]) -> Candidate:
+    """Laws that add up, each with its own numbers; parameters are named as in a scene: `1.mu` is of the second law."""
+    ends = np.cumsum([len(p.names) for p in parts])[:-1]  # as many unconstrained numbers as parameters
+
+    def values(u, scale):
+        return jnp.concatenate([p.values(v, scale) for p, v in zip(parts, jnp.split(u, ends), strict=True)])
+
+    def law(p):
+        return laws.Sum(laws=tuple(part.law(v) for part, v in zip(parts, jnp.split(p, ends), strict=True)))
+
+    def random(rng, n):
+        return np.concatenate([p.random(rng, n) for p in parts], axis=1)
+
+    return Candidate(
+        label,
+        tuple(f"{k}.{name}" for k, p in enumerate(parts) for name in p.names),
+        tuple(unit for p in parts for unit in p.units),
+        values,
+        law,
+        random,
+        tuple(note for p in parts for note in p.notes),
+    )
 
 
 def incompressible_form(name: str) -> bool:
@@ -84,12 +127,13 @@ def incompressible_form(name: str) -> bool:
 
 
 def _single(label: str, typical: Law) -> Candidate:
-    fields = [f for f in laws.parameters(type(typical)) if f.name != "bulk" and f.default is not None]
+    fields, notes = _fitted(label, typical)
     names = tuple(f.name for f in fields)
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata["above"] == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    middle = middle / np.where(modulus, _shear_modulus(typical), 1.0)
+    size = abs(_shear_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)  # higher terms alone have none
+    middle = middle / np.where(modulus, size, 1.0)
 
     def values(u, scale):
         unit = jnp.where(modulus, scale, 1.0)
@@ -105,7 +149,35 @@ def _single(label: str, typical: Law) -> Candidate:
     def law(p):
         return laws.replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
 
-    return Candidate(label, names, tuple("Pa" if m else "1" for m in modulus), values, law, random)
+    return Candidate(label, names, tuple("Pa" if m else "1" for m in modulus), values, law, random, notes)
+
+
+def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
+    """Fields that are fitted, those with a number other than 0, and notes on the others.
+
+    Raises:
+        InputError: a parameter that is a list, or none to be fitted.
+    """
+    fields = [f for f in laws.parameters(type(law)) if f.name != "bulk"]
+    absent = [f.name for f in fields if getattr(law, f.name) is None]
+    given = [f for f in fields if f.name not in absent]
+    for f in given:
+        if isinstance(getattr(law, f.name), Law) or np.ndim(getattr(law, f.name)) > 0:
+            raise InputError(
+                f"law {label}: {f.name} of {type(law).__name__} is not one number, which the fit of curves asks for: "
+                "give a law whose parameters are numbers"
+            )
+    zero = [f.name for f in given if float(getattr(law, f.name)) == 0]
+    fitted = [f for f in given if f.name not in zero]
+    if not fitted:
+        raise InputError(f"law {label}: none of its parameters has a value other than 0: give one to be fitted")
+    notes = []
+    if zero:
+        notes.append(f"{', '.join(zero)} held at 0 as given")
+    if absent:
+        notes.append(f"{', '.join(absent)} left out: a law in FILE.py:LAW that gives them a value has them fitted")
+    told = f"{label}: fitted are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
+    return fitted, (told,) if notes else ()
 
 
 def _shear_modulus(law: Law) -> float:
@@ -205,12 +277,20 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
     misfit = r[:n]
     values = np.asarray(candidate.values(jnp.asarray(u), scale))
     noise = float(np.sqrt(np.sum(misfit**2) / max(1, n - p)))
+    limits = _limits(candidate, values, scale)
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
-    half, s = spread(J[:n], noise, slope)
-    errors = np.linalg.norm(half, axis=1) if n > p else np.full(p, np.nan)
+    # Of a parameter at its limit nothing more is known; the others' errors are those of the law at that limit.
+    known = np.array([name not in limits for name in candidate.names])
+    half, s = spread(J[:n, known], noise, slope[np.ix_(known, known)])
+    errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
+    if n > p:
+        errors[known] = np.linalg.norm(half, axis=1)
+    if np.all(np.isfinite(half)):
+        lengths = np.maximum(np.linalg.norm(half, axis=1), 1e-300)[:, None]
+        correlation[np.ix_(known, known)] = (half / lengths) @ (half / lengths).T
     law = candidate.law(jnp.asarray(values))
     split = np.split(misfit, np.cumsum([len(c.stress) for c in curves])[:-1])
-    criterion = n * np.log(np.sum(misfit**2) / n)
+    criterion = n * np.log(max(np.sum(misfit**2) / n, 1e-300))
     k = p + 1
     result = LawFit(
         label=candidate.label,
@@ -218,7 +298,7 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
         units=candidate.units,
         values=values,
         standard_errors=errors,
-        correlation=(half @ half.T) / np.maximum(np.outer(errors, errors), 1e-300),
+        correlation=correlation,
         law=law,
         shear_modulus=_shear_modulus(law),
         cost=float(costs[best]),
@@ -232,6 +312,7 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
         warnings=[],
         run_time=times[0],
         compile_time=times[1],
+        limits=limits,
     )
     return result._replace(warnings=_warnings(result, curves, s, bool(np.any(r[n:] < 0))))
 
@@ -243,17 +324,50 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     if not fit.converged:
         told.append("the fit did not converge from its best start")
     quantile = scipy.stats.t.ppf(0.975, max(1, sum(len(c.stress) for c in curves) - len(fit.values)))
+    if fit.limits:
+        ran = ", ".join(f"{name} to {end}" for name, end in fit.limits.items())
+        told.append(
+            f"the law runs into its limit ({ran}): the limit is the answer, with the error and G0 given here, and the "
+            "number reached means nothing; take a law without that parameter"
+        )
     for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True):
-        if not error * quantile < abs(value):
+        if name not in fit.limits and not error * quantile < abs(value):
             told.append(f"the data leave {name} free: {value:.3g} with a standard error of {error:.2g}")
-    if singular[-1] < 1e-7 * singular[0]:
+    if not fit.limits and singular[-1] < 1e-7 * singular[0]:
         told.append("some combination of the parameters is not determined at all")
     if fit.starts_at_minimum == 1:
         told.append("only one start reached the minimum: there may be a better one")
     if held:
         told.append("the stress would fall within the fitted range: held at the edge of stability")
-    solid = laws.replace(fit.law, bulk=1e3 * abs(fit.shear_modulus))
-    lost = [c.label for c in curves if not np.all(ellipticity(np.asarray(solid.tangent(jnp.asarray(c.F)))) > 0)]
+    solid = fit.law + laws.Volumetric(bulk=jnp.asarray(1e3 * abs(fit.shear_modulus)))
+    firm = ellipticity(np.asarray(_tangents(solid, jnp.asarray(np.concatenate([c.F for c in curves]))))) > 0
+    parts = np.split(firm, np.cumsum([len(c.stress) for c in curves])[:-1])
+    lost = [c.label for c, part in zip(curves, parts, strict=True) if not np.all(part)]
     if lost:
         told.append(f"strong ellipticity is lost within {', '.join(lost)}: do not simulate with these parameters there")
+    return told
+
+
+def _limits(candidate: Candidate, values: np.ndarray, scale: float) -> dict[str, str]:
+    """Parameters that ran away: far from every start, whose spread is a few times their typical size."""
+    starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
+    typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
+    ends = {}
+    for name, ratio in zip(candidate.names, np.abs(values) / typical, strict=True):
+        if not 1 / RUNAWAY < ratio < RUNAWAY:
+            ends[name] = "0" if ratio < 1 else "infinity"
+    return ends
+
+
+def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
+    """A sentence on every curve that none of the laws follows."""
+    told = []
+    for curve in curves:
+        best = min(fits, key=lambda f: f.curve_errors[curve.label])
+        error = best.curve_errors[curve.label]
+        if not error < HOPELESS:
+            told.append(
+                f"{curve.label}: no law follows this curve, the nearest ({best.label}) misses it by "
+                f"{100 * error:.0f} % of its stress; check its unit, signs and axes, or fit it on its own"
+            )
     return told

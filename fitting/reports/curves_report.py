@@ -1,18 +1,24 @@
 """What a fit of stress-stretch curves leaves behind: curves.json, curves.png, and a table on the terminal."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from fitting.fits.stress_stretch import LawFit
+from fitting.fits.stress_stretch import LawFit, unfollowed
 from fitting.readers.curves import Curve
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import COLOURS, GREY
 from liverjax.core.versions import versions
 from liverjax.laws import homogeneous
+
+#: Points of a drawn line.
+FINE = 200
+#: The same shapes for every law and figure: compiled once a law.
+_stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
 def best_first(fits: list[LawFit]) -> list[LawFit]:
@@ -27,6 +33,7 @@ def summary(fit: LawFit) -> dict[str, Any]:
         "parameters": dict(zip(fit.names, fit.values.tolist(), strict=True)),
         "units": dict(zip(fit.names, fit.units, strict=True)),
         "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
+        "limits": fit.limits,
         "correlation": fit.correlation.tolist(),
         "ground_state_shear_modulus": fit.shear_modulus,
         "cost": fit.cost,
@@ -52,6 +59,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
         "curves": [
             {"label": c.label, "test": c.test, "points": len(c.stress), "rms_stress_Pa": c.scale} for c in curves
         ],
+        "not_followed": unfollowed(curves, fits),
         "laws": [summary(f) for f in ordered],
         "versions": versions(),
     }
@@ -74,8 +82,11 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
     halves: Any = fig.subfigures(2, 1, height_ratios=(2.8 * rows, 0.26 * len(ordered) + 1.3))
     top, bottom = halves
     axes = np.atleast_1d(top.subplots(rows, columns)).ravel()
-    for axis, curve in zip(axes, curves, strict=False):
-        _curve(axis, curve, shown)
+    dense = [fine(curve) for curve in curves]
+    F = np.concatenate([curve.F for curve in dense])
+    stresses = [np.split(np.asarray(_stress(f.law, F)), len(curves)) for f in shown]
+    for k, (axis, curve) in enumerate(zip(axes, curves, strict=False)):
+        _curve(axis, curve, dense[k], [P[k] for P in stresses])
     for axis in axes[len(curves) :]:
         axis.axis("off")
     bars = bottom.subplots()
@@ -92,12 +103,28 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
     return fig
 
 
-def _curve(axis: Any, curve: Curve, fits: list[LawFit]) -> None:
+def fine(curve: Curve) -> Curve:
+    """The path of a curve at `FINE` places, its stress left as zeros.
+
+    Between two points F12 and F21 are straight and the logarithms of the diagonal too, so that every homogeneous test
+    stays one: a side of stretch^(-1/2) does. F33 keeps the volume.
+    """
+    at, places = np.linspace(0, len(curve.stress) - 1, FINE), np.arange(len(curve.stress))
+    F = np.zeros((FINE, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            values = np.log(curve.F[:, i, i]) if i == j else curve.F[:, i, j]
+            F[:, i, j] = np.interp(at, places, values)
+    F[:, [0, 1, 2], [0, 1, 2]] = np.exp(F[:, [0, 1, 2], [0, 1, 2]])
+    F[:, 2, 2] /= np.linalg.det(F)
+    return curve._replace(F=F, stress=np.zeros(FINE))
+
+
+def _curve(axis: Any, curve: Curve, dense: Curve, stresses: list[np.ndarray]) -> None:
     unit, name = (1e6, "MPa") if curve.scale > 1e5 else (1e3, "kPa") if curve.scale > 1e2 else (1.0, "Pa")
     i, j = curve.component
-    for colour, fit in reversed(list(zip(COLOURS, fits, strict=False))):
-        P = np.asarray(jax.jit(lambda F, law=fit.law: homogeneous.nominal_stress(law, F))(curve.F))
-        axis.plot(curve.driven, P[:, i, j] / unit, color=colour, lw=1.2)
+    for colour, P in reversed(list(zip(COLOURS, stresses, strict=False))):
+        axis.plot(dense.driven, P[:, i, j] / unit, color=colour, lw=1.2)
     axis.plot(curve.driven, curve.stress / unit, "o", color="black", ms=3, mfc="none")
     label = "amount of shear" if curve.test == "simple_shear" else "stretch"
     axis.set(title=curve.label.replace("_", " "), xlabel=label, ylabel=f"nominal stress [{name}]")
@@ -110,7 +137,7 @@ def table(fits: list[LawFit]) -> str:
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(
-            f"{n} {v:.4g} ± {e:.1g}{'' if u == '1' else ' ' + u}"
+            f"{n} → {f.limits[n]}" if n in f.limits else f"{n} {v:.4g} ± {e:.1g}{'' if u == '1' else ' ' + u}"
             for n, v, e, u in zip(f.names, f.values, f.standard_errors, f.units, strict=True)
         )
         lines.append(
