@@ -32,6 +32,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
     parser.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     parser.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
+    parser.add_argument(
+        "--density", type=float, metavar="KG_M3", help="of the sample: simulate its inertia (default: none)"
+    )
     parser.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
     parser.add_argument("--steps", type=int, default=50, help="time steps a cycle of the simulation (default 50)")
     parser.add_argument("--scheme", choices=("exponential", "chapter"), default="exponential", help="Prony recursion")
@@ -85,6 +88,10 @@ def identify(options: argparse.Namespace) -> int:
         if value is not None and not 0 < value <= 0.2:
             meant = f"{value / 1000:g}" if 0.2 < value <= 200 else "0.004"
             raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} {meant}")
+    if options.density is not None and not 100 <= options.density <= 25000:
+        raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
+    if options.density is not None and options.method == "closed-form":
+        raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
     laws.find(options.law)
@@ -107,6 +114,7 @@ def identify(options: argparse.Namespace) -> int:
             law=options.law,
             scheme=options.scheme,
             steps=options.steps,
+            density=options.density,
         )
         update, bar = _progress(len(sweep.angular_frequency))
         with bar:

@@ -81,6 +81,23 @@ def test_unconverged_fit_exits_1_and_keeps_its_best_point(tmp_path, monkeypatch,
     assert "not converged" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("density", [None, 1060.0])
+def test_the_density_of_the_command_reaches_the_rig(density, tmp_path, monkeypatch):
+    from fitting.rigs import torsion
+
+    class Seen(Exception):
+        pass
+
+    def make_rig(*_, density=0.0, **__):
+        raise Seen(density)
+
+    monkeypatch.setattr(torsion, "make_rig", make_rig)
+    given = [] if density is None else ["--density", str(density)]
+    with pytest.raises(Seen) as seen:
+        main([str(PORCINE), "--modes", "1", *given, "--out", str(tmp_path)])
+    assert seen.value.args == (density,)
+
+
 HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"
 BAD = {
     "no file": (None, [], "no such file"),
@@ -94,6 +111,13 @@ BAD = {
     "radius in mm": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "4"], "give e.g. --radius 0.004"),
     "radius": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "-1"], "--radius -1.0 cannot be"),
     "height in mm": (HEADER + "1,300,30\n2,310,40\n", ["--height", "nan"], "--height nan cannot be"),
+    "density": (HEADER + "1,300,30\n2,310,40\n", ["--density", "1.06"], "give e.g. --density 1060"),
+    "density unused": (
+        HEADER + "1,300,30\n2,310,40\n",
+        ["--density", "1060", "--method", "closed-form"],
+        "--density 1060 is of the simulation",
+    ),
+    "table": (HEADER + "1,300,30\n2,310,40\n", ["--table", "liver"], "--table liver is no table of the file"),
     "steps": (HEADER + "1,300,30\n2,310,40\n", ["--steps", "1"], "--steps 1 is out of range"),
 }
 

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.optimize
@@ -10,8 +11,9 @@ from conftest import ROOT
 from fitting.fits import viscoelastic
 from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.least_squares import bfgs, levenberg_marquardt
+from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import Sweep, read_sweep
+from fitting.reports import sweep_report
 from liverjax import InputError
 
 TRUTH = np.array([770.0, 0.235, 0.333, 0.27, 0.03])
@@ -195,6 +197,47 @@ def test_a_number_of_modes_that_breaks_down_leaves_the_others(monkeypatch):
     monkeypatch.setattr(viscoelastic, "closed_form", lambda *a: breaking(s, 2))
     with pytest.raises(InputError, match="no number of modes could be fitted"):
         viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
+
+
+@pytest.mark.parametrize("modes", [2, 25])
+def test_the_picture_holds_its_table_and_its_legends_cover_nothing(modes):
+    s = melt()
+    u = generalised_maxwell.starts(s, modes, generalised_maxwell.spectrum(s), count=2)[0]
+    found = with_jacobian(generalised_maxwell.residuals)(
+        u, s.angular_frequency, s.storage, s.loss, np.concatenate(s.deviations)
+    )
+    solution = Solution(u, *found, 0.5 * found[0] @ found[0], 1, 0.0, True)
+    model = generalised_maxwell.natural(u)
+    fitted = (np.asarray(v) for v in generalised_maxwell.moduli(model, jnp.asarray(s.angular_frequency)))
+    spread = uncertainty.estimate(solution, False)
+    one = viscoelastic.Fit("closed-form", model, solution, spread, True, *fitted, (), 0.1, 1.0, {})
+    picture = sweep_report.figure(s, [one, one._replace(method="torsion")])
+    picture.canvas.draw()
+    axes = [a for sub in picture.subfigs for a in sub.axes]
+    top, rest, times, table = axes
+    (text,) = table.texts
+    assert text.get_text().count("\n") == modes + 3
+    assert text.get_window_extent().y0 >= picture.bbox.y0 and text.get_window_extent().x1 <= picture.bbox.x1
+    assert text.get_window_extent().y1 <= times.get_tightbbox().y0 + 1  # a pixel of rounding
+    sizes = [a.get_window_extent().height / picture.dpi for a in (top, rest, times)]
+    assert sizes[0] > 2 and sizes[1] > 0.9 and sizes[2] > 1.5
+    for a in (top, times):
+        assert a.get_legend().get_window_extent().y0 >= a.get_window_extent().y1
+    names = [t.get_text() for t in top.get_legend().get_texts()]
+    assert {"G' simulated", "G'' simulated", "G' measured", "G'' closed form"} <= set(names)
+    plt.close(picture)
+
+
+def test_a_shift_by_inertia_is_not_called_discretisation():
+    closed = viscoelastic.closed_form(sweep(), 1)
+    moved = closed.uncertainty._replace(values=closed.uncertainty.values * np.array([1.0, 1.0, 2.0]))
+    plain, heavy = (
+        viscoelastic._bias(closed, closed._replace(uncertainty=moved, details={"density_kg_m3": density}))
+        for density in (None, 1060.0)
+    )
+    assert "relaxation_times[0]: the simulation's discretisation moves it by 1e+02 %" in plain[0]
+    assert "relaxation_times[0]: the sample's inertia and the discretisation move it by 1e+02 %" in heavy[0]
+    assert "closed form" in plain[0] and "closed form" not in heavy[0]
 
 
 def test_what_auto_chooses_is_not_advised_against():

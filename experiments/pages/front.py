@@ -15,8 +15,9 @@ def job() -> str:
     kilo, sd = found["shear_modulus"] / 1e3, found["standard_errors"]["shear_modulus"] / 1e3
     times = ", ".join(f"{t:.2g}" for t in found["relaxation_times"])
     return (
-        f"Lion's mane jellyfish, 31 measured frequencies: G0 = {kilo:.3g} ± {sd:.2g} kPa, relaxation times {times} s; "
-        f"the fit misses\nthe moduli by {percent(found['mean_relative_error'])} on average. "
+        f"Lion's mane mushroom (Hericium erinaceus), 31 measured frequencies: G0 = {kilo:.3g} ± {sd:.2g} kPa, "
+        f"relaxation times\n{times} s; the fit misses the moduli by "
+        f"{percent(found['mean_relative_error'])} on average. "
         f"{found['total_s']:.0f} s in all on two cores, {found['compile_time_s']:.0f} s of them compilation."
     )
 

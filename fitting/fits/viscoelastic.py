@@ -218,6 +218,7 @@ class Simulation(NamedTuple):
     steps: int = 50
     cell_size: float | None = None
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
+    density: float | None = None  # of the sample [kg/m^3]; None: moduli that the instrument corrected for inertia
 
 
 def simulated_moduli(
@@ -249,7 +250,7 @@ def through_torsion(
     from liverjax.physics.viscosity import check
 
     law = laws.typical(simulation.law)
-    rig = torsion.make_rig(simulation.radius, simulation.height, simulation.cell_size)
+    rig = torsion.make_rig(simulation.radius, simulation.height, simulation.cell_size, density=simulation.density)
     drive = torsion.Drive(steps=simulation.steps)
     check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
@@ -306,6 +307,7 @@ def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law,
         "law": simulation.law,
         "radius_m": simulation.radius,
         "height_m": simulation.height,
+        "density_kg_m3": simulation.density,
         "nodes": rig.mesh.number_of_nodes,
         "elements": rig.mesh.number_of_elements,
         "geometry_factor": float(torsion.geometry_factor(rig, law)),
@@ -321,14 +323,17 @@ def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law,
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
-    """Where discretisation moves a parameter by more than its standard error."""
+    """Where the simulation moves a parameter by more than its standard error, and why."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors = simulated.uncertainty.standard_errors
+    cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
+    if simulated.details.get("density_kg_m3") is not None:  # which the closed form knows nothing of
+        cause, remedy = "the sample's inertia and the discretisation move", "raise --steps to see which it is"
     out = []
     for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):
         if abs(d) > e and abs(d) > 1e-6 * abs(v):
             out.append(
-                f"{name}: the simulation's discretisation moves it by {100 * d / v:.2g} %, more than its "
-                f"standard error ({100 * e / v:.2g} %); raise --steps or trust the closed form"
+                f"{name}: {cause} it by {100 * d / v:.2g} %, more than its standard error ({100 * e / v:.2g} %); "
+                f"{remedy}"
             )
     return out

@@ -99,40 +99,68 @@ def _figure(path: Path, sweep: Sweep, fits: list[Fit]) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    fig = figure(sweep, fits)
+    fig.savefig(path, dpi=150)
+    plt.close(fig)
+
+
+def figure(sweep: Sweep, fits: list[Fit]) -> Any:
+    """Moduli and residuals on the left; time constants and the table of parameters on the right.
+
+    Lengths are inches: the picture grows with the table, so that no panel shrinks and no line is lost.
+    """
+    import matplotlib.pyplot as plt
+
+    fit = fits[-1]
+    lines = _parameter_rows(fit)
+    foot = 0.16 * len(lines) + 0.35
+    height = max(5.6, 3.4 + foot)
+    fig = plt.figure(figsize=(10, height), layout="constrained")
+    halves: Any = fig.subfigures(1, 2, width_ratios=(5.6, 4.4))
+    left, right = halves
+    top, rest = left.subplots(2, 1, sharex=True, height_ratios=(height - 1.9, 1.9))
+    times, table = right.subplots(2, 1, height_ratios=(height - foot, foot))
+    _moduli(top, rest, sweep, fits)
+    _time_constants(times, sweep, fits)
+    table.axis("off")
+    text = table.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=table.transAxes)
+    text.set_in_layout(False)  # its axes are as large as it is
+    seconds = f"{fit.run_time:.2g} s run, {fit.compile_time:.2g} s compile"
+    plural = "s" if fit.modes > 1 else ""
+    mean = 100 * fit.relative_errors(sweep).mean()
+    fig.suptitle(f"{fit.method}, {fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}", fontsize=10)
+    return fig
+
+
+def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
+    """Data, the closed form as a fine line, what was simulated, and the relative difference below."""
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
-    fig = plt.figure(figsize=(9, 5.2), layout="constrained")
-    grid = fig.add_gridspec(3, 2, width_ratios=(3, 2), height_ratios=(3, 1, 0.001))
-    top, rest = fig.add_subplot(grid[0, 0]), fig.add_subplot(grid[1:, 0])
-    fine = np.geomspace(f[0], f[-1], 200)
+    fine = np.geomspace(f[0], f[-1], 400)
     lines = [np.asarray(v) for v in moduli(closed.model, jnp.asarray(2 * np.pi * fine))]
     rows = (
-        ("G'", "storage", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o"),
-        ("G''", "loss", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s"),
+        ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
+        ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
     )
-    spread = sweep.storage_sd is not None
-    for symbol, _, data, sd, simulated, colour, line, marker in rows:
+    for symbol, data, sd, fitted, colour, line, marker, cross in rows:
         if sd is not None:  # a bar below zero has no place on a log axis
             low = np.minimum(sd, 0.9 * data)
             top.errorbar(f, data, yerr=[low, sd], fmt="none", ecolor=colour, alpha=0.35, capsize=2)
-        top.plot(f, data, marker, color=colour, ms=4, label=f"{symbol} measured" + (" ± sd" if spread else ""))
+        measured = f"{symbol} measured" + ("" if sd is None else " ± sd")
+        top.plot(f, data, marker, color=colour, ms=4, mfc="none", label=measured)
         top.plot(fine, line, "-", color=colour, lw=1.2, label=f"{symbol} closed form")
         if fit.method == "torsion":
-            top.plot(f, simulated, "x", color="black", ms=5, label=f"{symbol} simulated" if symbol == "G''" else None)
-        rest.plot(f, 100 * (simulated / data - 1), marker + "-", color=colour, ms=3, lw=0.8, label=symbol)
+            top.plot(f, fitted, cross, color="black", ms=5, label=f"{symbol} simulated")
+        rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
     top.set(xscale="log", yscale="log", ylabel="modulus [Pa]")
-    top.legend(fontsize=8, ncols=2)
+    _legend_above(top, 2)
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
-    seconds = f"{fit.run_time:.2g} s run, {fit.compile_time:.2g} s compile"
-    top.set_title(
-        f"{fit.method}, {fit.modes} modes: mean error {100 * fit.relative_errors(sweep).mean():.2g} %, {seconds}",
-        fontsize=9,
-    )
-    _time_constants(fig.add_subplot(grid[0, 1]), sweep, fits)
-    _parameters(fig.add_subplot(grid[1:, 1]), fit)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
+
+
+def _legend_above(axes: Any, columns: int) -> None:
+    """Outside of the axes, where it covers nothing."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.3, fontsize=8, ncols=columns, frameon=False)
 
 
 def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
@@ -150,12 +178,23 @@ def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
         )
     axes.set(xscale="log", xlabel="relaxation time [s]", ylabel="ratio of G0 [1]")
     axes.set_ylim(bottom=0)
-    axes.legend(fontsize=8)
+    _legend_above(axes, 2)
 
 
-def _parameters(axes: Any, fit: Fit) -> None:
-    axes.axis("off")
-    axes.text(0, 1, "\n".join(_lines(fit)), family="monospace", fontsize=8, va="top", transform=axes.transAxes)
+def _parameter_rows(fit: Fit) -> list[str]:
+    """The moduli, and one line a mode."""
+    u, n = fit.uncertainty, fit.modes
+    equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
+    rows = [
+        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa",
+        f"G_inf {equilibrium:9.4g} ± {u.equilibrium_error:.2g} Pa",
+        "",
+        f"{'mode':4s} {'ratio [1]':>20s} {'relaxation time [s]':>22s}",
+    ]
+    for k in range(n):
+        ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}" for j in (1 + k, 1 + n + k))
+        rows.append(f"{k + 1:4d} {ratio:>20s} {time:>22s}")
+    return rows
 
 
 def _lines(fit: Fit) -> list[str]:
