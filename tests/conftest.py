@@ -60,6 +60,7 @@ def verified(record_property):
 def pytest_configure(config):
     """Programs compiled once are found again by the other worker and by commands that tests start."""
     config.addinivalue_line("markers", "slow: run by python -m pytest -m slow, not by default")
+    config.addinivalue_line("markers", "core: each public entry once, for other versions of Python and jax: -m core")
     config.addinivalue_line("markers", "quick_to_compile: few optimisations, where compiling takes longer than running")
     if config.getoption("--verification"):
         config.option.markexpr = ""

@@ -150,6 +150,7 @@ class Shapeless(lj.Law):
 """
 
 
+@pytest.mark.core
 def test_users_laws_pass_or_are_refused_in_one_sentence(tmp_path, capsys):
     file = tmp_path / "jax.py"  # a name that must not hide the package
     file.write_text(USERS_FILE)

@@ -61,6 +61,7 @@ def test_closed_form_on_measured_data(tmp_path, capsys):
     assert "profile 95 % (closed form)" in capsys.readouterr().out
 
 
+@pytest.mark.core
 def test_bfgs_option(tmp_path):
     code = main(
         [str(PORCINE), "--method", "closed-form", "--modes", "2", "--optimizer", "bfgs", "--out", str(tmp_path)]
@@ -145,6 +146,7 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
     assert "fit.h5 in it is a folder" in capsys.readouterr().err
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("module", ["fitting", "liverjax"])
 def test_help(module):
     run = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)

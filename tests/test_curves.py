@@ -269,6 +269,7 @@ def test_a_parameter_without_data_is_told():
     assert any("leave c2 free" in w for w in stress_stretch.fit(candidate, small).warnings)
 
 
+@pytest.mark.core
 def test_command_writes_table_json_and_picture(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["curves", "fung_demiray", str(DATA / "brain_cortex_curves.csv"), "--out", str(out)]) == 0

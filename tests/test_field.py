@@ -251,6 +251,7 @@ def test_viscosity_from_a_time_series(tmp_path):
         assert found["standard_errors"][name] < 0.1 * true
 
 
+@pytest.mark.core
 @pytest.mark.slow
 def test_the_command_maps_and_goes_on(tmp_path, capsys):
     """Map and sphere from files; everything written; --resume."""

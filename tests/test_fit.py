@@ -44,6 +44,7 @@ def test_parametrisation_has_an_inverse():
         assert np.allclose(uncertainty.parameter_vector(u), model, rtol=1e-12)
 
 
+@pytest.mark.core
 def test_noise_free_sweep_is_recovered():
     f = viscoelastic.closed_form(sweep(), 2)
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() < 1e-6
@@ -299,6 +300,7 @@ def coarse_torsion():
     return s, closed, viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004))
 
 
+@pytest.mark.core
 def test_torsion_fit_recovers_table_2(coarse_torsion):
     _, _, f = coarse_torsion
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() < 5e-3

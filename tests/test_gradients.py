@@ -15,22 +15,23 @@ pytestmark = pytest.mark.quick_to_compile
 RNG = np.random.default_rng(5)
 
 
-def _scene(kind: str) -> lj.Scene:
-    """A block of 81 tetrahedra that hangs, is pulled, pushed and moved, with the physics of `kind`."""
-    mesh = lj.shapes.box((0.05, 0.04, 0.03), (3, 3, 2))
+def _scene(kind: str, cells: tuple[int, int, int] = (3, 3, 2), steps: int = 3) -> lj.Scene:
+    """A block of 108 tetrahedra that hangs, is pulled, pushed and moved, with the physics that `kind` names."""
+    names = set(kind.split())
+    mesh = lj.shapes.box((0.05, 0.04, 0.03), cells)
     top = mesh.node_sets["x_max"]
     side = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["y_max"]))
-    load = {"pressure": 30.0} if kind == "follower" else {"value": jnp.array([5.0, -30.0, 10.0])}
-    dynamic = kind in ("dynamic", "newmark", "complete")
-    viscous = kind in ("viscous", "isochoric", "complete")
-    porous = kind in ("porous", "chapter", "complete")
+    load = {"pressure": 30.0} if "follower" in names else {"value": jnp.array([5.0, -30.0, 10.0])}
+    dynamic = bool(names & {"dynamic", "newmark", "complete"})
+    viscous = bool(names & {"viscous", "isochoric", "complete"})
+    porous = bool(names & {"porous", "chapter", "complete"})
     sponge = lj.Porosity(
         bulk=400.0,
         limit_bulk=2200.0,
         fluid_fraction=0.5,
         permeability=2e-6,
-        drained=mesh.node_sets["z_max"] if kind == "porous" else None,
-        scheme="chapter" if kind == "chapter" else "implicit",
+        drained=mesh.node_sets["z_max"] if "porous" in names else None,
+        scheme="chapter" if "chapter" in names else "implicit",
     )
     return lj.Scene(
         mesh=mesh,
@@ -38,7 +39,7 @@ def _scene(kind: str) -> lj.Scene:
         viscosity=lj.Prony(
             ratios=jnp.array([0.235, 0.333]),
             relaxation_times=jnp.array([0.27, 0.03]),
-            part="isochoric" if kind == "isochoric" else "all",
+            part="isochoric" if "isochoric" in names else "all",
         )
         if viscous
         else None,
@@ -49,8 +50,8 @@ def _scene(kind: str) -> lj.Scene:
         traction=(lj.Traction(triangles=side, **load),),
         solve=lj.Solve(
             kind="dynamic" if dynamic else "static",
-            integrator="newmark" if kind == "newmark" else "euler",
-            steps=3,
+            integrator="newmark" if "newmark" in names else "euler",
+            steps=steps,
             dt=0.02 if dynamic or viscous or porous else None,
             tolerance=1e-12,
         ),
@@ -136,6 +137,44 @@ def _sum(result):
     return jnp.sum(result.positions[-1] ** 2)
 
 
+#: What runs always, several kinds in one program, and some numbers of each; the slow test takes all of them.
+TOGETHER = {
+    "follower": ("law.mu", "displaced.0.by", "traction.0.pressure", "mesh.points"),
+    "dynamic viscous chapter": ("body.density", "start", "viscosity.ratios", "porosity.bulk", "traction.0.value"),
+    "newmark isochoric porous": ("body.gravity", "viscosity.relaxation_times", "porosity.permeability", "solve.dt"),
+}
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("kind", TOGETHER)
+def test_some_leaves_of_a_scene(kind):
+    """Six tetrahedra, two steps: central differences of the value, from the program of the gradient itself."""
+    scene = _scene(kind, cells=(1, 1, 1), steps=2)
+    at = {name: value for name, value in _leaves(scene).items() if name in TOGETHER[kind]}
+    assert len(at) == len(TOGETHER[kind])
+    rng = np.random.default_rng(5)
+    size = {name: 0.002 if name in ("mesh.points", "start") else jnp.abs(value) for name, value in at.items()}
+    along = {name: size[name] * rng.uniform(0.5, 1, value.shape) for name, value in at.items()}
+    found = lj.value_and_gradient(_weighted, scene, at)
+    assert int(found.status) == status.CONVERGED
+    for name in at:
+        slope = float(jnp.vdot(found.gradient[name], along[name]))
+        entries = float(jnp.vdot(abs(found.gradient[name]), abs(along[name])))
+        errors = []
+        for h in (1e-2, 1e-3, 1e-4):
+            ends = [lj.value_and_gradient(_weighted, scene, at | {name: at[name] + s * along[name]}) for s in (h, -h)]
+            errors.append(abs(float(ends[0].value - ends[1].value) / (2 * h) - slope) / entries)
+        # Truncation is h^2, 1e-8 at the last; roundoff of a value at a tolerance of 1e-12 is that over h.
+        assert min(errors) < 1e-7, (name, errors)
+
+
+def _weighted(result):
+    """Positions and reactions, every entry with a weight of its own."""
+    n = result.positions.size
+    weight = jnp.cos(jnp.arange(n, dtype=float)).reshape(result.positions.shape)
+    return jnp.sum(weight * result.positions) + 1e-3 * jnp.sum(weight[::-1] * result.reactions)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("store", ["sqrt", 1, 3])
 def test_what_is_kept_changes_no_derivative(store):
@@ -170,16 +209,18 @@ def test_a_step_keeps_no_more_than_its_state_and_root():
 
 
 def test_codes_of_derivatives():
-    """Through a step that did not converge, and where the adjoint solve gives nothing."""
-    scene = _scene("static")
-    hasty = replace(scene, solve=replace(scene.solve, newton_iterations=2, tolerance=1e-14))
-    assert int(lj.value_and_gradient(_sum, hasty, {"law.mu": 770.0}).status) == status.GRADIENT_UNCONVERGED
-    good = replace(scene, solve=replace(scene.solve, steps=1, tolerance=1e-8))
+    """Through a step that did not converge, and where the adjoint solve gives nothing: one program, two tolerances."""
+    scene = _scene("static", cells=(1, 1, 1), steps=1)
 
     def spoiled(result):
-        return jnp.sum(jnp.where(jnp.isfinite(result.positions), jnp.nan, 0.0) * result.positions)
+        converged = result.status[-1] == status.CONVERGED
+        return jnp.sum(jnp.where(converged, jnp.nan, 1.0) * result.positions)
 
-    assert int(lj.value_and_gradient(spoiled, good, {"law.mu": 770.0}).status) == status.ADJOINT_FAILED
+    for tolerance, code in ((1e-14, status.GRADIENT_UNCONVERGED), (0.1, status.ADJOINT_FAILED)):
+        hasty = replace(scene, solve=replace(scene.solve, newton_iterations=2, tolerance=tolerance))
+        found = lj.value_and_gradient(spoiled, hasty, {"law.mu": 770.0})
+        assert int(found.status) == code
+        assert np.isfinite(float(found.gradient["law.mu"])) == (code == status.GRADIENT_UNCONVERGED)
     for code in (status.GRADIENT_UNCONVERGED, status.ADJOINT_FAILED):
         assert "derivative" in status.advice(code)
 

@@ -13,6 +13,7 @@ import liverjax as lj
 from liverjax.laws import LAWS
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(("dtype", "n"), [(jnp.float64, 16385), (jnp.float32, 32769)])
 def test_known_miscompilation_is_absent(dtype, n):
     # jax issue 39103: 0.10.2 answers 267911424 for 268435456 in the last row.

@@ -10,6 +10,7 @@ from fitting.fits import joint
 from fitting.methods import generalised_maxwell
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
+from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -18,23 +19,25 @@ PRONY = lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.5]))
 R, H = 0.01, 0.01
 
 
-@pytest.mark.slow
-def test_creep_is_that_of_the_standard_linear_solid(verified):
+@pytest.mark.parametrize("times", [(0.1,), pytest.param((0.1, 0.05), marks=pytest.mark.slow)], ids=["one", "two"])
+def test_creep_is_that_of_the_standard_linear_solid(times, verified):
     """All stress relaxes alike, so a small strain creeps as 1/(1-g) - g/(1-g) exp(-t (1-g)/tau), averaged over the
     first step, in which the load comes up; at second order."""
     errors = []
-    for dt in (0.1, 0.05):
+    for dt in times:
         rig = glued.creep(R, H, dt, round(1 / dt), 0.01, cell_size=0.005)
         u, codes = glued.read(rig, LAW, PRONY)
-        elastic = glued.read(glued.creep(R, H, 1.0, 1, 0.01, cell_size=0.005), LAW, None)[0][0]
+        # Nothing relaxes within 1e-9 of the time: the elastic sample, by the same program.
+        elastic = glued.read(rig, LAW, replace(PRONY, relaxation_times=jnp.array([1e9])))[0][-1]
         t = dt * np.arange(1, len(u) + 1)
         rate = 0.6 / 0.5
         exact = 1 / 0.6 - 0.4 / 0.6 * np.exp(-rate * t) * np.expm1(rate * dt) / (rate * dt)
         assert not np.any(codes)
         errors.append(abs(float(u[-1] / elastic / exact[-1]) - 1))
-    order, source = np.log2(errors[0] / errors[1]), "standard linear solid"
-    verified("creep of a cylinder, steps of 0.05 s", source, errors[1], 1e-3, order)
-    assert errors[0] < 1e-3 and errors[0] / errors[1] > 3, errors
+    order = np.log2(errors[0] / errors[1]) if len(times) > 1 else None
+    verified(f"creep of a cylinder, steps of {times[-1]} s", "standard linear solid", errors[-1], 1e-3, order)
+    # Second order in rate dt = 0.12: at most its square over 12, of what has yet to creep, exp(-1.2).
+    assert errors[0] < 4e-4 and (order is None or errors[0] / errors[1] > 3), errors
 
 
 @pytest.mark.slow

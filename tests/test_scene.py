@@ -104,6 +104,7 @@ def test_parameters_by_the_files_own_names(folder):
             lj.with_parameters(scene, {name: 1.0})
 
 
+@pytest.mark.core
 def test_command_leaves_hdf5_vtu_and_a_picture(folder, capsys):
     out = folder / "out"
     assert main(["simulate", str(folder / "scene.toml"), "--out", str(out), "--vtu", "--png"]) == 0

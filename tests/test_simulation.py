@@ -75,6 +75,7 @@ def test_patch_test_is_exact(verified):
     assert np.abs(np.asarray(q).reshape(-1, 3)[inner] - x[inner]).max() < 1e-11 * 0.1
 
 
+@pytest.mark.core
 def test_static_solution_and_reactions_balance():
     mesh = box()
     scene = lj.Scene(
@@ -325,36 +326,7 @@ def test_viscous_ramp_and_hold_of_febio(febio, verified):
     assert errors[0] / errors[1] > 2.5
 
 
-def test_gradients_against_differences():
-    mesh = box()
-    scene = lj.Scene(
-        mesh=mesh,
-        law=LAW,
-        viscosity=TABLE_2,
-        body=lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -9.81])),
-        fixed=(bottom(mesh),),
-        solve=lj.Solve(kind="dynamic", dt=0.03, steps=4, tolerance=1e-12),
-    )
-    names = ("law.mu", "viscosity.relaxation_times", "body.density")
-
-    @jax.jit
-    def loss(values):
-        x = lj.simulate(lj.with_parameters(scene, dict(zip(names, values, strict=True)))).positions
-        return jnp.sum((x[-1] - mesh.points) ** 2)
-
-    at = (770.0, jnp.array([0.27, 0.03]), 1060.0)
-    gradient = jax.jit(jax.grad(loss))(at)
-    for k, direction in ((0, 1.0), (1, jnp.array([1.0, 0.0])), (2, 1.0)):
-        size = float(jnp.sum(jnp.asarray(at[k]) * direction))
-        best = np.inf
-        for relative in (1e-3, 1e-4, 1e-5):
-            h = relative * size
-            plus, minus = (loss((*at[:k], at[k] + sign * h * direction, *at[k + 1 :])) for sign in (1, -1))
-            exact = float(jnp.sum(gradient[k] * direction))
-            best = min(best, abs((plus - minus) / (2 * h) - exact) / abs(exact))
-        assert best < 1e-7
-
-
+@pytest.mark.core
 @pytest.mark.slow
 def test_vmap_is_the_loop():
     mesh = box(1)
@@ -471,11 +443,14 @@ def test_single_precision_says_so():
     assert jax.eval_shape(lj.simulate, once).positions.dtype == jnp.float32
 
 
-@pytest.mark.slow
-def test_cooks_membrane(verified):
+# Pointed corner, linear elements: 3 instead of 4 for halved cells. What is coarse has not come near that yet.
+@pytest.mark.parametrize(
+    ("cells", "allowed", "fall"), [((8, 16), 0.1, 2), pytest.param((32, 64), 0.01, 3, marks=pytest.mark.slow)]
+)
+def test_cooks_membrane(cells, allowed, fall, verified):
     # Miehe 1994, plane strain: the middle of the right edge rises by 14.74 mm.
     errors = []
-    for n in (32, 64):
+    for n in cells:
         flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
         s, t, w = np.asarray(flat.points).T
         points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * 1e-3
@@ -494,9 +469,10 @@ def test_cooks_membrane(verified):
         k = np.argmin(np.linalg.norm(points - np.array([0.048, 0.052, 0]), axis=1))
         errors.append(abs((x - points)[k, 1] / 14.74e-3 - 1))
     order = np.log2(errors[0] / errors[1])
-    verified("Cook's membrane, 24,576 tetrahedra: rise", "14.74 mm (Miehe 1994)", errors[1], 0.01, order)
-    assert errors[1] < 0.01
-    assert errors[0] / errors[1] > 3  # near second order, with the corner's singularity
+    number = f"{6 * cells[1] ** 2:,}"
+    verified(f"Cook's membrane, {number} tetrahedra: rise", "14.74 mm (Miehe 1994)", errors[1], allowed, order)
+    assert errors[1] < allowed
+    assert errors[0] / errors[1] > fall
 
 
 def test_what_ends_unloaded_has_converged():

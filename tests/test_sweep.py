@@ -62,6 +62,7 @@ def content(file) -> dict[str, bytes]:
         return {name: value[()].tobytes() for name, value in out.items()}
 
 
+@pytest.mark.core
 def test_a_batch_is_the_loop_and_a_lane_that_fails_spoils_no_other(files):
     scene = lj.load_scene(files / "scene.toml")
     density = jnp.array([1000.0, 1e12, 1100.0])  # the second falls further than any law holds
@@ -107,6 +108,7 @@ def test_unusable_batches_are_refused(files, values, sentence):
         lj.simulate_batch(lj.load_scene(files / "scene.toml"), values)
 
 
+@pytest.mark.core
 def test_a_sweep_holds_the_rows_of_single_runs(files):
     more = ("--store", "final_positions", "largest_displacement", "final_reactions", "--probe", "0", "3")
     assert main(command(files, *more)) == 0
