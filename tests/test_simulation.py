@@ -443,11 +443,8 @@ def test_single_precision_says_so():
     assert jax.eval_shape(lj.simulate, once).positions.dtype == jnp.float32
 
 
-# Pointed corner, linear elements: 3 instead of 4 for halved cells. What is coarse has not come near that yet.
-@pytest.mark.parametrize(
-    ("cells", "allowed", "fall"), [((8, 16), 0.1, 2), pytest.param((32, 64), 0.01, 3, marks=pytest.mark.slow)]
-)
-def test_cooks_membrane(cells, allowed, fall, verified):
+@pytest.mark.parametrize(("cells", "allowed"), [((16,), 0.1), pytest.param((32, 64), 0.01, marks=pytest.mark.slow)])
+def test_cooks_membrane(cells, allowed, verified):
     # Miehe 1994, plane strain: the middle of the right edge rises by 14.74 mm.
     errors = []
     for n in cells:
@@ -467,12 +464,13 @@ def test_cooks_membrane(cells, allowed, fall, verified):
         )
         x = np.asarray(lj.simulate(scene).check().positions[-1])
         k = np.argmin(np.linalg.norm(points - np.array([0.048, 0.052, 0]), axis=1))
-        errors.append(abs((x - points)[k, 1] / 14.74e-3 - 1))
-    order = np.log2(errors[0] / errors[1])
-    number = f"{6 * cells[1] ** 2:,}"
-    verified(f"Cook's membrane, {number} tetrahedra: rise", "14.74 mm (Miehe 1994)", errors[1], allowed, order)
-    assert errors[1] < allowed
-    assert errors[0] / errors[1] > fall
+        errors.append(1 - (x - points)[k, 1] / 14.74e-3)  # linear elements are too stiff, on every mesh
+    order = np.log2(errors[0] / errors[1]) if len(cells) > 1 else None
+    number = f"{6 * cells[-1] ** 2:,}"
+    verified(f"Cook's membrane, {number} tetrahedra: rise", "14.74 mm (Miehe 1994)", errors[-1], allowed, order)
+    # Three for halved cells, near second order with the corner's singularity: 1 % of 64 cells is 9 % of 16.
+    assert 0 < errors[-1] < allowed
+    assert order is None or errors[0] / errors[1] > 3
 
 
 def test_what_ends_unloaded_has_converged():
