@@ -177,7 +177,7 @@ def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
             tau, g, xerr=x, yerr=y, fmt=marker, color=colour, ms=5, capsize=2, lw=1, label=f"{fit.method}, 95 %"
         )
     axes.set(xscale="log", xlabel="relaxation time [s]", ylabel="ratio of G0 [1]")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # room above the largest
     _legend_above(axes, 2)
 
 
