@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 
 from experiments.pages.results import RESULTS, load, percent
+from experiments.pages.stability import returned
 
 
 def _main_job() -> str:
@@ -229,18 +230,14 @@ def _gradient() -> str:
 
 
 def _inverted() -> str:
-    (data,) = load("stability_inverted")
-    found = [t["projected"] for t in data["laws"].values()]
-    moved = [t["projected, in motion"]["50 % inverted"] for t in data["laws"].values() if "projected, in motion" in t]
-    least = min(r["right"] / r["starts"] for t in found for r in t.values())
-    part = "all" if least == 1 else f"at least {percent(least)} of a law's"
-    most = {c: max(t[c]["most_iterations"] or 0 for t in found) for c in ("20 % inverted", "50 % inverted")}
+    solver = "projected, from the start itself"
+    half, fifth = returned(solver, ("50 % inverted",)), returned(solver, ("20 % inverted",))
+    left = returned("projected, guess left")
+    part = "all" if left.least == 1 else f"at least {percent(left.least)}"
     return (
-        f"at rest {part} starts return with the projected stiffness, within {most['20 % inverted']} iterations with "
-        f"20 % inverted and {most['50 % inverted']} with 50 %: inverted ones are left for the reference shape; in "
-        f"motion, from the start itself, {percent(min(r['right'] / r['starts'] for r in moved))} of those half "
-        "inverted: the others "
-        "end folded, in equilibrium"
+        f"from the start itself, projected, {percent(half.least)} to {percent(half.most)} of those half inverted come "
+        f"back ({half.laws} laws; {percent(half.folded)} of the others end folded, in equilibrium), with 20 % inverted "
+        f"{'all' if fifth.least == 1 else f'at least {percent(fifth.least)}'}; at rest {part}, because an inverted guess is left for the reference shape"
     )
 
 
@@ -353,7 +350,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     "stability_inverted": (
         "scrambled, inverted and crushed starts, every solver: how many come back?",
         _inverted,
-        "its regularised stiffness is the middle row",
+        "its regularised stiffness is the second solver",
     ),
     "stability_steps": ("the liver under its full weight at any step, with and without `robust`", _steps, ""),
     "stability_bulk": ("locking against K/mu", _bulk, ""),
