@@ -1,8 +1,9 @@
 """The chapter's Fig. 4: force and stiffness of a cube of 20,250 tetrahedra, every law, every way.
 
-``python experiments/fig4_assembly.py`` (25 minutes) writes results/fig4_assembly.json and .png, or with ``--laws NAME …``
-replaces those laws in it: medians of interleaved rounds of each way, its error against the vmapped Hessian, its compile time, and the floor: the 45 rows written and
-nothing else, and the time to copy as many bytes as the chapter's full matrices have.
+``python experiments/fig4_assembly.py`` (25 minutes) writes results/fig4_assembly.json and .png; with ``--laws NAME …``
+it replaces those laws in them. Medians of interleaved rounds of each way, its error against the vmapped Hessian, its
+compile time, and the floor: the 45 rows written and nothing else, and the time to copy as many bytes as the chapter's
+full matrices have.
 """
 
 import argparse
