@@ -147,7 +147,7 @@ def _written(values: Any) -> Any:
     """The same, its arrays written to memory (`stored`); plain numbers stay: what is 0 times them is left out."""
     leaves, tree = jax.tree.flatten(values)
     arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))
-    return tree.unflatten([next(arrays) if jnp.ndim(v) else v for v in leaves])
+    return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
 
 
 def _block(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:

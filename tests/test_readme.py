@@ -29,10 +29,14 @@ def test_what_the_claim_on_porosity_takes_is_told_from_both_sides():
     rows = [{"varied": n, "value": v, "ratio": r} for n, found in varied.items() for v, r in found.items()]
     found = porosity.holding({"rows": rows, "table_2": {"bulk": 400.0, "limit_bulk": 2200.0, "permeability": 2e-5}})
     assert found["it takes"] == [
-        "K0 800 Pa (400 is too little)",
-        "permeability 1e-06 m^4/(N s) or less (2e-05 is too much)",
+        "K0 of 800 Pa or more (400 is too little)",
+        "a permeability of 1e-06 m^4/(N s) or less (2e-05 is too much)",
     ]
-    assert found["not enough"] == ["K_lim 2,200 Pa to 8,800 Pa", "gravity grown over 0 s to 3 s", "`keep_bulk = true`"]
+    assert found["not enough"] == [
+        "K_lim of 2,200 Pa to 8,800 Pa",
+        "gravity that grows over 0 s to 3 s",
+        "`keep_bulk = true`",
+    ]
 
 
 @pytest.mark.parametrize("block", BLOCKS[:4], ids=["fit", "many bodies", "check of a law", "rheometer"])

@@ -145,8 +145,8 @@ def _fig4() -> str:
     behind = sum(t["chapter"] > t["standard FEM"] for t in six)
     return (
         f"the chapter's six terms take {span('chapter')} times as long, standard FEM in the same layout "
-        f"{span('standard FEM')}, a vmapped Hessian {span('vmapped Hessian')} (each with or without its parts written "
-        f"to memory, as is faster for it): the six terms are slower than standard FEM in {behind} of {len(six)} laws; "
+        f"{span('standard FEM')}, a vmapped Hessian {span('vmapped Hessian')} (parts written to memory where "
+        f"that was measured to be faster): the six terms are slower than standard FEM in {behind} of {len(six)} laws; "
         f"storing L and U loses in {worse} of {len(both)}"
     )
 

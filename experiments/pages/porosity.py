@@ -6,10 +6,10 @@ from experiments.pages.results import load
 
 #: What is varied: its name on the page, and its unit.
 NAMES = {
-    "bulk": ("K0", " Pa"),
-    "limit_bulk": ("K_lim", " Pa"),
-    "permeability": ("permeability", " m^4/(N s)"),
-    "ramp_s": ("gravity grown over", " s"),
+    "bulk": ("K0 of", " Pa"),
+    "limit_bulk": ("K_lim of", " Pa"),
+    "permeability": ("a permeability of", " m^4/(N s)"),
+    "ramp_s": ("gravity that grows over", " s"),
 }
 
 
@@ -32,7 +32,7 @@ def holding(data: dict[str, Any]) -> dict[str, list[str]]:
             found["not enough"].append(f"{_shown(name, low)} to {high:,g}{NAMES[name][1]}")
         elif good[-1] == mine[-1][0]:
             last_bad = max(v for v, ratio in mine if ratio >= 1)
-            found["it takes"].append(f"{_shown(name, good[0])} ({last_bad:,g} is too little)")
+            found["it takes"].append(f"{_shown(name, good[0])} or more ({last_bad:,g} is too little)")
         else:
             first_bad = min(v for v, ratio in mine if ratio >= 1)
             found["it takes"].append(f"{_shown(name, good[-1])} or less ({first_bad:,g} is too much)")
@@ -54,7 +54,7 @@ def porosity() -> str:
         "Largest displacement of a node of the liver phantom, gravity of 2 m/s2 at once if nothing else is said,",
         f"{data['seconds']:g} s in steps of {data['dt_s']:g} s (Newmark); all with Table 2 but for what is named:",
         "",
-        "| what | with the sponge | without | ratio | least J with it |",
+        "| complete model with | largest displacement | without the sponge | ratio | least J |",
         "|---|---|---|---|---|",
     ]
     for r in data["rows"]:
@@ -62,7 +62,7 @@ def porosity() -> str:
             _shown(r["varied"], r["value"]) if r["varied"] in NAMES else f"{r['value']:,} tetrahedra, first peak"
         )
         state = "" if r["converged"] else " (not all steps converged)"
-        cells = (f"{100 * r['largest_m']:.3g} cm", f"{100 * r['without_m']:.3g} cm", f"{r['ratio']:.3g}{state}")
+        cells = (f"{100 * r['largest_m']:.3g} cm", f"{100 * r['without_m']:.3g} cm", f"{r['ratio']:.3f}{state}")
         rows.append(f"| {name} | " + " | ".join([*cells, f"{r['least_J']:.2f}"]) + " |")
     found = holding(data)
     finer = {r["varied"]: r for r in data["rows"]}["tetrahedra"]
@@ -70,9 +70,9 @@ def porosity() -> str:
         "",
         "The chapter says that porosity prevents unrealistic large deformations. With its own numbers it does not, for",
         f"the law's K = {data['law_bulk_Pa']:g} Pa is off and the sponge's K0 = {data['table_2']['bulk']:g} Pa acts, "
-        "with the fluid beside it, which flows away.",
-        f"The claim holds with {', or '.join(found['it takes'])}.",
-        f"It does not with {', nor '.join(found['not enough'])}. These are numbers of linear",
+        "with a fluid that flows out of what is compressed.",
+        f"The claim holds with {', or with '.join(found['it takes'])}.",
+        f"It does not with {', nor with '.join(found['not enough'])}. These are numbers of linear",
         f"tetrahedra on one mesh of {data['tetrahedra']:,}, too stiff in bending: with eight times as many the first "
         f"peaks are {100 * finer['largest_m']:.3g} and",
         f"{100 * finer['without_m']:.3g} cm. Compare them with each other, not with a liver.",

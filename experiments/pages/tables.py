@@ -108,7 +108,8 @@ def speed() -> str:
     ways = ("chapter", "standard FEM", "autodiff 9 x 9", "vmapped Hessian")
     rows = [
         f"Force and stiffness of {fig4['elements']:,} tetrahedra, every way of a law in one run, with the error",
-        "against the vmapped Hessian. Rivals with or without their parts written to memory, as is faster for them:",
+        "against the vmapped Hessian. Rivals are as books have them, or with their parts written to memory where that",
+        "was measured to be faster:",
         "",
         "| law | time | error | " + " | ".join(f"{way}, times slower" for way in ways) + " |",
         "|---" * (3 + len(ways)) + "|",
