@@ -74,6 +74,8 @@ def motion(curves: dict, rows: list) -> plt.Figure:
         left.plot(curve["times"], 100 * np.array(curve["tip_m"]), color=colour, label=name)
         for newton, marker in ((1, "o"), (25, "s")):
             own = [r for r in rows if r["model"] == name and r["newton"] == newton and r["converged"]]
+            if not own:  # not timed
+                continue
             right.loglog(
                 [r["steps_per_s"] * r["dt"] for r in own],
                 [100 * r["error"] for r in own],
@@ -82,8 +84,8 @@ def motion(curves: dict, rows: list) -> plt.Figure:
                 label=f"{name}, {'one iteration' if newton == 1 else 'to 1e-6'}",
             )
     left.set(xlabel="time [s]", ylabel="tip along gravity [cm]", title="liver phantom, 2 m/s$^2$, steps of 5 ms")
-    left.legend(loc="upper right", ncols=4, fontsize=7)
-    left.set_ylim(top=11.5)
+    left.legend(loc="upper right", ncols=2, fontsize=7)
+    left.set_ylim(top=12.5)
     plain_ticks(right.xaxis, right.yaxis)
     right.axvline(1.0, color="black", lw=0.8)
     right.set(

@@ -77,7 +77,7 @@ def _fig6() -> str:
         ", ".join(f"{m} {speed[m]:.2g} steps a second (error {percent(off[m])})" for m in speed)
         + f" at 0.15 s. Viscosity raises the tip's peak from {peak['hyperelastic']} to {peak['viscous']} cm, and "
         f"lowers its swing after a quarter of the run from {swing['hyperelastic']} to {swing['viscous']} cm; the "
-        f"complete model's peak is {peak['complete']} cm"
+        f"complete model's peak is {peak['complete']} cm, the porohyperelastic one's {peak['porohyperelastic']} cm"
     )
 
 
@@ -364,8 +364,8 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     "fig4_assembly": (
         "Fig. 4: force and stiffness, every law, every way (`assembly_rivals.py`), the write floor",
         _fig4,
-        "up to five times faster than standard FEM (its implementation): here only with the terms contracted, not as "
-        "six; proposes storing L and U",
+        "up to five times faster than standard FEM (its implementation): here the six terms are slower than that, "
+        "the contracted ones faster; proposes storing L and U",
     ),
     "solve_benchmark": (
         "solves: a static cube and its gradient; the liver's steps; preconditioner; factorisation",
