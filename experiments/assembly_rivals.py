@@ -1,10 +1,12 @@
 """Other ways to the same numbers, for comparison: force and the 45 entries of every element's stiffness.
 
 All in the layout of `liverjax.elements.mjed` (the element index last, every scalar written out), except the vmapped
-Hessian. Only the contracted way writes its parts to memory (`liverjax.tensors.matrices.stored`); the others are as
-books have them.
+Hessian. With `write` a rival writes what its blocks share to memory (`liverjax.tensors.matrices.stored`), as the
+contracted way does; without, it is as books have it and the compiler chooses. Which is faster depends on the way, so
+both are measured. A vmapped Hessian has no parts that could be written.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -51,11 +53,11 @@ def contracted(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
     return force, _entries(mesh, invariant_terms.blocks(shared, _shape_vectors(mesh), PAIRS))
 
 
-def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None) -> tuple:
+def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None, write: bool = False) -> tuple:
     """Six terms for every product, section 4.1.2, with `constant` matrices stored or computed on the fly."""
-    F = deformation_gradient(mesh, x)
+    F = _kept(write)(deformation_gradient(mesh, x))
     force = mjed.nodal_force(mesh, chapter_terms.first_piola(law, F))
-    return force, _entries(mesh, chapter_terms.blocks(law, F, _shape_vectors(mesh), PAIRS, False, constant))
+    return force, _entries(mesh, chapter_terms.blocks(law, F, _shape_vectors(mesh), PAIRS, False, constant, write))
 
 
 def stored_matrices(mesh: TetMesh) -> list:
@@ -63,16 +65,21 @@ def stored_matrices(mesh: TetMesh) -> list:
     return chapter_terms.constant_matrices(_shape_vectors(mesh), PAIRS)
 
 
-def standard(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
+def _kept(write: bool) -> Callable:
+    return stored if write else lambda values: values
+
+
+def standard(mesh: TetMesh, law: Any, x: jax.Array, write: bool = False) -> tuple:
     """Standard finite elements: B^T D B and D_a . S D_b, with C^-1 in S and D (Zienkiewicz and Taylor 2000)."""
-    F = deformation_gradient(mesh, x)
+    keep = _kept(write)
+    F = keep(deformation_gradient(mesh, x))
     axes = green_terms.material_axes(law, F[0][0])
     turned = hasattr(law, "fibre")
     FA = matmul(F, axes) if turned else F
     D = [matvec(transpose(axes), d) if turned else d for d in _shape_vectors(mesh)]
-    S, moduli = _elasticity(law, F, FA)
+    S, moduli = keep(_elasticity(law, F, FA))
     SD = [matvec(S, d) for d in D]
-    B = [_strain_displacement(FA, d) for d in D]
+    B = keep([_strain_displacement(FA, d) for d in D])
     DB = [[[_sum(moduli[p][q] * b[q][c] for q in range(6)) for c in range(3)] for p in range(6)] for b in B]
     blocks = []
     for i, j in PAIRS:
@@ -143,9 +150,9 @@ def _parts(first: dict, second: dict, slopes: dict, inverse: Matrix, J: Any, p: 
     return parts
 
 
-def autodiff(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
+def autodiff(mesh: TetMesh, law: Any, x: jax.Array, write: bool = False) -> tuple:
     """dP/dF, 9 x 9, by forward over reverse mode of the energy, then contracted with the shape vectors."""
-    F, D = deformation_gradient(mesh, x), _shape_vectors(mesh)
+    F, D = _kept(write)(deformation_gradient(mesh, x)), _shape_vectors(mesh)
     ones, zeros = jnp.ones_like(F[0][0]), jnp.zeros_like(F[0][0])
 
     def stress(F):
@@ -155,7 +162,7 @@ def autodiff(mesh: TetMesh, law: Any, x: jax.Array) -> tuple:
         direction = tuple(tuple(ones if (r, c) == (k, q) else zeros for c in range(3)) for r in range(3))
         return jax.jvp(stress, (F,), (direction,))[1]
 
-    A = [[column(k, q) for q in range(3)] for k in range(3)]
+    A = _kept(write)([[column(k, q) for q in range(3)] for k in range(3)])
     blocks = []
     for i, j in PAIRS:
         half = [

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.pages import front, identification, overview, stability, tables, verification
+from experiments.pages import front, identification, overview, porosity, stability, tables, verification
 from experiments.pages.results import RESULTS
 
 HERE = Path(__file__).parent.parent
@@ -12,7 +12,7 @@ END = "<!-- end of numbers -->"
 PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     HERE.parent / "README.md": front.PARTS,
     HERE / "README.md": overview.PARTS,
-    HERE / "TABLES.md": tables.PARTS | identification.PARTS | stability.PARTS,
+    HERE / "TABLES.md": tables.PARTS | porosity.PARTS | identification.PARTS | stability.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
 }
 

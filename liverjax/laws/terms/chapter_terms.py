@@ -6,6 +6,7 @@ roundoff at a cost that does not grow with the number of products. `liverjax.law
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from liverjax.laws import products
@@ -25,6 +26,7 @@ from liverjax.tensors.matrices import (
     right_cauchy_green,
     scale,
     scale_matrix,
+    stored,
     transpose,
 )
 
@@ -105,39 +107,67 @@ def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, Any]]
 
 
 def blocks(
-    law: Any, F: Matrix, D: list[Vector], pairs: tuple, regularised: bool = False, constant: list | None = None
+    law: Any,
+    F: Matrix,
+    D: list[Vector],
+    pairs: tuple,
+    regularised: bool = False,
+    constant: list | None = None,
+    write: bool = False,
 ) -> list[Matrix]:
     """d2W/dx_i dx_j per reference volume: G + H + I + Lambda + M + R of every k, and phi'' of a function of the sum.
 
     `regularised` changes the G of every product (not phi''). `constant` is `constant_matrices(D, pairs)`, stored in
     advance as the chapter proposes; without it they are computed here, which is faster (experiments/fig4_assembly.py).
+    `write` writes what blocks share to memory, as `invariant_terms` does; here the compiler does better without.
     """
-    s = _at(law, F)
+    keep = _written if write else lambda values: values
+    s = keep(_at(law, F))
+    nodes = keep([_node(s, d) for d in D])
     constant = constant_matrices(D, pairs) if constant is None else constant
-    return [_block(s, D[i], D[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
+    return [_block(s, nodes[i], nodes[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
 
 
-def _block(s: _At, Di: Vector, Dj: Vector, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
-    ji, jj = matvec(s.cof, Di), matvec(s.cof, Dj)
+class _Node(NamedTuple):
+    """What the six terms need of a node."""
+
+    D: Vector
+    cof: Vector  # cof F D
+    B: Vector  # B D
+    S: list[list[Vector]]  # S^k D, by group and term
+    FS: list[list[Vector]]  # F S^k D
+
+
+def _node(s: _At, D: Vector) -> _Node:
+    S = [[matvec(_stress(t, s), D) for t in terms] for terms, _, _ in s.groups]
+    return _Node(D, matvec(s.cof, D), matvec(s.B, D), S, [[matvec(s.F, v) for v in group] for group in S])
+
+
+def _written(values: Any) -> Any:
+    """The same, its arrays written to memory (`stored`); plain numbers stay: what is 0 times them is left out."""
+    leaves, tree = jax.tree.flatten(values)
+    arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))
+    return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
+
+
+def _block(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
     K = scale_matrix(0.0, IDENTITY)
-    for terms, phi1, phi2 in s.groups:
-        for t in terms:
-            S = _stress(t, s)
-            FSDi, FSDj = matvec(s.F, matvec(S, Di)), matvec(s.F, matvec(S, Dj))
-            G = scale_matrix(t.h2 * t.g, outer(ji, jj))
+    for n, (terms, phi1, phi2) in enumerate(s.groups):
+        for t, FSDi, FSDj, SDj in zip(terms, i.FS[n], j.FS[n], j.S[n], strict=True):
+            G = scale_matrix(t.h2 * t.g, outer(i.cof, j.cof))
             if regularised:  # eps/3 where the chapter prints eps: the trace is kept
                 eps = jnp.clip(1 - s.J, 0, 1)
-                G = add_matrices(scale_matrix(1 - eps, G), scale_matrix(t.h2 * t.g * eps / 3 * dot(ji, jj), IDENTITY))
-            H = scale_matrix(t.h1 * t.g, _second_derivative_of_J(s.F, Di, Dj))
-            I_ = scale_matrix(t.h1, outer(ji, FSDj))
-            Lambda = scale_matrix(t.h1, outer(FSDi, jj))
-            M = scale_matrix(t.h * dot(Di, matvec(S, Dj)), IDENTITY)
-            R = scale_matrix(t.h, matmul(matmul(s.F, _linear_matrices(t, s, Di, Dj, constant)), transpose(s.F)))
+                trace = scale_matrix(t.h2 * t.g * eps / 3 * dot(i.cof, j.cof), IDENTITY)
+                G = add_matrices(scale_matrix(1 - eps, G), trace)
+            H = scale_matrix(t.h1 * t.g, _second_derivative_of_J(s.F, i.D, j.D))
+            I_ = scale_matrix(t.h1, outer(i.cof, FSDj))
+            Lambda = scale_matrix(t.h1, outer(FSDi, j.cof))
+            M = scale_matrix(t.h * dot(i.D, SDj), IDENTITY)
+            R = scale_matrix(t.h, matmul(matmul(s.F, _linear_matrices(t, i, j, constant)), transpose(s.F)))
             for part in (G, H, I_, Lambda, M, R):
                 K = add_matrices(K, scale_matrix(phi1, part))
         if phi2 is not None:
-            ri, rj = _slope(terms, s, Di), _slope(terms, s, Dj)
-            K = add_matrices(K, scale_matrix(phi2, outer(ri, rj)))
+            K = add_matrices(K, scale_matrix(phi2, outer(_slope(terms, i, n), _slope(terms, j, n))))
     return K
 
 
@@ -147,21 +177,20 @@ def _second_derivative_of_J(F: Matrix, Di: Vector, Dj: Vector) -> Matrix:
     return ((0.0, n2, -n1), (-n2, 0.0, n0), (n1, -n0, 0.0))
 
 
-def _linear_matrices(t: _Term, s: _At, Di: Vector, Dj: Vector, constant: tuple[Matrix, Any]) -> Matrix:
+def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Any]) -> Matrix:
     """L + U of dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C."""
-    BDi, BDj = matvec(s.B, Di), matvec(s.B, Dj)
     DiDj, product = constant
     beta = -2 * t.g2
     L = add_matrices(scale_matrix(beta, transpose(DiDj)), scale_matrix(beta * product, IDENTITY))
     U = scale_matrix(4 * (t.g11 + t.g2), DiDj)
-    for weight, a, b in ((t.g12, Di, BDj), (t.g12, BDi, Dj), (t.g22, BDi, BDj)):
+    for weight, a, b in ((t.g12, i.D, j.B), (t.g12, i.B, j.D), (t.g22, i.B, j.B)):
         U = add_matrices(U, scale_matrix(4 * weight, outer(a, b)))
     return add_matrices(L, U)
 
 
-def _slope(terms: list[_Term], s: _At, D: Vector) -> Vector:
-    """d(sum_k g h)/dx of a node."""
-    v = scale(sum(t.h1 * t.g for t in terms), matvec(s.cof, D))
-    for t in terms:
-        v = tuple(a + t.h * b for a, b in zip(v, matvec(s.F, matvec(_stress(t, s), D)), strict=True))
+def _slope(terms: list[_Term], node: _Node, n: int) -> Vector:
+    """d(sum_k g h)/dx of a node, of the terms of group n."""
+    v = scale(sum(t.h1 * t.g for t in terms), node.cof)
+    for t, FS in zip(terms, node.FS[n], strict=True):
+        v = tuple(a + t.h * b for a, b in zip(v, FS, strict=True))
     return v
