@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 
 import liverjax as lj
+from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.physics import boundary
 from liverjax.simulation import tangent
+from liverjax.simulation.equations import Equations, equations, initial_state
 from liverjax.solvers import block_matrix
 from liverjax.solvers.krylov import conjugate_gradients
 from liverjax.tensors import matrices
@@ -22,11 +24,17 @@ def _mass_and_weight(scene: lj.Scene) -> tuple[jax.Array, jax.Array]:
     return mass, mass * jnp.asarray(scene.body.gravity)[None]
 
 
+def at_rest(scene: lj.Scene) -> Equations:
+    """What acts on elements at rest: no inertia, no loads."""
+    plain = replace(scene, body=None, traction=(), solve=replace(scene.solve, kind="static"))
+    return equations(plain, initial_state(plain), 1.0)
+
+
 @jax.jit
 def critical_step(scene: lj.Scene) -> jax.Array:
     """2 / omega_max [s] of the rest state by power iteration: above it central differences blow up."""
     mass, _ = _mass_and_weight(scene)
-    A = tangent.stiffness(scene, None, None, None, scene.mesh.points)
+    A = tangent.stiffness(at_rest(scene), None, scene.mesh.points)
     mask = boundary.free_degrees(scene.mesh, scene.fixed, ())
 
     def stiffness(v):
@@ -77,7 +85,7 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
     mesh = scene.mesh
     mass, weight = _mass_and_weight(scene)
     mask = boundary.free_degrees(mesh, scene.fixed, ())
-    rest = tangent.element_blocks(scene, None, None, matrices.deformation_gradient(mesh, mesh.points))
+    rest = tangent.element_blocks(at_rest(scene), None, matrices.deformation_gradient(mesh, mesh.points))
     own = mjed.element_stiffness(mesh, scene.law, mesh.points)
     full = mjed.all_blocks(own)
     corners = [tuple(mesh.points[mesh.tetrahedra[:, a]].T) for a in range(4)]

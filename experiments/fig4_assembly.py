@@ -24,6 +24,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.plotting import BLUE, COLOURS, GREY
 from liverjax.elements import mjed
 from liverjax.simulation import tangent
+from liverjax.simulation.equations import equations, initial_state
 
 WAYS = {
     "contracted": assembly_rivals.contracted,
@@ -65,7 +66,7 @@ def programs(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array, stored: list
 def into_rows(mesh: lj.mesh.TetMesh, law: lj.laws.Law, x: jax.Array) -> tuple:
     """Force, and the stiffness assembled into the padded rows that the solver multiplies with."""
     scene = lj.Scene(mesh=mesh, law=law)
-    return mjed.internal_force(mesh, law, x), tangent.stiffness(scene, None, None, None, x)
+    return mjed.internal_force(mesh, law, x), tangent.stiffness(equations(scene, initial_state(scene), 1.0), None, x)
 
 
 def medians(made: dict, rounds: int) -> dict[str, float]:

@@ -21,7 +21,7 @@ import liverjax as lj
 from liverjax.core import status
 from liverjax.core.plotting import BLUE, COLOURS, ORANGE
 from liverjax.core.struct import replace
-from liverjax.simulation import run, step
+from liverjax.simulation import equations, run
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 SECONDS, DT = either(1.8, 0.2), either(0.02, 0.05)
@@ -49,7 +49,7 @@ def path(scene: lj.Scene, ramp: float = 0.0, seconds: float = SECONDS) -> dict[s
     """Largest displacement over time; gravity acts at once, or grows over `ramp` seconds."""
     scene = run.prepared(with_solve(scene, 1e4, DT, integrator="newmark"))
     begin = scene if ramp == 0 else lj.with_parameters(scene, {"body.gravity": jnp.zeros(3)})
-    state, moved, least, codes = step.initial_state(begin), [], [], []
+    state, moved, least, codes = equations.initial_state(begin), [], [], []
     for k in range(1, round((seconds + ramp) / DT) + 1):
         state, u, J, code = one_step(scene, state, float(k), 1.0 if ramp == 0 else min(k * DT / ramp, 1.0))
         moved.append(float(u))

@@ -20,6 +20,7 @@ from liverjax.core.plotting import BLUE, GREY, ORANGE
 from liverjax.core.struct import replace
 from liverjax.physics import boundary
 from liverjax.simulation import tangent
+from liverjax.simulation.equations import equations, initial_state
 from liverjax.solvers.krylov import conjugate_gradients
 from liverjax.solvers.preconditioner import Coarse
 
@@ -134,11 +135,12 @@ def preconditioners() -> list[dict]:
         for dt, _ in STEPS:
 
             def solved(law, dt, coarse):
-                setting = tangent.Setting(replace(base, law=law), None, None, mass / dt**2, mask)
-                K = tangent.tangent(setting, None, base.mesh.points, 1.0)
+                scene = replace(base, law=law, solve=replace(base.solve, dt=dt))
+                e = equations(scene, initial_state(scene), 1.0)
+                K = tangent.tangent(e, None, base.mesh.points, 1.0)
                 slow = Coarse(K.slow.inverse, K.slow.used & coarse)
-                precondition = tangent.preconditioner(setting, K._replace(slow=slow))
-                return conjugate_gradients(tangent.product(setting, K), b, precondition, 1e-8, 5000)[1]
+                precondition = tangent.preconditioner(e, K._replace(slow=slow))
+                return conjugate_gradients(tangent.product(e, K), b, precondition, 1e-8, 5000)[1]
 
             results, seconds = medians({n: (solved, law, dt, n == "two-level") for n in ("two-level", "block-Jacobi")})
             rows.append({"bulk_over_mu": ratio, "dt": dt})

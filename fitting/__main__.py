@@ -37,7 +37,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
     parser.add_argument("--steps", type=int, default=50, help="time steps a cycle of the simulation (default 50)")
-    parser.add_argument("--scheme", choices=("exponential", "chapter"), default="exponential", help="Prony recursion")
+    parser.add_argument(
+        "--scheme", choices=("exponential", "backward_euler", "chapter"), default="exponential", help="Prony recursion"
+    )
     parser.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
     parser.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
     parser.add_argument(

@@ -12,6 +12,7 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.physics import boundary
 from liverjax.simulation import automatic, run, tangent
+from liverjax.simulation.equations import equations, initial_state
 from liverjax.solvers import direct
 
 pytestmark = pytest.mark.quick_to_compile
@@ -95,7 +96,8 @@ def test_auto_decides_by_size_and_stiffness():
 
 def test_a_matrix_without_an_inverse_is_told():
     loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # nothing holds it
-    A = jax.jit(lambda: tangent.stiffness(loose, None, None, None, MESH.points))()
+    e = equations(loose, initial_state(loose), 1.0)
+    A = jax.jit(lambda: tangent.stiffness(e, None, MESH.points))()
     A = A._replace(rows=jax.tree.map(jnp.zeros_like, A.rows), diagonal=jax.tree.map(jnp.zeros_like, A.diagonal))
     free = jnp.ones((3, MESH.number_of_nodes))
     assert np.isnan(direct.solve(A, free, free)).all()

@@ -13,7 +13,8 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.physics import boundary
-from liverjax.simulation.step import equations, initial_state, step
+from liverjax.simulation.equations import equations, initial_state
+from liverjax.simulation.step import step
 from liverjax.solvers import continuation
 from liverjax.solvers.continuation import StepOptions
 from liverjax.solvers.krylov import conjugate_gradients

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.laws.terms import invariant_terms
-from liverjax.physics import boundary, porosity, viscosity
-from liverjax.simulation import tangent
+from liverjax.mesh.nodal import to_nodes
+from liverjax.physics import boundary, darcy, porosity, viscosity
+from liverjax.simulation import mixed_system, tangent
+from liverjax.simulation.equations import State, equations, initial_state
 from liverjax.solvers import block_matrix
 from liverjax.solvers.krylov import chebyshev, stabilised_biconjugate_gradients
 from liverjax.tensors.matrices import add_matrices, deformation_gradient, determinant
@@ -41,7 +44,8 @@ def test_pattern_names_every_neighbour_once():
 
 def test_assembled_stiffness_is_the_sparse_one():
     scene = lj.Scene(mesh=MESH, law=LAW)
-    A = jax.jit(lambda x: tangent.stiffness(scene, None, None, None, x))(X)
+    e = equations(scene, initial_state(scene), 1.0)
+    A = jax.jit(lambda x: tangent.stiffness(e, None, x))(X)
     K = mjed.stiffness_matrix(MESH, LAW, X)
     expected = (K @ np.asarray(V).ravel()).reshape(-1, 3)
     assert np.abs(np.stack(block_matrix.product(A, V.T), axis=-1) - expected).max() < 1e-13 * abs(K).max() * 10
@@ -68,27 +72,30 @@ def test_viscous_and_porous_tangent_against_autodiff(part):
         return mjed.nodal_force(MESH, add_matrices(stress, porosity.first_piola(SPONGE, MESH, P, F)))
 
     expected = jax.jit(lambda: jax.jvp(forces, (X,), (V,))[1])()
-    A = jax.jit(lambda: tangent.stiffness(scene, memory, P, None, X))()
+    state = State(MESH.points, (history, porosity.initial_fluid(SPONGE, MESH)))
+    e = equations(replace(scene, solve=lj.Solve(dt=0.05)), state, 1.0)
+    A = jax.jit(lambda: tangent.stiffness(e, P, X))()
     error = np.stack(block_matrix.product(A, V.T), axis=-1) - np.asarray(expected)
     assert np.abs(error).max() < 1e-12 * np.abs(np.asarray(expected)).max()
 
 
 def test_coupled_matrix_against_autodiff():
-    scene = lj.Scene(mesh=MESH, law=LAW, porosity=SPONGE)
+    scene = lj.Scene(mesh=MESH, law=LAW, porosity=SPONGE, solve=lj.Solve(dt=0.05))
     law = porosity.law_in_force(SPONGE, LAW)
+    e = equations(scene, initial_state(scene), 1.0)
     n, fluid = MESH.number_of_nodes, porosity.initial_fluid(SPONGE, MESH)
     P, dP = jnp.asarray(rng.uniform(-50, 50, n)), jnp.asarray(rng.standard_normal(n))
 
     @jax.jit
     def both():
         F = deformation_gradient(MESH, X)
-        flow = porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, MESH.points), 0.05, 1e-10)
-        A = porosity.coupled(MESH, tangent.element_blocks(scene, None, P, F), None, F, flow.matrix)
+        flow = darcy.flow(SPONGE, MESH, fluid.J, deformation_gradient(MESH, MESH.points), 0.05, 1e-10)
+        A = mixed_system.coupled(MESH, tangent.element_blocks(e, P, F), None, F, flow.matrix)
 
         def equations(x, P):
             F = deformation_gradient(MESH, x)
             stress = add_matrices(invariant_terms.first_piola(law, F), porosity.first_piola(SPONGE, MESH, P, F))
-            volume = porosity._scatter(MESH, MESH.volumes * determinant(F) / 4)
+            volume = to_nodes(MESH, MESH.volumes * determinant(F) / 4)
             flux = jnp.stack(block_matrix.product(flow.matrix, (P,)), axis=-1)
             return jnp.concatenate([mjed.nodal_force(MESH, stress), -flux - volume[:, None]], axis=1)
 
@@ -102,7 +109,7 @@ def test_coupled_matrix_against_autodiff():
 
 def test_darcys_laplacian_and_its_polynomial():
     fluid = porosity.initial_fluid(SPONGE, MESH)
-    flow = jax.jit(lambda: porosity.flow(SPONGE, MESH, fluid, deformation_gradient(MESH, X), 0.05, 1e-10))()
+    flow = jax.jit(lambda: darcy.flow(SPONGE, MESH, fluid.J, deformation_gradient(MESH, X), 0.05, 1e-10))()
     n = MESH.number_of_nodes
     A = np.asarray(jax.vmap(lambda e: block_matrix.product(flow.matrix, (e,))[0])(jnp.eye(n)))
     assert np.allclose(A, A.T, rtol=0, atol=1e-15 * A.max())
@@ -111,7 +118,7 @@ def test_darcys_laplacian_and_its_polynomial():
     # All eigenvalues within the polynomial's bounds: its error is theirs. Below the bounds it stays positive definite.
     for low, least in ((lowest, 0.9), (flow.low, 0.0)):
         known = flow._replace(low=jnp.asarray(low))
-        B = np.asarray(jax.vmap(lambda e, known=known: porosity.nearly_solved(MESH, known, e))(jnp.eye(n)))
+        B = np.asarray(jax.vmap(lambda e, known=known: darcy.nearly_solved(MESH, known, e))(jnp.eye(n)))
         assert np.allclose(B, B.T, rtol=0, atol=1e-12 * B.max())
         eigenvalues = np.linalg.eigvals(B @ A).real
         assert eigenvalues.min() > least and eigenvalues.max() < 1.1

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from liverjax.laws.base import isochoric_part
 from liverjax.laws.terms import green_terms, invariant_terms
+from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.tensors.matrices import (
     Matrix,
     Vector,
@@ -73,22 +74,6 @@ def _unit(a: Vector, otherwise: Vector) -> Vector:
     return _chosen(size > 0, scale(1 / jnp.where(size > 0, size, 1.0), a), otherwise)
 
 
-class _Scalars(NamedTuple):
-    """Scalar derivatives at F as a law, to be used in the axes of F, where I1, I2 and J are the same."""
-
-    first: dict
-    second: dict
-    invariants: tuple = ("I1", "I2", "J")
-
-    def measures(self, F: Matrix) -> Matrix:
-        """What `energy_derivatives` takes."""
-        return F
-
-    def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
-        """Slopes and curvatures, given beforehand."""
-        return self.first, self.second
-
-
 def blocks(
     parts: list[tuple[Any, Any]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
 ) -> list[Matrix]:
@@ -120,7 +105,7 @@ def blocks(
                 added.append([scale_matrix(weight, block) for block in green_terms.blocks(part, F, D, pairs)])
                 own = projected(scale_matrix(weight, green_terms.stress(part, F)))
                 metric = own if metric is None else add_matrices(metric, own)
-    result = _isotropic(_Scalars(first, second), stretched, F, D, pairs)
+    result = _isotropic(Scalars(first, second, ("I1", "I2", "J")), stretched, F, D, pairs)
     if metric is not None:
         added.append([_diagonal(dot(D[i], matvec(metric, D[j]))) for i, j in pairs])
     for more in added:
@@ -174,7 +159,7 @@ def _from_axes(values: list, n: Matrix) -> Matrix:
     return total
 
 
-def _isotropic(scalars: _Scalars, stretched: list, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+def _isotropic(scalars: Scalars, stretched: list, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     at = frame(F)
     zero = jnp.zeros_like(at.s[0])
     diagonal = tuple(tuple(at.s[i] if i == j else zero for j in range(3)) for i in range(3))

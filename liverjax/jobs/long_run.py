@@ -18,8 +18,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.versions import versions
 from liverjax.jobs import parts
 from liverjax.scenes.scene import Scene
+from liverjax.simulation.equations import initial_state
 from liverjax.simulation.run import Result, prepared, simulate_part
-from liverjax.simulation.step import initial_state
 from liverjax.solvers.continuation import StepStatistics
 
 _ROWS = ("times", "positions", "reactions", "pressure", "status")

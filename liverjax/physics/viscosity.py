@@ -4,7 +4,8 @@ Both recursions have the form gamma^n = a S^n + c S^(n-1) + b gamma^(n-1):
 
 * ``"exponential"``: exact for a stress linear over the step. e = exp(-dt/tau), q = (1 - e) tau/dt, a = g (1 - q),
   c = g (q - e), b = e. Second order in dt.
-* ``"chapter"``: backward Euler as printed, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). First order in dt.
+* ``"backward_euler"``: as printed, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). First order in dt. Its old name,
+  "chapter", is accepted.
 
 The memory advances once an accepted step; inside a step `recall` is a constant.
 """
@@ -19,10 +20,20 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law, isochoric_part, volumetric_part
 from liverjax.laws.terms import invariant_terms
+from liverjax.physics.base import End, Pairs, Physics, Solid, Start, Step
 from liverjax.tensors.material_axes import SIX, symmetric
-from liverjax.tensors.matrices import Matrix, Vector, add_matrices, dot, matmul, matvec, scale_matrix
+from liverjax.tensors.matrices import (
+    Matrix,
+    Vector,
+    add_matrices,
+    dot,
+    matmul,
+    matvec,
+    right_cauchy_green,
+    scale_matrix,
+)
 
-SCHEMES = ("exponential", "chapter")
+SCHEMES = ("exponential", "backward_euler")
 PARTS = ("all", "isochoric")
 
 
@@ -35,14 +46,19 @@ class Prony:
     part: str = static(
         default="all", about="all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)"
     )
-    scheme: str = static(default="exponential", about="exponential or chapter")
+    scheme: str = static(default="exponential", about="exponential or backward_euler (as printed)")
+
+    def __post_init__(self) -> None:
+        """The old name of a scheme becomes the new one."""
+        if self.scheme == "chapter":
+            object.__setattr__(self, "scheme", "backward_euler")
 
 
 class History(NamedTuple):
     """Memory of every element at the end of a step."""
 
     gamma: jax.Array  # (N, 6, E) [Pa]
-    stress: jax.Array | None  # S^n (6, E) [Pa]; the chapter's scheme does not need it
+    stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
 
 
 class Recall(NamedTuple):
@@ -82,7 +98,7 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
     """a, b, c (N,) of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s]."""
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
-    if prony.scheme == "chapter":
+    if prony.scheme == "backward_euler":
         return g * r / (1 + r), 1 / (1 + r), jnp.zeros_like(g)
     one_minus_q, q_minus_e = _weights(r)
     return g * one_minus_q, jnp.exp(-r), g * q_minus_e
@@ -120,7 +136,7 @@ def initial_history(prony: Prony, number_of_elements: int, dtype: Any = float) -
     """Memory of a body at rest: zero."""
     modes = jnp.asarray(prony.ratios).shape[0]
     gamma = jnp.zeros((modes, 6, number_of_elements), dtype)
-    return History(gamma, None if prony.scheme == "chapter" else jnp.zeros((6, number_of_elements), dtype))
+    return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, number_of_elements), dtype))
 
 
 def recall(prony: Prony, history: History, dt: Any) -> Recall:
@@ -181,13 +197,59 @@ def blocks(
     ]
 
 
-def summands(prony: Prony, memory: Recall, law: Law) -> tuple[list[tuple[Any, Law]], Matrix]:
-    """Laws with weights and a constant second Piola-Kirchhoff stress that `first_piola` is the sum of."""
-    rest = volumetric_part(law) if prony.part == "isochoric" else None
-    parts = [(memory.now, relaxing(prony, law))]
-    return parts if rest is None else [*parts, (1.0, rest)], scale_matrix(-1.0, memory.past)
-
-
 def relaxing(prony: Prony, law: Law) -> Law:
     """What relaxes of a law: all of it, or its isochoric part."""
     return law if prony.part == "all" else isochoric_part(law)
+
+
+@struct
+class Viscoelasticity(Physics):
+    """A solid whose law relaxes."""
+
+    law: Law = param("1", "the instantaneous law")
+    prony: Prony = param("1", "how it relaxes")
+
+    def begin(self, start: Start) -> History:
+        """At rest."""
+        return initial_history(self.prony, start.mesh.number_of_elements, start.x.dtype)
+
+    def freeze(self, memory: History, step: Step) -> "Viscoelastic":
+        """The law beside what is remembered."""
+        return Viscoelastic(law=self.law, prony=self.prony, recall=recall(self.prony, memory, step.dt), dt=step.dt)
+
+    def advance(self, memory: History, acting: "Viscoelastic", end: End) -> History:
+        """The memory takes in the stress at the end of the step."""
+        return advance(self.prony, memory, self.law, end.F, acting.dt)
+
+
+@struct
+class Viscoelastic(Solid):
+    """A relaxing law during a step."""
+
+    law: Law = param("1", "the instantaneous law")
+    prony: Prony = param("1", "how it relaxes")
+    recall: Recall = param("1", "what is remembered")
+    dt: Any = param("s", "time step")
+
+    def stress(self, F: Matrix) -> Matrix:
+        """See `first_piola`."""
+        return first_piola(self.prony, self.recall, self.law, F)
+
+    def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
+        """See `blocks` of this module."""
+        return blocks(self.prony, self.recall, self.law, F, D, pairs)
+
+    def energy(self, F: Matrix) -> jax.Array:
+        """(1 - sum a) W - past : C/2, and U in full where it does not relax: an incremental potential."""
+        law, past = relaxing(self.prony, self.law), self.recall.past
+        C = right_cauchy_green(F)
+        stored = sum(past[i][j] * C[i][j] for i in range(3) for j in range(3))
+        W = self.recall.now * law.strain_energy(law.measures(F)) - 0.5 * stored
+        rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
+        return W if rest is None else W + rest.strain_energy(rest.measures(F))
+
+    def parts(self) -> tuple[list[tuple[Any, Any]], Matrix]:
+        """What relaxes with its weight, what does not, and minus the memory."""
+        rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
+        weighted = [(self.recall.now, relaxing(self.prony, self.law))]
+        return weighted if rest is None else [*weighted, (1.0, rest)], scale_matrix(-1.0, self.recall.past)

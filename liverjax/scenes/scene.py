@@ -12,9 +12,10 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
 from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh, with_points
-from liverjax.physics import porosity
-from liverjax.physics.boundary import Displaced, Fixed, Traction
+from liverjax.physics.base import Physics
+from liverjax.physics.loads import Traction
 from liverjax.physics.porosity import Porosity
+from liverjax.physics.prescribed import Displaced, Fixed
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes.regions import Region
 
@@ -69,14 +70,12 @@ class Scene:
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
     traction: tuple[Traction, ...] = param("1", "loads", default=())
+    physics: tuple[Physics, ...] = param("1", "what else acts: supports, …", unnamed=True, default=())
     solve: Solve = param("1", "how", default=Solve())
 
-
-def element_law(scene: Scene) -> Law:
-    """The law that acts element by element: without its volumetric energy where a sponge or the nodes have that."""
-    if scene.solve.volumetric == "nodal":
-        return laws.isochoric_part(scene.law)
-    return porosity.law_in_force(scene.porosity, scene.law)
+    def named(self, section: str) -> list[int]:
+        """Places in `physics` of those that scene files write as [[section]]."""
+        return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
 def with_parameters(scene: Scene, values: dict[str, Any]) -> Scene:
@@ -102,6 +101,9 @@ def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
             return tuple(value)
         return jnp.array(value, float) if isinstance(thing, jax.Array) else value
     key, rest = path[0], path[1:]
+    if isinstance(thing, Scene) and rest and rest[0].isdigit() and int(rest[0]) < len(thing.named(key)):
+        k = thing.named(key)[int(rest[0])]
+        return replace(thing, physics=_with(thing.physics, [str(k), *rest[1:]], value, name))
     if isinstance(thing, dict) and ".".join(path) in thing:
         return thing | {".".join(path): value}
     if isinstance(thing, TetMesh) and path == ["points"]:

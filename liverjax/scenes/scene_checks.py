@@ -9,6 +9,8 @@ from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import boundary, porosity, viscosity
+from liverjax.physics.base import Physics
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Body, Scene
 
@@ -77,7 +79,9 @@ def check_bounds(scene: Scene) -> None:
     Raises:
         InputError: one sentence with the number's dotted name, value, bound and remedy.
     """
-    bounds.check(scene, leave=("mesh",))
+    bounds.check(scene, leave=("mesh", "physics"))
+    for name, physics in _named_physics(scene):
+        bounds.check(physics, name)
     regions.check_numbers(scene.law, scene.region)
 
 
@@ -98,6 +102,9 @@ def check_scene(scene: Scene) -> None:
         viscosity.check(scene.viscosity, scene.law)
     if scene.porosity is not None:
         porosity.check(scene.porosity)
+    for name, physics in _named_physics(scene):
+        physics.check(scene.mesh, name)
+    _no_two_normals(scene)
     solve = scene.solve
     histories = any(d.history is not None for d in scene.displaced)
     if solve.dt is None:
@@ -123,6 +130,26 @@ def check_scene(scene: Scene) -> None:
         _held(scene)
 
 
+def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:
+    """Every further physics with the name that scene files give it: support.0."""
+    places = {k: f"{p.section}.{n}" for p in scene.physics for n, k in enumerate(scene.named(p.section))}
+    return [(places[k], physics) for k, physics in enumerate(scene.physics)]
+
+
+def _no_two_normals(scene: Scene) -> None:
+    """A node may slide along one oblique plane only, and be held along no axis or all."""
+    taken: dict[int, str] = {}
+    mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
+    for name, physics in _named_physics(scene):
+        if not isinstance(physics, SlidingSupport) or physics.axis:
+            continue
+        for node in np.asarray(physics.nodes).tolist():
+            other = taken.setdefault(node, name)
+            if other != name or 0 < mask[node].sum() < 3:
+                held = f"{other} and {name} both hold" if other != name else f"{name} and a held axis both hold"
+                raise InputError(f"{held} node {node}, in directions that are not at right angles: make places differ")
+
+
 def _no_contradiction(scene: Scene) -> None:
     taken: dict[tuple[int, str], str] = {}
     for kind in ("fixed", "displaced"):
@@ -145,23 +172,23 @@ def _held(scene: Scene) -> None:
     rows, columns = np.repeat(tets, 4, axis=1).ravel(), np.tile(tets, (1, 4)).ravel()
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
     mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
+    fixed = np.argwhere(mask == 0)
+    both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(physics.holds(scene.mesh) for physics in scene.physics)]
+    numbers, directions = (np.concatenate(a) for a in zip(*both, strict=True))
     for piece in range(pieces):
         nodes = np.flatnonzero(label == piece)
-        held = [(node, axis) for node, axis in np.argwhere(mask[nodes] == 0)]
-        points = np.asarray(scene.mesh.points)[nodes]
-        if _rigid_rank(points - points.mean(axis=0), held) < 6:
+        inside = np.isin(numbers, nodes)
+        points = np.asarray(scene.mesh.points)
+        held = points[numbers[inside]] - points[nodes].mean(axis=0)
+        if _rigid_rank(held, directions[inside], np.ptp(points[nodes], axis=0).max()) < 6:
             which = f"piece {piece} ({len(nodes)} nodes)" if pieces > 1 else "the body"
             raise InputError(f"nothing holds {which} against every rigid motion: add [[fixed]] or kind = 'dynamic'")
 
 
-def _rigid_rank(points: np.ndarray, held: list) -> int:
-    """Rank of the six rigid motions as seen by the held degrees of freedom."""
-    if not held:
+def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
+    """Rank of the six rigid motions as seen along held directions (n, 3) at points (n, 3) of a body of that size."""
+    if not len(points):
         return 0
-    size = max(np.abs(points).max(), 1e-300)
-    motions = []
-    for node, axis in held:
-        x = points[node] / size
-        turns = [np.cross(e, x)[axis] for e in np.eye(3)]
-        motions.append([*np.eye(3)[axis], *turns])
-    return int(np.linalg.matrix_rank(np.array(motions), tol=1e-6))
+    # A turn about e moves x by e x x, of which the part along d is (x x d) . e.
+    motions = np.concatenate([directions, np.cross(points / max(size, 1e-300), directions)], axis=1)
+    return int(np.linalg.matrix_rank(motions, tol=1e-6))

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import difflib
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.tetrahedra import UNITS, TetMesh, read_mesh
 from liverjax.physics import boundary, porosity, viscosity
+from liverjax.physics.base import Physics
 from liverjax.physics.boundary import Displaced, Fixed, Traction
 from liverjax.physics.porosity import Porosity
+from liverjax.physics.registry import NAMED
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes import regions
 from liverjax.scenes.regions import Region
@@ -36,6 +39,9 @@ _KEYS = {
     "displaced": ("where", "set", "axes", "by", "history"),
     "traction": ("where", "set", "value", "pressure"),
     "solve": tuple(f.name for f in dataclasses.fields(Solve)),
+} | {
+    section: tuple(dict.fromkeys(key for p in NAMED if p.section == section for key in p.keys))
+    for section in dict.fromkeys(p.section for p in NAMED)
 }
 _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
 
@@ -81,10 +87,23 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
         fixed=tuple(_fixed(mesh, k, t) for k, t in enumerate(_tables(content, "fixed"))),
         displaced=tuple(_displaced(mesh, k, t, folder) for k, t in enumerate(_tables(content, "displaced"))),
         traction=tuple(_traction(mesh, k, t) for k, t in enumerate(_tables(content, "traction"))),
+        physics=tuple(_physics(mesh, content)),
         solve=_solve(_table("solve", content.get("solve", {}))),
     )
     check_scene(scene)
     return scene
+
+
+def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
+    """What tables of `liverjax.physics.registry` describe: the first kind that knows all keys of a table."""
+    for section in dict.fromkeys(p.section for p in NAMED):
+        for k, table in enumerate(_tables(content, section)):
+            name, own = f"{section}.{k}", set(table) - {"where", "set"}
+            kinds = [p for p in NAMED if p.section == section and own and own <= set(p.keys)]
+            if not kinds:
+                known = " or ".join(", ".join(p.keys[2:]) for p in NAMED if p.section == section)
+                raise InputError(f"{name} has {', '.join(sorted(own)) or 'a place alone'}: give {known}")
+            yield kinds[0].read(mesh, table, name)
 
 
 def _known(name: str, table: dict, keys: tuple) -> None:

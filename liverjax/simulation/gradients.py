@@ -18,8 +18,9 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation import checkpoints
+from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.run import Result, simulate
-from liverjax.simulation.step import equations, initial_state, method_of
+from liverjax.simulation.step import method_of
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
 

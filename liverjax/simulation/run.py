@@ -15,7 +15,8 @@ from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
 from liverjax.simulation import automatic, checkpoints
-from liverjax.simulation.step import Sizes, State, equations, force_sizes, initial_state, method_of, step
+from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs
+from liverjax.simulation.step import method_of, step
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.continuation import StepStatistics
@@ -52,7 +53,7 @@ def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | No
         good = finite & (statistics.status != status.NOT_FINITE)
         statistics = statistics._replace(status=jnp.where(finite, statistics.status, status.NOT_FINITE))
         new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
-        P = None if new.fluid is None else new.fluid.pressure
+        P = outputs(scene, new).get("pressure")
         kept = kept._replace(made=kept.made & good)
         return (new, kept), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 

@@ -61,18 +61,36 @@ def row_sums(rows: Block) -> Block:
     return tuple(tuple(jnp.sum(entry, axis=0) for entry in row) for row in rows)
 
 
-def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], inertia: Any = None) -> BlockMatrix:
-    """The matrix of forces (3 x 3 blocks, without the elements' own diagonal ones) and of `inertia` (V,), or None."""
+def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block | None = None) -> BlockMatrix:
+    """The matrix of forces: 3 x 3 blocks of elements, without their own diagonal ones, and blocks that nodes add.
+
+    Args:
+        mesh: `TetMesh`.
+        blocks: of `PAIRS` of every element, of (E,).
+        own: of (V,), added to the diagonal; an entry None where it is 0.
+    """
     rows = off_diagonal(mesh, blocks)
     sums = row_sums(rows)
-    own = [[-sums[min(r, c)][max(r, c)] for c in range(3)] for r in range(3)]
-    if inertia is not None:
-        own = [[own[r][c] + (inertia if r == c else 0.0) for c in range(3)] for r in range(3)]
-    return BlockMatrix(rows, tuple(map(tuple, own)), mesh.pattern.row_nodes)
+    diagonal = tuple(tuple(-sums[min(r, c)][max(r, c)] for c in range(3)) for r in range(3))
+    return BlockMatrix(rows, diagonal if own is None else added(diagonal, own), mesh.pattern.row_nodes)
 
 
-def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
-    """Inverse 3 x 3 blocks; unit rows where `mask` (V, 3) is 0, that of the mean where one is not positive definite."""
+def added(a: Block, b: Block) -> Block:
+    """Sum of two blocks; an entry None is 0."""
+
+    def plus(x: Any, y: Any) -> Any:
+        return y if x is None else x if y is None else x + y
+
+    return tuple(tuple(map(plus, *rows)) for rows in zip(a, b, strict=True))
+
+
+def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
+    """Inverse 3 x 3 blocks; unit rows where `mask` (V, 3) is 0, that of the mean where one is not positive definite.
+
+    Along `normals` (V, 3), unit vectors or 0, nothing moves: their part of a block is its mean.
+    """
+    if normals is not None:
+        diagonal = _across(diagonal, normals)
     A = [
         [diagonal[r][c] * mask[:, r] * mask[:, c] + (1 - mask[:, r] if r == c else 0.0) for c in range(3)]
         for r in range(3)
@@ -87,6 +105,15 @@ def inverse_blocks(diagonal: Block, mask: jax.Array) -> Block:
     return tuple(
         tuple(jnp.where(positive, cof[r][c] / safe, 1 / mean if r == c else 0.0) for c in range(3)) for r in range(3)
     )
+
+
+def _across(A: Block, normals: jax.Array) -> Block:
+    """(I - n n) A (I - n n) + mean n n."""
+    n = normals.T
+    mean = (A[0][0] + A[1][1] + A[2][2]) / 3
+    An = [sum(A[r][c] * n[c] for c in range(3)) for r in range(3)]
+    both = sum(n[r] * An[r] for r in range(3)) + mean
+    return tuple(tuple(A[r][c] - n[r] * An[c] - An[r] * n[c] + both * n[r] * n[c] for c in range(3)) for r in range(3))
 
 
 def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:

@@ -41,6 +41,22 @@ class Stress(NamedTuple):
     p: Any
 
 
+class Scalars(NamedTuple):
+    """Scalar derivatives at one deformation gradient, known beforehand: they stand where a law stands."""
+
+    first: dict
+    second: dict
+    invariants: tuple[str, ...]
+
+    def measures(self, F: Matrix) -> Matrix:
+        """What `energy_derivatives` takes."""
+        return F
+
+    def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
+        """The numbers themselves."""
+        return self.first, self.second
+
+
 class State(NamedTuple):
     """What force and stiffness share at one deformation gradient."""
 

@@ -1,0 +1,60 @@
+"""Parts of a mesh: nodes chosen by place or by name, triangles of its surface."""
+
+import difflib
+from typing import Any
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.tetrahedra import TetMesh
+
+AXES = "xyz"
+
+
+def select(
+    mesh: TetMesh, where: dict[str, float] | None = None, set: str | None = None, name: str = "where"
+) -> np.ndarray:
+    """Node numbers that satisfy all conditions of `where`, or those of a node set of the mesh.
+
+    Args:
+        mesh: `TetMesh`.
+        where: x_min, x_max, y_min, … [m], inclusive within 1e-9 of the mesh's size.
+        set: name of a node set.
+        name: of the condition, for messages.
+
+    Raises:
+        InputError: both or neither given, unknown key or set, no node found.
+    """
+    if (where is None) == (set is None):
+        raise InputError(f'{name}: give either where = {{z_max = 0.0}} or set = "name"')
+    if set is not None:
+        if set not in mesh.node_sets:
+            there = ", ".join(mesh.node_sets) or "none"
+            raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
+        return np.asarray(mesh.node_sets[set])
+    points = np.asarray(mesh.points)
+    tolerance = 1e-9 * np.linalg.norm(np.ptp(points, axis=0))
+    inside = np.ones(len(points), dtype=bool)
+    known = [f"{a}_{end}" for a in AXES for end in ("min", "max")]
+    for key, bound in (where or {}).items():
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
+            raise InputError(f"{name}: {key!r} is not known: did you mean {near}?")
+        if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not np.isfinite(bound):
+            raise InputError(f"{name}: {key} = {bound!r} is not a length: give a number in metres")
+        x = points[:, AXES.index(key[0])]
+        inside &= x >= bound - tolerance if key.endswith("min") else x <= bound + tolerance
+    if not inside.any():
+        low, high = points.min(axis=0), points.max(axis=0)
+        box = ", ".join(f"{a} {lo:.4g} to {hi:.4g}" for a, lo, hi in zip(AXES, low, high, strict=True))
+        raise InputError(f"{name} = {where} meets no node: the mesh spans {box} m")
+    return np.flatnonzero(inside)
+
+
+def boundary_triangles(mesh: TetMesh, nodes: Any | None = None) -> np.ndarray:
+    """Outer triangles (m, 3), normals outwards; with `nodes` those whose three nodes are among them."""
+    tets = np.asarray(mesh.tetrahedra)
+    faces = np.concatenate([tets[:, f] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = faces[np.sort(first[count == 1])]
+    return outer if nodes is None else outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]

@@ -1,0 +1,221 @@
+"""What a physics is: one frozen struct of numbers, and what acts of it during a step.
+
+A scene has a tuple of physics. Each says what it remembers between steps, and what acts during one:
+
+* `begin(start)` -> memory: what it knows of the past at the beginning of a run, any pytree;
+* `freeze(memory, step)` -> what acts: everything that is constant during the step, put together once;
+* `advance(memory, acting, end)` -> memory: after an accepted step;
+* `check(...)`: refuses what no step can use, with one sentence.
+
+What acts is of one of three kinds. Step, tangent and energy are sums over them and know nothing else.
+
+* `Solid` and `VolumeStress` act in elements, before assembly: stress and blocks of the stiffness.
+* `NodalForce` acts at nodes, after assembly: forces and blocks of the diagonal.
+
+A `VolumeStress` has pressures at the nodes, which the mixed system of positions and pressures solves for
+(`liverjax.solvers.mixed_system`).
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.laws.terms.invariant_terms import Scalars
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers.block_matrix import Block, BlockMatrix
+from liverjax.tensors.matrices import Matrix, Vector
+
+#: Which blocks of the stiffness are asked for, as pairs of indices into a list of shape vectors.
+Pairs = tuple[tuple[int, int], ...]
+
+
+class Free(NamedTuple):
+    """Where the body can move: a projection of nodal vectors onto the free directions."""
+
+    mask: jax.Array  # (V, 3) 0 along the axes that are held or prescribed
+    normals: jax.Array | None = None  # (V, 3) unit normals that nodes may not move along, 0 elsewhere
+
+    def vectors(self, field: jax.Array) -> jax.Array:
+        """The free part of a field (V, 3)."""
+        field = self.mask * field
+        if self.normals is None:
+            return field
+        return field - jnp.sum(self.normals * field, axis=1, keepdims=True) * self.normals
+
+    def columns(self, columns: Any) -> list[jax.Array]:
+        """The free part of a field given by its columns x, y, z (V,)."""
+        masked = [m * c for m, c in zip(self.mask.T, columns, strict=True)]
+        if self.normals is None:
+            return masked
+        n = self.normals.T
+        along = n[0] * masked[0] + n[1] * masked[1] + n[2] * masked[2]
+        return [c - along * k for c, k in zip(masked, n, strict=True)]
+
+
+class Start(NamedTuple):
+    """What a run begins with."""
+
+    mesh: TetMesh
+    x: jax.Array  # (V, 3) [m]
+    free: Free
+    force: Callable[[], jax.Array]  # (V, 3) [N] what acts on the nodes at x, without inertia
+
+
+class Step(NamedTuple):
+    """What a step begins with; constant during it."""
+
+    mesh: TetMesh
+    x: jax.Array  # (V, 3) [m] at its beginning
+    k: Any  # its number, from 1
+    steps: int  # of the run
+    dt: Any  # [s] or None: load steps without time
+    inertia: bool  # loads act at once where there is inertia
+    tolerance: Any  # of the residual, without derivative
+    free: Free
+
+
+class End(NamedTuple):
+    """Where an accepted step ended."""
+
+    x: jax.Array  # (V, 3) [m]
+    F: Matrix  # deformation gradients (E,)
+    pressure: Any  # (V,) [Pa] of the nodes, or None
+
+
+class Solid:
+    """Acts in elements; depends on the deformation gradient alone."""
+
+    def stress(self, F: Matrix) -> Matrix:
+        """First Piola-Kirchhoff stress [Pa]."""
+        raise TypeError(f"{type(self).__name__} lacks stress(F)")
+
+    def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
+        """d2W/dx_i dx_j per reference volume for shape vectors D [1/m]."""
+        raise TypeError(f"{type(self).__name__} lacks blocks(F, D, pairs)")
+
+    def energy(self, F: Matrix) -> jax.Array:
+        """Energy density (E,) [Pa]."""
+        raise TypeError(f"{type(self).__name__} lacks energy(F)")
+
+    def parts(self) -> tuple[list[tuple[Any, Any]], Matrix | None]:
+        """Weighted laws, and a constant second Piola-Kirchhoff stress [Pa], that add up to the stress."""
+        raise TypeError(f"{type(self).__name__} lacks parts()")
+
+
+class VolumeStress:
+    """Acts on the volume of elements, with pressures at the nodes."""
+
+    #: Whether pressures depend on where the step ends: then they are unknowns of the mixed system.
+    coupled: ClassVar[bool] = True
+
+    def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+        """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,)."""
+        raise TypeError(f"{type(self).__name__} lacks pressure(mesh, J)")
+
+    def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
+        """First Piola-Kirchhoff stress [Pa] at given pressures (V,)."""
+        raise TypeError(f"{type(self).__name__} lacks stress(mesh, pressure, F)")
+
+    def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
+        """Stress and slope at given pressures."""
+        raise TypeError(f"{type(self).__name__} lacks scalars(mesh, pressure, F)")
+
+    def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+        """Energy [J] at volume ratios J (E,), pressures solved for."""
+        raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
+
+    def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
+        """Matrix of the pressures [m^3/Pa]; `positive`: with no negative eigenvalue."""
+        raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
+
+    #: The equation of pressures that flow (`liverjax.physics.darcy.Flow`); None: each node by itself.
+    flow: Any = None
+
+
+class NodalForce:
+    """Acts at nodes."""
+
+    #: Whether it acts on every node: then it keeps slow motions from holding up the linear solver.
+    everywhere: ClassVar[bool] = False
+    #: Whether the force has an energy; one that follows the body has none, and its stiffness is not symmetric.
+    conservative: bool = True
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at part s of the step."""
+        raise TypeError(f"{type(self).__name__} lacks force(mesh, x, s)")
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Energy [J] at the end of the step."""
+        raise TypeError(f"{type(self).__name__} lacks energy(mesh, x)")
+
+    def stiffness(self) -> Block | None:
+        """Diagonal blocks 3 x 3 of (V,) [N/m], an entry None where it is 0; None: the force is constant."""
+        return None
+
+    def predicted(self) -> jax.Array | None:
+        """Positions (V, 3) [m] where the body would go by itself: the first guess of Newton; None: it stays."""
+        return None
+
+    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+        """Change (V, 3) [N] of a force that is not conservative, with a motion dx (V, 3) [m]."""
+        return jax.jvp(lambda x: self.force(mesh, x, s), (x,), (dx,))[1]
+
+
+class Physics:
+    """One physics of a scene: a struct of numbers; see the module."""
+
+    #: Table of the scene file that it is read from, and the keys of that table.
+    section: ClassVar[str] = ""
+    keys: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Physics":
+        """From a table of a scene file.
+
+        Raises:
+            InputError: values that cannot be used.
+        """
+        raise TypeError(f"{cls.__name__} has no table in scene files")
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Refuse what no step can use; host side.
+
+        Raises:
+            InputError: one sentence that begins with `name`.
+        """
+
+    def begin(self, start: Start) -> Any:
+        """Memory at the beginning of a run; None: it remembers nothing."""
+        return None
+
+    def freeze(self, memory: Any, step: Step) -> Any:
+        """What acts during a step; None: nothing acts."""
+        return None
+
+    def advance(self, memory: Any, acting: Any, end: End) -> Any:
+        """Memory after an accepted step."""
+        return memory
+
+    def constrain(self, free: Free) -> Free:
+        """The free directions, without those that this physics takes away."""
+        return free
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Node numbers (n,) and directions (n, 3) along which the body is held against rigid motion."""
+        return np.zeros(0, int), np.zeros((0, 3))
+
+    def bulk_modulus(self) -> Any:
+        """Bulk modulus [Pa] that acts in place of the law's; None: the law's acts."""
+        return None
+
+    def output(self, memory: Any) -> dict[str, jax.Array]:
+        """What the result shows of it beside positions and reactions."""
+        return {}
+
+
+def diagonal(value: jax.Array) -> Block:
+    """Blocks of a value (V,) along every axis."""
+    return ((value, None, None), (None, value, None), (None, None, value))

@@ -1,0 +1,110 @@
+"""Darcy's law (chapter, section 4.3): the fluid's pressure at the nodes, stored and conducted.
+
+    (1/K_lim) dP/dt = kappa lap P - (dJ/dt)/J
+
+Volumes are those at the beginning of a step, so that the equation is linear in P: A P = b.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.elements.gradients import volume_gradients
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.nodal import to_nodes
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers import block_matrix, preconditioner
+from liverjax.solvers.krylov import chebyshev, differentiable_solve
+from liverjax.solvers.preconditioner import Coarse
+from liverjax.tensors.matrices import Matrix, dot
+
+#: Flat and inverted elements store and conduct fluid as elements of this J.
+_LEAST_J = 1e-3
+
+
+class Flow(NamedTuple):
+    """dt times storage rate plus Darcy's Laplacian, in the positions at the beginning of a step: made once a step."""
+
+    matrix: block_matrix.BlockMatrix  # symmetric positive definite, 1 x 1 blocks
+    store: jax.Array  # (V,) [m^3/Pa]
+    mask: jax.Array  # (V,) 0 where P is given
+    slow: Coarse  # coarse space of the matrix
+    low: jax.Array  # about the least eigenvalue of D^-1 A beyond the coarse space
+    high: jax.Array  # no eigenvalue of D^-1 A is above it
+    tolerance: Any  # of a solve, relative to its right-hand side
+
+
+def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, tolerance: Any) -> Flow:
+    """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
+    mask = jnp.ones(mesh.points.shape[0], J.dtype)
+    if porosity.drained is not None:
+        mask = mask.at[porosity.drained].set(0.0)
+    # Everything times dt: the storage term stays of the size of a volume whatever the step.
+    J = jnp.maximum(J, _LEAST_J)
+    store = to_nodes(mesh, mesh.volumes * J / 4) / porosity.limit_bulk
+    g = volume_gradients(mesh, F)
+    # grad N_a = cof(F) D_a / J per current volume J V0.
+    weight = dt * porosity.permeability * mesh.volumes / J
+    rows = block_matrix.off_diagonal(mesh, {(a, b): ((weight * dot(g[a], g[b]),),) for a, b in PAIRS})
+    diagonal = ((store - block_matrix.row_sums(rows)[0][0],),)
+    A = block_matrix.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)
+    A0, total, rate = jax.lax.stop_gradient((A, jnp.sum(diagonal[0][0]), dt * porosity.permeability))
+    # Storage, and Darcy flow at the wave number 5 / width: slower waves the coarse space takes (measured: 4.9 to 5.4).
+    waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
+    low = jax.lax.stop_gradient(jnp.sum(store) + waves) / total
+    slow = preconditioner.coarse(mesh, A0, mask[:, None], True)
+    high = 1 + jnp.max(jnp.sum(jnp.abs(A0.rows[0][0]), axis=0) / A0.diagonal[0][0])  # Gershgorin
+    return Flow(A, store, mask, slow, low, high, tolerance)
+
+
+def solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
+    """A^-1 b for b (V,), A the matrix of the pressure, to the tolerance of the flow; has derivatives."""
+
+    def apply(p):
+        # A unit row where drained: adjoint loads need not vanish there.
+        return flow.mask * _product(flow, flow.mask * p) + (1 - flow.mask) * p
+
+    diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
+    slow = preconditioner.correction(mesh, flow.slow, flow.mask[:, None])
+
+    def precondition(r):
+        return r / diagonal + slow((r,))[0]
+
+    D = jax.lax.stop_gradient(diagonal)
+    return differentiable_solve(apply, b, precondition, flow.tolerance, 2000, diagonal=D)
+
+
+def _product(flow: Flow, p: jax.Array) -> jax.Array:
+    """A p, by differences of neighbours: where p is uniform nothing flows, however large dt and however few digits."""
+    rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
+
+    def add(slot, total):
+        return total + rows[slot] * (p[nodes[slot]] - p)
+
+    return jax.lax.fori_loop(0, nodes.shape[0], add, flow.store * p)
+
+
+#: Error of the polynomial that stands for the inverse of the pressure's matrix in Newton's direction.
+_POLYNOMIAL_ERROR = 0.1
+
+
+def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
+    """Near A^-1 b for b (V,), A the matrix of the pressure: a symmetric, positive definite, linear map.
+
+    The slow waves exactly, by the coarse space, the others by a polynomial.
+    """
+    d = flow.matrix.diagonal[0][0]
+    degree = jnp.ceil(0.5 * jnp.sqrt(flow.high / flow.low) * jnp.log(2 / _POLYNOMIAL_ERROR)).astype(jnp.int32)
+    exact = preconditioner.correction(mesh, flow.slow, flow.mask[:, None])
+
+    def apply(p):
+        return flow.mask * _product(flow, p)
+
+    def slow(r):
+        return exact((r,))[0]
+
+    b = flow.mask * b
+    at_once = slow(b)
+    p = chebyshev(apply, b - apply(at_once), d, (flow.low, flow.high), degree)
+    return at_once + p - slow(apply(p))

@@ -1,0 +1,111 @@
+"""An elastic support: springs between the body and a wall that does not move, on nodes or on a part of the surface.
+
+Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
+(a Winkler foundation). They begin without tension. A third of every triangle counts at each of its nodes.
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, struct
+from liverjax.mesh import selection
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import NodalForce, Physics, Step
+from liverjax.solvers.block_matrix import Block
+
+
+@struct
+class ElasticSupport(Physics):
+    """Springs on triangles of the surface (`normal`, `tangential`) or on nodes (`stiffness`)."""
+
+    triangles: Any = param("1", "node numbers (m, 3)", lower=0, default=None)
+    normal: Any = param("Pa/m", "stiffness per area along the normal", lower=0.0, default=0.0)
+    tangential: Any = param("Pa/m", "stiffness per area along the surface", lower=0.0, default=0.0)
+    nodes: Any = param("1", "node numbers (n,)", lower=0, default=None)
+    stiffness: Any = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
+
+    section: ClassVar[str] = "support"
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "normal", "tangential", "stiffness")
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "ElasticSupport":
+        """From [[support]]: a place, and stiffnesses."""
+        nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
+        given: dict[str, Any] = {k: table[k] for k in ("normal", "tangential", "stiffness") if k in table}
+        if ("stiffness" in given) == bool({"normal", "tangential"} & set(given)):
+            raise InputError(
+                f"{name} needs either normal and tangential in Pa/m, for springs on the surface, or stiffness in N/m, "
+                "for springs on nodes: give one of them"
+            )
+        if "stiffness" in given:
+            return cls(nodes=jnp.asarray(nodes, jnp.int32), **given)
+        triangles = selection.boundary_triangles(mesh, nodes)
+        if not len(triangles):
+            raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
+        return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Node numbers of the mesh, and a place."""
+        if (self.triangles is None) == (self.nodes is None):
+            raise InputError(f"{name} needs either triangles or nodes: give one of them")
+        numbers = np.asarray(self.nodes if self.triangles is None else self.triangles)
+        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
+            raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
+
+    def freeze(self, memory: Any, step: Step) -> "Springs":
+        """One symmetric block a node."""
+        return Springs(blocks=blocks(self, step.mesh))
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Along the axes of every node's block that have a stiffness."""
+        K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
+        size, axes = np.linalg.eigh(K)
+        node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
+        return node, axes[node, :, axis]
+
+
+def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
+    """3 x 3 blocks of (V,) [N/m]."""
+    zero = jnp.zeros(mesh.points.shape[0], mesh.points.dtype)
+    if support.triangles is None:
+        own = zero.at[support.nodes].add(support.stiffness)
+        return tuple(tuple(own if r == c else zero for c in range(3)) for r in range(3))
+    corner = mesh.points[support.triangles]
+    twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    double = jnp.sqrt(jnp.sum(twice * twice, axis=1))
+    n, third = twice / double[:, None], double / 6
+
+    def entry(r: int, c: int) -> jax.Array:
+        along = support.tangential if r == c else 0.0
+        share = third * ((support.normal - support.tangential) * n[:, r] * n[:, c] + along)
+        total = zero
+        for a in range(3):
+            total = total.at[support.triangles[:, a]].add(share)
+        return total
+
+    upper = {(r, c): entry(r, c) for r in range(3) for c in range(r, 3)}
+    return tuple(tuple(upper[min(r, c), max(r, c)] for c in range(3)) for r in range(3))
+
+
+@struct
+class Springs(NodalForce):
+    """Springs during a step."""
+
+    blocks: Block = param("N/m", "3 x 3 of (V,)")
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Blocks times displacement."""
+        u = (x - mesh.points).T
+        return jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks], axis=-1)
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Half of displacement times force."""
+        return 0.5 * jnp.sum((x - mesh.points) * self.force(mesh, x, 1.0))
+
+    def stiffness(self) -> Block:
+        """The blocks."""
+        return self.blocks

@@ -1,0 +1,45 @@
+"""A hyperelastic solid: its law acts in every element, and nothing is remembered."""
+
+from typing import Any
+
+import jax
+
+from liverjax.core.struct import param, struct
+from liverjax.laws.base import Law
+from liverjax.laws.terms import invariant_terms
+from liverjax.physics.base import Pairs, Physics, Solid, Step
+from liverjax.tensors.matrices import Matrix, Vector
+
+
+@struct
+class Elasticity(Physics):
+    """A law that acts element by element."""
+
+    law: Law = param("1", "the law")
+
+    def freeze(self, memory: Any, step: Step) -> "Elastic":
+        """The law itself."""
+        return Elastic(law=self.law)
+
+
+@struct
+class Elastic(Solid):
+    """The law during a step."""
+
+    law: Law = param("1", "the law")
+
+    def stress(self, F: Matrix) -> Matrix:
+        """By the hand-derived terms."""
+        return invariant_terms.first_piola(self.law, F)
+
+    def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
+        """By the hand-derived terms."""
+        return invariant_terms.blocks(invariant_terms.state(self.law, F), D, pairs)
+
+    def energy(self, F: Matrix) -> jax.Array:
+        """Strain energy."""
+        return self.law.strain_energy(self.law.measures(F))
+
+    def parts(self) -> tuple[list[tuple[Any, Any]], None]:
+        """The law alone."""
+        return [(1.0, self.law)], None

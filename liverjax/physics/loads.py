@@ -1,0 +1,115 @@
+"""Loads: weight, dead tractions, and pressures that follow the body."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.struct import param, static, struct
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import NodalForce, Physics, Step
+
+
+@struct
+class Traction:
+    """A load on boundary triangles: dead (`value`), or a pressure that follows them."""
+
+    triangles: Any = param("1", "node numbers (m, 3), normals outwards", lower=0)
+    value: Any = param("Pa", "force per reference area (3,); direction and reference area count", default=None)
+    pressure: Any = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
+
+
+def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
+    """Dead nodal forces (V, 3) [N]: a third of reference area times traction at each corner."""
+    force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
+    for load in tractions:
+        if load.value is None:
+            continue
+        corner = mesh.points[load.triangles]
+        normal = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        area = 0.5 * jnp.sqrt(jnp.sum(normal * normal, axis=1))
+        share = (area / 3)[:, None] * jnp.asarray(load.value, force.dtype)[None]
+        for a in range(3):
+            force = force.at[load.triangles[:, a]].add(share)
+    return force
+
+
+def follows(tractions: tuple) -> bool:
+    """Whether a load follows the body: then the tangent is not symmetric."""
+    return any(load.pressure is not None for load in tractions)
+
+
+def follower_forces(tractions: tuple, x: jax.Array) -> jax.Array:
+    """Nodal forces (V, 3) [N] of the pressures at positions x (V, 3) [m]: a third of -p n da at each corner."""
+    force = jnp.zeros_like(x)
+    for load in tractions:
+        if load.pressure is None:
+            continue
+        corner = x[load.triangles]
+        twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        for a in range(3):
+            force = force.at[load.triangles[:, a]].add(-load.pressure / 6 * twice)
+    return force
+
+
+def dead_loads(mesh: TetMesh, density: Any, gravity: Any, tractions: tuple) -> jax.Array:
+    """Nodal forces (V, 3) [N] that do not follow the body: weight (none where `density` is None) and tractions."""
+    force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
+    if density is not None:
+        mass = density * nodal_volumes(mesh)
+        force = force + mass[:, None] * jnp.asarray(gravity, force.dtype)[None]
+    return force + nodal_tractions(mesh, tractions) if tractions else force
+
+
+@struct
+class Loads(Physics):
+    """What pulls and pushes a body."""
+
+    density: Any = param("kg/m^3", "None: no weight", default=None)
+    gravity: Any = param("m/s^2", "(3,)", default=None)
+    traction: tuple[Traction, ...] = param("1", "on the surface", default=())
+
+    def freeze(self, memory: Any, step: Step) -> "Loading":
+        """Dead loads are summed once; which part of them acts depends on the part of the step."""
+        dead = dead_loads(step.mesh, self.density, self.gravity, self.traction)
+        growth = "steps" if step.dt is None else "none" if step.inertia else "first"
+        return Loading(dead=dead, traction=self.traction, k=step.k, steps=step.steps, growth=growth)
+
+
+@struct
+class Loading(NodalForce):
+    """Loads during a step."""
+
+    dead: jax.Array = param("N", "(V, 3)")
+    traction: tuple[Traction, ...] = param("1", "of which pressures follow the body")
+    k: Any = param("1", "number of the step")
+    steps: int = static(default=1, about="of the run")
+    growth: str = static(default="none", about="steps: with the load steps; first: within the first step; none")
+
+    @property
+    def conservative(self) -> bool:  # type: ignore[override]
+        """No pressure follows the body."""
+        return not follows(self.traction)
+
+    def fraction(self, s: Any) -> Any:
+        """Part of the loads that acts at part s of the step."""
+        if self.growth == "steps":
+            return (self.k - 1 + s) / self.steps
+        dtype = self.dead.dtype
+        return jnp.ones((), dtype) if self.growth == "none" else jnp.where(self.k == 1, s, 1.0).astype(dtype)
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Minus the loads."""
+        outer = self.fraction(s) * self.dead
+        if follows(self.traction):
+            outer = outer + self.fraction(s) * follower_forces(self.traction, x)
+        return -outer
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Minus the work of the dead loads."""
+        return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
+
+    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+        """Of the pressures alone: dead loads do not change."""
+        return -jax.jvp(lambda x: self.fraction(s) * follower_forces(self.traction, x), (x,), (dx,))[1]

@@ -1,0 +1,57 @@
+"""Prescribed motion: nodes that are held, and nodes that are moved."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.struct import param, static, struct
+from liverjax.mesh.selection import AXES
+from liverjax.mesh.tetrahedra import TetMesh
+
+
+@struct
+class Fixed:
+    """Nodes that do not move along some axes."""
+
+    nodes: Any = param("1", "node numbers (n,)", lower=0)
+    axes: str = static(default="xyz", about="held axes")
+
+
+@struct
+class Displaced:
+    """Nodes that are moved: by `by` at the last step, proportionally before, or along a history."""
+
+    nodes: Any = param("1", "node numbers (n,)", lower=0)
+    by: Any = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
+    times: Any = param("s", "times of a history (T,)", default=None)
+    history: Any = param("m", "displacements at these times (T, 3), linear in between", default=None)
+    axes: str = static(default="xyz", about="prescribed axes")
+
+
+def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
+    """1 where a degree of freedom is solved for, 0 where it is held or prescribed: (V, 3)."""
+    mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
+    for condition in (*fixed, *displaced):
+        for axis in condition.axes:
+            mask = mask.at[condition.nodes, AXES.index(axis)].set(0.0)
+    return mask
+
+
+def prescribed(mesh: TetMesh, displaced: tuple, time: Any, fraction: Any) -> jax.Array:
+    """Displacements (V, 3) [m] of prescribed degrees of freedom, zero elsewhere.
+
+    Args:
+        time: [s], for histories.
+        fraction: of the whole run, for `by`.
+    """
+    u = jnp.zeros(mesh.points.shape, mesh.points.dtype)
+    for condition in displaced:
+        for axis in condition.axes:
+            k = AXES.index(axis)
+            if condition.by is not None:
+                value = jnp.asarray(condition.by, u.dtype)[..., k] * fraction
+            else:
+                value = jnp.interp(time, condition.times, jnp.asarray(condition.history)[:, k])
+            u = u.at[condition.nodes, k].set(value)
+    return u

@@ -1,0 +1,47 @@
+"""The physics of a scene, in order; and those that a scene file may name beside the sections of every scene."""
+
+from typing import Any
+
+from liverjax.laws.base import Law, isochoric_part
+from liverjax.physics import porosity
+from liverjax.physics.averaged_volume import AveragedVolume
+from liverjax.physics.base import Physics
+from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.elasticity import Elasticity
+from liverjax.physics.inertia import Inertia
+from liverjax.physics.loads import Loads
+from liverjax.physics.sliding_support import SlidingSupport
+from liverjax.physics.viscosity import Viscoelasticity
+
+#: Physics with a table of their own in scene files: a new one is a line here.
+NAMED: tuple[type[Physics], ...] = (
+    ElasticSupport,
+    SlidingSupport,
+)
+
+
+def law_at_rest(scene: Any) -> Law:
+    """The law that holds the body together at rest, in whole."""
+    return porosity.law_in_force(scene.porosity, scene.law)
+
+
+def physics_of(scene: Any) -> tuple[Physics, ...]:
+    """What acts in a `liverjax.scenes.scene.Scene`: what it lacks is not there."""
+    law, averaged = law_at_rest(scene), scene.solve.volumetric == "nodal"
+    if averaged:
+        law = isochoric_part(scene.law)
+    solid: Physics = Elasticity(law=law)
+    if scene.viscosity is not None:
+        solid = Viscoelasticity(law=law, prony=scene.viscosity)
+    found: list[Physics] = [solid]
+    if scene.porosity is not None:
+        found.append(scene.porosity)
+    elif averaged:
+        found.append(AveragedVolume(law=scene.law))
+    body = scene.body
+    if body is not None and scene.solve.kind == "dynamic":
+        found.append(Inertia(density=body.density, integrator=scene.solve.integrator))
+    if body is not None or scene.traction:
+        weight = {} if body is None else {"density": body.density, "gravity": body.gravity}
+        found.append(Loads(traction=scene.traction, **weight))
+    return (*found, *scene.physics)

@@ -1,0 +1,84 @@
+"""A sliding support: nodes of a plane part of the body that stay in that plane, and move in it without friction."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.mesh import selection
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import Free, Physics
+
+#: Distance from the plane that counts as in it, over the extent of the nodes.
+_FLAT = 1e-6
+
+
+@struct
+class SlidingSupport(Physics):
+    """Nodes that do not move along a normal: along an axis, or any direction."""
+
+    nodes: Any = param("1", "node numbers (n,)", lower=0)
+    normal: Any = param("1", "of the plane (3,), of length 1; not used with an axis", default=None)
+    axis: str = static(default="", about="x, y or z where the normal is that axis")
+
+    section: ClassVar[str] = "support"
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "sliding")
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "SlidingSupport":
+        """From [[support]] with `sliding = true`: the plane is that of the nodes."""
+        if table["sliding"] is not True:
+            raise InputError(
+                f"{name} sliding = {table['sliding']!r} is not true: write sliding = true, or leave it out"
+            )
+        nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
+        return on_plane(mesh, nodes, name)
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Node numbers of the mesh, and a direction."""
+        numbers = np.asarray(self.nodes)
+        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
+            raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
+        if self.axis not in ("", *selection.AXES):
+            raise InputError(f"{name} axis = {self.axis!r} is not known: use x, y or z, or a normal")
+        if not self.axis and (self.normal is None or abs(np.linalg.norm(np.asarray(self.normal)) - 1) > 1e-6):
+            raise InputError(f"{name} normal = {self.normal} must be of length 1: divide it by its length")
+
+    def constrain(self, free: Free) -> Free:
+        """Without the normal direction at the nodes."""
+        if self.axis:
+            return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
+        normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
+        # A node that is held along every axis has no direction left to take away.
+        loose = jnp.max(free.mask[self.nodes], axis=1, keepdims=True)
+        return free._replace(normals=normals.at[self.nodes].set(loose * jnp.asarray(self.normal, free.mask.dtype)))
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Along the normal."""
+        nodes = np.asarray(self.nodes)
+        normal = np.eye(3)[selection.AXES.index(self.axis)] if self.axis else np.asarray(self.normal)
+        return nodes, np.tile(normal, (len(nodes), 1))
+
+
+def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> SlidingSupport:
+    """A sliding support of nodes (n,) that lie in one plane, whose normal is found.
+
+    Raises:
+        InputError: fewer than three nodes, or nodes that lie in no plane.
+    """
+    points = np.asarray(mesh.points)[nodes]
+    size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[1:]
+    if len(points) < 3 or size[1] <= _FLAT * size[0]:
+        raise InputError(f"{name} where meets nodes that span no plane: widen it to a whole face")
+    off = np.abs((points - points.mean(axis=0)) @ axes[2]).max()
+    if off > _FLAT * size[0]:
+        raise InputError(
+            f"{name} where meets nodes up to {off:.3g} m off one plane: choose a plane part of the surface, or several"
+        )
+    numbers = jnp.asarray(nodes, jnp.int32)
+    along = np.flatnonzero(np.abs(np.abs(axes[2]) - 1) < _FLAT**2 + 1e-12)
+    if len(along):
+        return SlidingSupport(nodes=numbers, axis=selection.AXES[int(along[0])])
+    return SlidingSupport(nodes=numbers, normal=jnp.asarray(axes[2]))

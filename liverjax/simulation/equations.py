@@ -1,0 +1,203 @@
+"""The equations of one load or time step: sums over the physics of the scene."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.elements import mjed
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import End, Free, NodalForce, Physics, Solid, Start, Step, VolumeStress
+from liverjax.physics.prescribed import free_degrees, prescribed
+from liverjax.physics.registry import law_at_rest, physics_of
+from liverjax.scenes.scene import Scene
+from liverjax.solvers.block_matrix import columns, flat
+from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant
+
+
+class State(NamedTuple):
+    """What a step hands to the next."""
+
+    x: jax.Array  # (V, 3) [m]
+    memories: tuple  # one of every physics, in order; None where it remembers nothing
+
+
+class Sizes(NamedTuple):
+    """Sizes of nodal forces at rest, the same for all steps; without derivatives."""
+
+    unit_strain: jax.Array  # [N] of a stretch along x, per unit strain
+    roundoff: jax.Array  # [N] of positions rounded to their digits
+
+
+class Equations(NamedTuple):
+    """What is constant during a step."""
+
+    scene: Scene
+    physics: tuple[Physics, ...]
+    acting: tuple  # what acts of each of them, None where nothing does
+    state: State  # at the beginning
+    k: Any  # number of the step, from 1
+    free: Free
+    noise: Any  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
+    roundoff: jax.Array  # [N] of positions rounded to their digits
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The body."""
+        return self.scene.mesh
+
+    @property
+    def solids(self) -> list[Solid]:
+        """What acts in elements by their deformation gradient."""
+        return [a for a in self.acting if isinstance(a, Solid)]
+
+    @property
+    def volume(self) -> VolumeStress | None:
+        """What acts on their volume."""
+        return next((a for a in self.acting if isinstance(a, VolumeStress)), None)
+
+    @property
+    def nodal(self) -> list[NodalForce]:
+        """What acts at nodes."""
+        return [a for a in self.acting if isinstance(a, NodalForce)]
+
+    @property
+    def conservative(self) -> bool:
+        """Whether all forces have an energy."""
+        return all(a.conservative for a in self.nodal)
+
+
+class Forces(NamedTuple):
+    """Forces at a point of a step."""
+
+    internal: jax.Array  # (V, 3) [N] of the elements
+    nodal: list[jax.Array]  # (V, 3) [N] of each physics that acts at nodes
+    pressure: Any  # (V,) [Pa], or None
+    x: jax.Array  # (V, 3) [m]
+    F: Matrix
+
+    @property
+    def total(self) -> jax.Array:
+        """(V, 3) [N]."""
+        return sum(self.nodal, self.internal)
+
+
+def free_directions(scene: Scene) -> Free:
+    """Where the body can move."""
+    free = Free(free_degrees(scene.mesh, scene.fixed, scene.displaced))
+    for physics in scene.physics:
+        free = physics.constrain(free)
+    return free
+
+
+def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
+    """At rest in the reference positions, or at positions `start` (V, 3) [m]."""
+    x = scene.mesh.points if start is None else start
+    physics, free = physics_of(scene), free_directions(scene)
+
+    def force() -> jax.Array:
+        """What acts on the nodes at x, without inertia, which begins with it."""
+        begin = _first_step(scene, x, free)
+        acting = [p.freeze(None, begin) for p in physics if type(p).begin is Physics.begin]
+        forces = [a.force(scene.mesh, x, 1.0) for a in acting if isinstance(a, NodalForce)]
+        return sum(forces, jnp.zeros_like(x))
+
+    begin = Start(scene.mesh, x, free, force)
+    return State(x, tuple(p.begin(begin) for p in physics))
+
+
+def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
+    return Step(scene.mesh, x, 1, scene.solve.steps, scene.solve.dt, scene.solve.kind == "dynamic", None, free)
+
+
+def force_sizes(scene: Scene) -> Sizes:
+    """What forces are measured against where loads do not say."""
+    mesh, law = scene.mesh, law_at_rest(scene)
+    dtype = mesh.points.dtype
+    along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
+    rounded = 0.5 * float(jnp.finfo(dtype).eps) * jnp.abs(mesh.points)
+    rounded = rounded * jax.random.rademacher(jax.random.key(0), mesh.points.shape, dtype)
+    _, forces = jax.linearize(lambda x: mjed.internal_force(mesh, law, x), mesh.points)
+    return Sizes(*(jax.lax.stop_gradient(jnp.linalg.norm(forces(v))) for v in (along, rounded)))
+
+
+def equations(scene: Scene, state: State, k: Any, sizes: Sizes | None = None) -> Equations:
+    """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all."""
+    sizes = force_sizes(scene) if sizes is None else sizes
+    physics, free = physics_of(scene), free_directions(scene)
+    tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
+    step = _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance)
+    return Equations(
+        scene=scene,
+        physics=physics,
+        acting=tuple(p.freeze(memory, step) for p, memory in zip(physics, state.memories, strict=True)),
+        state=state,
+        k=k,
+        free=free,
+        noise=20 * float(np.finfo(np.float64).eps) / tolerance * sizes.unit_strain,
+        roundoff=sizes.roundoff,
+    )
+
+
+def positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
+    """Positions (V, 3) of unknowns q (3 V,) and of what is held at part s of the step."""
+    held, solve, free = e.mesh.points, e.scene.solve, e.free
+    if e.scene.displaced:
+        # Straight from beginning to end: a history may bend within the step, and only its end counts.
+        before, after = (
+            prescribed(e.mesh, e.scene.displaced, 0.0 if solve.dt is None else solve.dt * n, n / solve.steps)
+            for n in (e.k - 1, e.k)
+        )
+        held = held + before + s * (after - before)
+    x = free.mask * jnp.stack(columns(q), axis=-1) + (1 - free.mask) * held
+    if free.normals is None:
+        return x
+    return x - jnp.sum(free.normals * (x - e.mesh.points), axis=1, keepdims=True) * free.normals
+
+
+def forces(e: Equations, q: jax.Array, s: Any) -> Forces:
+    """Forces of all physics at unknowns q (3 V,), at part s of the step."""
+    x = positions(e, q, s)
+    F = deformation_gradient(e.mesh, x)
+    first, *rest = [solid.stress(F) for solid in e.solids]
+    P, pressure = first, None
+    for other in rest:
+        P = add_matrices(P, other)
+    if e.volume is not None:
+        pressure = e.volume.pressure(e.mesh, determinant(F))
+        P = add_matrices(P, e.volume.stress(e.mesh, pressure, F))
+    return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F)
+
+
+def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, Any]:
+    """Out of balance forces (3 V,) [N] at part s of the step, the size of those at work, and the pressures."""
+    f = forces(e, q, s)
+    at_work = e.noise + jnp.linalg.norm(f.internal)
+    for force in f.nodal:
+        at_work = at_work + jnp.linalg.norm(force)
+    return flat(e.free.vectors(f.total)), jax.lax.stop_gradient(at_work), f.pressure
+
+
+def energy(e: Equations, q: jax.Array) -> jax.Array:
+    """What a step makes least [J]; its gradient is the residual. All are incremental potentials."""
+    x = positions(e, q, 1.0)
+    F = deformation_gradient(e.mesh, x)
+    total = jnp.sum(e.mesh.volumes * sum(solid.energy(F) for solid in e.solids))
+    if e.volume is not None:
+        total = total + e.volume.energy(e.mesh, determinant(F))
+    return sum((a.energy(e.mesh, x) for a in e.nodal), total)
+
+
+def advanced(e: Equations, end: End) -> State:
+    """The state after an accepted step."""
+    each = zip(e.physics, e.state.memories, e.acting, strict=True)
+    return State(end.x, tuple(p.advance(memory, acting, end) for p, memory, acting in each))
+
+
+def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
+    """What the physics show of a state beside positions and reactions."""
+    shown: dict[str, jax.Array] = {}
+    for physics, memory in zip(physics_of(scene), state.memories, strict=True):
+        shown |= physics.output(memory)
+    return shown

@@ -1,0 +1,78 @@
+"""The mixed system of positions and nodal pressures: put together, and its pressures eliminated.
+
+What acts on the volume of elements with pressures at the nodes brings a matrix of these pressures: a sponge in which a
+fluid flows, or volume changes averaged at the nodes, where each pressure stands by itself.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.elements.gradients import volume_gradients
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics import darcy
+from liverjax.physics.darcy import Flow
+from liverjax.solvers import block_matrix
+from liverjax.tensors.matrices import Matrix, scale
+
+
+def coupled(
+    mesh: TetMesh, K: dict, own: Any, F: Matrix, pressures: block_matrix.BlockMatrix
+) -> block_matrix.BlockMatrix:
+    """Derivative of forces and minus the pressure equation by (x, P): symmetric, indefinite, 4 x 4 blocks.
+
+    Args:
+        K: blocks (E,) of the forces at given pressure, by pairs of nodes.
+        own: 3 x 3 blocks of (V,) that nodes add to the diagonal, entries None where 0; or None.
+        F: deformation gradient at the end of the step.
+        pressures: matrix of the pressure equation.
+    """
+    q = [scale(mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
+    bordered = {}
+    for (a, b), block in K.items():
+        forces = [(*block[r], -q[a][r]) for r in range(3)]
+        bordered[a, b] = (*forces, (*(-x for x in q[b]), None))
+    rows: block_matrix.Block = block_matrix.off_diagonal(mesh, bordered)
+    rows = (*rows[:3], (*rows[3][:3], -pressures.rows[0][0]))
+    sums = block_matrix.row_sums(rows)
+    # No force under translation: the columns of x add up to zero along a row.
+    corner: Any = tuple(tuple(-sums[r][c] for c in range(3)) for r in range(3))
+    corner = corner if own is None else block_matrix.added(corner, own)
+    border = [-sums[3][c] for c in range(3)]
+    diagonal = (*((*corner[r], border[r]) for r in range(3)), (*border, -pressures.diagonal[0][0]))
+    return block_matrix.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)
+
+
+def eliminated(
+    mesh: TetMesh, flow: Flow | None, A: block_matrix.BlockMatrix, both: tuple[jax.Array, ...], exactly: bool = False
+) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of a motion that changes pressures too, from `both` = A (dx, 0) of the `coupled` matrix A.
+
+    Without `flow` nothing flows: the matrix of the pressures is diagonal. With it their equation is solved nearly, or
+    `exactly`: to its tolerance.
+    """
+    *forces, balance = both
+    if flow is None:
+        dP = -balance / A.diagonal[3][3]
+    else:
+        dP = (
+            flow.mask * darcy.solved(mesh, flow, flow.mask * balance)
+            if exactly
+            else darcy.nearly_solved(mesh, flow, balance)
+        )
+    rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
+    pull = block_matrix.product(block_matrix.BlockMatrix(rows, diagonal, A.nodes), (dP,))
+    return tuple(f + p for f, p in zip(forces, pull, strict=True))
+
+
+def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Any) -> block_matrix.Block:
+    """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the pressure's matrix: right where nothing flows."""
+    soft = -mask / A.diagonal[3][3]
+    near = soft[A.nodes]
+
+    def entry(r, c):
+        pull = jnp.sum(A.rows[r][3] * near * A.rows[c][3], axis=0)
+        return A.diagonal[r][c] + pull + A.diagonal[r][3] * soft * A.diagonal[c][3]
+
+    return tuple(tuple(entry(r, c) for c in range(3)) for r in range(3))

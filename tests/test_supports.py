@@ -1,0 +1,179 @@
+"""Supports: springs against what they must balance, sliding planes against the same body turned."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.sliding_support import on_plane
+from liverjax.scenes.scene_file import scene_from
+
+pytestmark = pytest.mark.quick_to_compile
+
+LAW = lj.laws.NeoHookean(mu=800.0, bulk=4000.0)
+SIDE = 0.1
+
+
+def box() -> lj.TetMesh:
+    """A 10 cm cube."""
+    return lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
+
+
+def part(mesh: lj.TetMesh, **where) -> np.ndarray:
+    """Nodes of a place."""
+    return lj.boundary.select(mesh, where)
+
+
+def springs(mesh: lj.TetMesh, nodes: np.ndarray, **stiffness) -> ElasticSupport:
+    """Springs on the surface of these nodes."""
+    return ElasticSupport(triangles=jnp.asarray(lj.boundary.boundary_triangles(mesh, nodes)), **stiffness)
+
+
+def pulled(mesh: lj.TetMesh, value, **more) -> lj.Scene:
+    """A cube under a traction on its top."""
+    triangles = jnp.asarray(lj.boundary.boundary_triangles(mesh, part(mesh, z_min=SIDE)))
+    traction = (lj.Traction(triangles=triangles, value=jnp.array(value)),)
+    return lj.Scene(mesh=mesh, law=LAW, traction=traction, **more)
+
+
+def test_springs_along_the_normal_carry_the_whole_pull():
+    """p on top, k below, sides that slide: uniform stress, so the bottom moves by p/k exactly, whatever the mesh."""
+    mesh = box()
+    sides = (on_plane(mesh, part(mesh, x_max=0.0)), on_plane(mesh, part(mesh, y_max=0.0)))
+    scene = pulled(mesh, [0.0, 0.0, 30.0], physics=(springs(mesh, part(mesh, z_max=0.0), normal=5e4), *sides))
+    lj.check_scene(scene)
+
+    def lift(k):
+        found = lj.simulate(lj.with_parameters(scene, {"support.0.normal": k}))
+        return found.positions[-1, part(mesh, z_max=0.0), 2]
+
+    # Residual 1e-8 of the forces at work, which are some times the pull.
+    assert np.allclose(lift(5e4), 30.0 / 5e4, rtol=1e-6)
+    assert np.allclose(jax.jacfwd(lift)(5e4), -30.0 / 5e4**2, rtol=1e-6)
+
+
+def test_springs_along_the_surface_carry_shear():
+    """A stiff cube pushed sideways: the springs of its sole give way by p/k, those of its weightless top do not act."""
+    mesh = box()
+    sole = springs(mesh, part(mesh, z_max=0.0), tangential=2e3, normal=1e9)
+    stiff = replace(pulled(mesh, [3.0, 0.0, 0.0]), law=lj.laws.NeoHookean(mu=1e8, bulk=1e9), physics=(sole,))
+    lj.check_scene(stiff)
+    moved = np.asarray(lj.simulate(stiff).check().positions[-1] - mesh.points)
+    # A rigid cube: shear adds p/mu and turning p/(k_n side) times some, 1e-4 of it together.
+    assert np.allclose(moved[part(mesh, z_max=0.0), 0], 3.0 / 2e3, rtol=1e-3)
+
+
+def test_springs_on_nodes():
+    mesh = box()
+    nodes = jnp.asarray(part(mesh, z_max=0.0))
+    scene = pulled(mesh, [0.0, 0.0, 30.0], physics=(ElasticSupport(nodes=nodes, stiffness=2.0),))
+    lj.check_scene(scene)
+    result = lj.simulate(scene).check()
+    carried = 2.0 * np.asarray(result.positions[-1] - mesh.points)[part(mesh, z_max=0.0)].sum(axis=0)
+    assert np.allclose(carried, [0.0, 0.0, 30.0 * SIDE**2], atol=1e-6 * 30.0 * SIDE**2)
+
+
+TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # a rotation along no axis
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"linear_solver": "cg"},
+        {"linear_solver": "direct"},
+        {"robust": "projected"},
+        {"kind": "dynamic", "dt": 0.02, "steps": 3, "integrator": "newmark"},
+    ],
+    ids=["cg", "direct", "robust", "newmark"],
+)
+def test_a_turned_body_slides_as_the_straight_one(changes):
+    """The straight body slides along axes, which are left out of the unknowns; the turned one along its normals."""
+    mesh = box()
+    turned = lj.tet_mesh(np.asarray(mesh.points) @ TURN.T, mesh.tetrahedra)
+    held = jnp.asarray(part(mesh, z_max=0.0, x_max=0.0, y_max=0.0))
+    low, side = part(mesh, z_max=0.0), np.setdiff1d(part(mesh, x_max=0.0), part(mesh, z_max=0.0))
+    pull, found = np.array([10.0, 5.0, 60.0]), []
+    for body, R in ((mesh, np.eye(3)), (turned, TURN)):
+        triangles = jnp.asarray(lj.boundary.boundary_triangles(mesh, part(mesh, z_min=SIDE)))
+        scene = lj.Scene(
+            mesh=body,
+            law=LAW,
+            body=lj.Body(density=1000.0, gravity=jnp.asarray(R @ [0.5, 0.0, -1.0])),
+            traction=(lj.Traction(triangles=triangles, value=jnp.asarray(R @ pull)),),
+            fixed=(lj.Fixed(nodes=held),),
+            physics=(
+                on_plane(body, low),
+                on_plane(body, side),
+                # Turning about the normal of the low plane is held by springs.
+                ElasticSupport(nodes=jnp.asarray(low), stiffness=1.0),
+            ),
+            solve=lj.Solve(**changes),
+        )
+        lj.check_scene(scene)
+        result = lj.simulate(scene).check()
+        found.append(np.asarray(result.positions - body.points[None]) @ R)
+        assert np.abs(found[-1][:, low, 2]).max() < 1e-15 and np.abs(found[-1][:, side, 0]).max() < 1e-15
+    size = np.abs(found[0]).max()
+    assert size > 1e-3 and np.abs(found[0] - found[1]).max() < 1e-6 * size
+
+
+def test_reactions_of_a_slide_are_along_its_normal():
+    mesh = box()
+    turned = lj.tet_mesh(np.asarray(mesh.points) @ TURN.T, mesh.tetrahedra)
+    low = part(mesh, z_max=0.0)
+    weight = lj.Body(density=1000.0, gravity=jnp.asarray(TURN @ [0.0, 0.0, -1.0]))
+    hold = ElasticSupport(nodes=jnp.asarray(low), stiffness=1.0)
+    scene = lj.Scene(mesh=turned, law=LAW, body=weight, physics=(on_plane(turned, low), hold))
+    reactions = np.asarray(lj.simulate(scene).check().reactions[-1]) @ TURN
+    assert np.allclose(reactions.sum(axis=0), [0.0, 0.0, 1000.0 * SIDE**3], atol=1e-7)
+    assert np.abs(reactions[:, :2]).max() < 1e-12
+
+
+def scene_text(*support) -> dict:
+    """The content of a scene file with these supports."""
+    return {
+        "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [2, 2, 2]},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "body": {"density": 1000.0, "gravity": [0, 0, -1.0]},
+        "support": list(support),
+    }
+
+
+def test_supports_of_a_scene_file():
+    low = {"z_max": 0.0}
+    scene = scene_from(scene_text({"where": low, "normal": 1e4, "tangential": 100.0}, {"where": low, "sliding": True}))
+    assert [type(p).__name__ for p in scene.physics] == ["ElasticSupport", "SlidingSupport"]
+    assert scene.physics[1].axis == "z"
+    changed = lj.with_parameters(scene, {"support.0.normal": 2e4})
+    assert changed.physics[0].normal == 2e4
+
+
+@pytest.mark.parametrize(
+    ("support", "words"),
+    [
+        ({"where": {"z_max": 0.0}}, "support.0 has a place alone: give normal, tangential, stiffness or sliding"),
+        ({"where": {"z_max": 0.0}, "normal": -1.0}, "support.0.normal = -1.0 must be at least 0 Pa/m"),
+        ({"where": {"z_max": 0.0}, "normal": "soft"}, "support.0.normal = 'soft' is not a number"),
+        ({"where": {"z_max": 0.0}, "normal": 1.0, "stiffness": 1.0}, "support.0 needs either normal and tangential"),
+        ({"where": {"z_max": 0.0}, "sliding": False}, "support.0 sliding = False is not true"),
+        ({"where": {"z_max": 0.05}, "sliding": True}, "off one plane"),
+        ({"where": {"z_max": 0.0}, "norml": 1.0}, "did you mean normal"),
+        ({"where": {"z_max": 0.0}, "sliding": True}, "nothing holds the body against every rigid motion"),
+    ],
+)
+def test_bad_supports_are_refused(support, words):
+    with pytest.raises(InputError, match=words.replace("(", r"\(")):
+        scene_from(scene_text(support))
+
+
+def test_a_scene_without_supports_pays_nothing():
+    mesh = box()
+    plain = pulled(mesh, [0.0, 0.0, 30.0], fixed=(lj.Fixed(nodes=jnp.asarray(part(mesh, z_max=0.0))),))
+    one = replace(plain, physics=(springs(mesh, part(mesh, x_max=0.0), normal=1.0),))
+    sizes = [len(str(jax.make_jaxpr(lj.simulate)(scene))) for scene in (plain, one)]
+    assert sizes[0] < sizes[1]
+    assert not plain.physics and len(jax.tree.leaves(one)) > len(jax.tree.leaves(plain))
