@@ -85,8 +85,8 @@ TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # a
     [
         {"linear_solver": "cg"},
         {"linear_solver": "direct"},
-        {"robust": "projected"},
-        {"kind": "dynamic", "dt": 0.02, "steps": 3, "integrator": "newmark"},
+        pytest.param({"robust": "projected"}, marks=pytest.mark.slow),
+        pytest.param({"kind": "dynamic", "dt": 0.02, "steps": 3, "integrator": "newmark"}, marks=pytest.mark.slow),
     ],
     ids=["cg", "direct", "robust", "newmark"],
 )

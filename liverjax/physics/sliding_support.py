@@ -53,7 +53,8 @@ class SlidingSupport(Physics):
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
         # A node that is held along every axis has no direction left to take away.
         loose = jnp.max(free.mask[self.nodes], axis=1, keepdims=True)
-        return free._replace(normals=normals.at[self.nodes].set(loose * jnp.asarray(self.normal, free.mask.dtype)))
+        normal = jnp.asarray(self.normal, free.mask.dtype)[None]
+        return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Along the normal."""
