@@ -45,6 +45,40 @@ def test_imports_have_no_circle_and_point_downwards():
         visit(module, [])
 
 
+#: Rooms from the ground up: a room knows those below it, and itself.
+STOREYS = {
+    "liverjax": (
+        "core",
+        "tensors",
+        "mesh",
+        "laws",
+        "elements",
+        "solvers",
+        "physics",
+        "scenes",
+        "simulation",
+        "jobs",
+        "commands",
+    ),
+    "fitting": ("readers", "rigs", "methods", "fits", "reports", "commands"),
+}
+#: Files of a package that belong to no room: what users import, and the way in.
+DOORS = {"liverjax": {"check"}, "fitting": {"fit", "rheometer", "torsion"}}
+
+
+@pytest.mark.parametrize("package", STOREYS)
+def test_every_room_is_known_and_knows_none_above_it(package):
+    rooms = STOREYS[package]
+    for name, tree in TREES.items():
+        own = name.split(".")
+        if own[0] != package or len(own) < 2 or own[1] in DOORS[package] | {"__main__"}:
+            continue
+        assert own[1] in rooms, f"{name} is in no room of {package}: {', '.join(rooms)}"
+        known = {m.split(".")[1] for m in _imported(tree) if m.startswith(f"{package}.") and m.count(".")}
+        above = known - set(rooms[: rooms.index(own[1]) + 1])
+        assert not above, f"{name} imports from {', '.join(sorted(above))}, which is above it"
+
+
 def _public(tree: ast.Module) -> list:
     kinds = (ast.FunctionDef, ast.ClassDef)
     top = [n for n in tree.body if isinstance(n, kinds) and not n.name.startswith("_")]

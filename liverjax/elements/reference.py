@@ -9,8 +9,19 @@ import numpy as np
 import scipy.sparse
 
 from liverjax.elements.mjed import sparse
+from liverjax.laws.autodiff import derivative, first_piola, tangent
 from liverjax.laws.base import Law
 from liverjax.mesh.tetrahedra import TetMesh
+
+__all__ = [
+    "energy",
+    "first_piola",
+    "internal_force",
+    "standard_internal_force",
+    "standard_stiffness_matrix",
+    "stiffness_matrix",
+    "tangent",
+]
 
 # Voigt order xx, yy, zz, xy, yz, xz.
 _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
@@ -19,27 +30,6 @@ _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     """Total strain energy [J] at positions x (V, 3) [m], through (E, 3, 3) deformation gradients."""
     return jnp.sum(mesh.volumes * law.energy(_gradient(mesh, x)))
-
-
-def first_piola(law: Law, F: jax.Array) -> jax.Array:
-    """dW/dF [Pa] of one (3, 3) or many (..., 3, 3) deformation gradients by reverse mode."""
-    return jax.grad(lambda F: jnp.sum(law.energy(F)))(F)
-
-
-def tangent(law: Law, F: jax.Array) -> jax.Array:
-    """d2W/dF dF [Pa] of deformation gradients (..., 3, 3): (..., 3, 3, 3, 3) by forward over reverse mode."""
-    return _derivative(lambda F: first_piola(law, F), F)
-
-
-def _derivative(function, A: jax.Array) -> jax.Array:
-    """Derivative of an element-wise function of matrices (…, n, m): (…, its shape, n, m), by forward mode.
-
-    One direction for all elements at a time, so that a law may have numbers of its own for each element.
-    """
-    n, m = A.shape[-2:]
-    directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)
-    columns = jax.vmap(lambda d: jax.jvp(function, (A,), (jnp.broadcast_to(d, A.shape),))[1])(directions)
-    return jnp.moveaxis(columns, 0, -1).reshape(*columns.shape[1:], n, m)
 
 
 @jax.jit
@@ -55,7 +45,7 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     def total(nodes):
         return jnp.sum(mesh.volumes * law.energy(jnp.einsum("eai,eaj->eij", nodes, D)))
 
-    return _derivative(jax.grad(total), x[mesh.tetrahedra])
+    return derivative(jax.grad(total), x[mesh.tetrahedra])
 
 
 def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
@@ -77,7 +67,7 @@ def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     F, D = _gradient(mesh, x), _all_shape_vectors(mesh)
     C = jnp.einsum("eki,ekj->eij", F, F)
-    elasticity = 2 * _derivative(lambda C: _second_piola_of(law, C), C)
+    elasticity = 2 * derivative(lambda C: _second_piola_of(law, C), C)
     elasticity = 0.5 * (elasticity + jnp.swapaxes(elasticity, -1, -2))
     rows = jnp.asarray(_VOIGT).T
     Dm = elasticity[:, rows[0], rows[1]][:, :, rows[0], rows[1]]

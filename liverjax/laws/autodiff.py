@@ -1,0 +1,29 @@
+"""Stress and tangent of a law by automatic differentiation of its energy: the oracle of the hand-derived terms."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.laws.base import Law
+
+
+def first_piola(law: Law, F: jax.Array) -> jax.Array:
+    """dW/dF [Pa] of one (3, 3) or many (..., 3, 3) deformation gradients by reverse mode."""
+    return jax.grad(lambda F: jnp.sum(law.energy(F)))(F)
+
+
+def tangent(law: Law, F: jax.Array) -> jax.Array:
+    """d2W/dF dF [Pa] of deformation gradients (..., 3, 3): (..., 3, 3, 3, 3) by forward over reverse mode."""
+    return derivative(lambda F: first_piola(law, F), F)
+
+
+def derivative(function: Callable[[jax.Array], jax.Array], A: jax.Array) -> jax.Array:
+    """Derivative of an element-wise function of matrices (…, n, m): (…, its shape, n, m), by forward mode.
+
+    One direction for all elements at a time, so that a law may have numbers of its own for each element.
+    """
+    n, m = A.shape[-2:]
+    directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)
+    columns = jax.vmap(lambda d: jax.jvp(function, (A,), (jnp.broadcast_to(d, A.shape),))[1])(directions)
+    return jnp.moveaxis(columns, 0, -1).reshape(*columns.shape[1:], n, m)
