@@ -16,8 +16,8 @@ from liverjax.physics import boundary
 from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.step import step
 from liverjax.solvers import continuation
-from liverjax.solvers.continuation import StepOptions
 from liverjax.solvers.krylov import conjugate_gradients
+from liverjax.solvers.problem import Problem, StepOptions
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -69,7 +69,7 @@ def test_patch_test_is_exact(verified):
         dq, s = conjugate_gradients(slope, b, lambda r: r, *limits)
         return dq, s.iterations, s.positive
 
-    method = continuation.Method(residual, lambda q, s, *_: q, solved, lambda _: lambda r: r)
+    method = Problem(residual, lambda q, s, *_: q, solved, lambda _: lambda r: r)
     options = StepOptions(tolerance=1e-13)
     q, statistics, _ = jax.jit(lambda q: continuation.solve(method, q, options))((mask * start).ravel())
     assert int(statistics.status) == status.CONVERGED

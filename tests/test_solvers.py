@@ -7,6 +7,7 @@ import numpy as np
 from liverjax.core import status
 from liverjax.solvers import continuation, newton
 from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
+from liverjax.solvers.problem import Problem, StepOptions
 
 RNG = np.random.default_rng(0)
 _B = RNG.standard_normal((20, 20))
@@ -96,14 +97,14 @@ def test_lanes_do_not_disturb_each_other():
 
 def test_a_step_that_fails_in_one_go_is_followed_in_parts():
     """log q + 5 = 0 from q = 1: full steps leave the domain until the part is an eighth."""
-    method = continuation.Method(
+    method = Problem(
         residual=lambda q, s: (jnp.log(q) + 5, jnp.ones(()), None),
         tangent=lambda q, s, by, near: 1 / q,
         solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32), jnp.array(True)),
         preconditioner=lambda K: lambda r: r / K,
         moved=False,
     )
-    options = continuation.StepOptions(max_halvings=0)
+    options = StepOptions(max_halvings=0)
     cuts = []
     for guess in (None, jnp.array([-1.0])):  # a guess that is out of the domain costs no cut
         q, s, kept = jax.jit(lambda q, g=guess: continuation.solve(method, q, options, g))(jnp.ones(1))

@@ -20,7 +20,7 @@ from liverjax.jobs import parts
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import initial_state
 from liverjax.simulation.run import Result, prepared, simulate_part
-from liverjax.solvers.continuation import StepStatistics
+from liverjax.solvers.problem import StepStatistics
 
 _ROWS = ("times", "positions", "reactions", "pressure", "status")
 

@@ -20,7 +20,7 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation import checkpoints
 from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.run import Result, simulate
-from liverjax.simulation.step import method_of
+from liverjax.simulation.step import problem_of
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
 
@@ -100,7 +100,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
 
     def carry(scene):
         start = initial_state(scene)
-        method = method_of(equations(scene, start, jnp.ones(())))
+        method = problem_of(equations(scene, start, jnp.ones(())))
         return start, continuation.nothing_kept(method, flat(start.x))
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))

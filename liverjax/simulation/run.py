@@ -16,10 +16,10 @@ from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
 from liverjax.simulation import automatic, checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs
-from liverjax.simulation.step import method_of, step
+from liverjax.simulation.step import problem_of, step
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
-from liverjax.solvers.continuation import StepStatistics
+from liverjax.solvers.problem import StepStatistics
 
 
 @struct
@@ -78,7 +78,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     sizes = force_sizes(scene)
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
-    method, q = method_of(equations(scene, start, numbers[0], sizes)), flat(start.x)
+    method, q = problem_of(equations(scene, start, numbers[0], sizes)), flat(start.x)
     kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
     # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
     near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
@@ -91,7 +91,7 @@ def _run_part(
     scene: Scene, state: State, numbers: jax.Array, report: Callable[[int], None] | None
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
-    kept = continuation.nothing_kept(method_of(equations(scene, state, numbers[0], sizes)), flat(state.x))
+    kept = continuation.nothing_kept(problem_of(equations(scene, state, numbers[0], sizes)), flat(state.x))
     advance = _step_by_step(scene, sizes, report, None)
 
     def unless_over(carry, k):

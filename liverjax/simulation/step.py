@@ -15,22 +15,22 @@ from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, State, advanced, energy, forces, positions, residual
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
-from liverjax.solvers.continuation import Kept, StepOptions, StepStatistics
+from liverjax.solvers.problem import Kept, Potential, Problem, StepOptions, StepStatistics
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 
-def method_of(e: Equations) -> continuation.Method:
+def problem_of(e: Equations) -> Problem:
     """How `continuation.solve` finds the end of the step."""
-    robust: dict[str, Any] = {}
+    potential = None
     if e.scene.solve.robust != "off":
-        robust = {
-            "energy": partial(energy, e),
-            "definite": partial(_tangent, e, e.scene.solve.robust),
-            "volume": lambda q, s: jnp.min(determinant(deformation_gradient(e.mesh, positions(e, q, s)))),
-            "surrogate": None if isinstance(e.scene.law, laws.StableNeoHookean) else method_of(_finite(e)),
-            "rest": _rest(e) if e.scene.solve.kind == "static" else None,
-        }
-    return continuation.Method(
+        potential = Potential(
+            energy=partial(energy, e),
+            definite=partial(_tangent, e, e.scene.solve.robust),
+            volume=lambda q, s: jnp.min(determinant(deformation_gradient(e.mesh, positions(e, q, s)))),
+            surrogate=None if isinstance(e.scene.law, laws.StableNeoHookean) else problem_of(_finite(e)),
+            rest=_rest(e) if e.scene.solve.kind == "static" else None,
+        )
+    return Problem(
         residual=partial(residual, e),
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
@@ -39,7 +39,7 @@ def method_of(e: Equations) -> continuation.Method:
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
-        **robust,
+        potential=potential,
     )
 
 
@@ -78,7 +78,7 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     # Straight on where there is inertia; one step of Newton starts at x, as printed.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = flat(e.free.vectors(ahead[0])) if ahead and not scene.displaced and not options.one_step else None
-    q, statistics, kept = continuation.solve(method_of(e), flat(e.free.vectors(x)), options, guess, kept, near)
+    q, statistics, kept = continuation.solve(problem_of(e), flat(e.free.vectors(x)), options, guess, kept, near)
     f = forces(e, q, jnp.ones((), x.dtype))
     reactions = f.total - e.free.vectors(f.total) if e.free.normals is not None else (1 - e.free.mask) * f.total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)

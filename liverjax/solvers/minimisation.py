@@ -1,4 +1,4 @@
-"""Newton's method on the energy of a step: for steps where following the load failed, or that begin inverted.
+"""Newton's problem on the energy of a step: for steps where following the load failed, or that begin inverted.
 
 The true tangent is used where conjugate gradients find no negative curvature in it, else one without negative
 eigenvalues (`liverjax.elements.projection`); every step is shortened until the energy falls (Armijo). So the energy
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core import status
+from liverjax.solvers.problem import LINEAR_TOLERANCE, MOST_LINEAR_ITERATIONS, Potential, Problem, StepOptions
 
 #: Fall of the energy asked for, over that of its slope (Armijo; Nocedal and Wright 2006, 3.1).
 _FALL = 1e-4
@@ -20,6 +21,8 @@ _FALL = 1e-4
 _ROUNDOFF = 5e3
 #: The true tangent is tried again after at most so many iterations.
 _PATIENCE = 8
+#: Most iterations on the energy, and most shortenings of one of them.
+_MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
 #: Residual at which a surrogate body is untangled enough.
 _UNTANGLED = 1e-4
 
@@ -48,62 +51,71 @@ class _Point(NamedTuple):
     linear: jax.Array
 
 
-def minimise(method: Any, start: jax.Array, options: Any) -> Minimum:
-    """A minimum of `method.energy` near `start` (n,), at the end of the step.
+def minimise(problem: Problem, start: jax.Array, options: StepOptions) -> Minimum:
+    """A minimum of `problem.potential.energy` near `start` (n,), at the end of the step.
 
     Args:
-        method: `liverjax.solvers.continuation.Method` with energy and definite tangent.
+        problem: `liverjax.solvers.problem.Problem` with a potential.
         start: flat vector of unknowns; inverted elements will do where the energy is finite.
-        options: `liverjax.solvers.continuation.StepOptions`.
+        options: `liverjax.solvers.problem.StepOptions`.
     """
 
     def go_on(c):
         searching = jnp.isfinite(c.energy) & (c.relative > options.tolerance) & ~c.stuck
-        return searching & (c.iterations < options.max_minimisation)
+        return searching & (c.iterations < _MOST_ITERATIONS)
 
     zero = jnp.zeros((), jnp.int32)
-    begin = _evaluated(method, start, zero, zero + 1, jnp.array(False), zero, zero)
-    end = jax.lax.while_loop(go_on, lambda c: _iterate(method, options, c), begin)
+    begin = _evaluated(problem, start, zero, zero + 1, jnp.array(False), zero, zero)
+    end = jax.lax.while_loop(go_on, lambda c: _iterate(problem, options, c), begin)
     finite = jnp.isfinite(end.energy) & jnp.isfinite(end.relative)
     failure = jnp.where(finite, jnp.where(end.indefinite, status.INDEFINITE, status.STALLED), status.NOT_FINITE)
     code = jnp.where(finite & (end.relative <= options.tolerance), status.CONVERGED, failure)
     return Minimum(end.q, code, end.iterations, end.linear, end.relative)
 
 
-def untangled(method: Any, start: jax.Array, options: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _potential(problem: Problem) -> Potential:
+    assert problem.potential is not None
+    return problem.potential
+
+
+def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A point without inverted elements near `start`, where one is there, and the iterations for it, of both kinds."""
-    zero = jnp.zeros((), jnp.int32)
-    if method.surrogate is None:
+    zero, potential = jnp.zeros((), jnp.int32), _potential(problem)
+    surrogate = potential.surrogate
+    if surrogate is None:
         return start, zero, zero
 
     def away():
-        least = minimise(method.surrogate, start, options._replace(tolerance=_UNTANGLED))
+        least = minimise(surrogate, start, options._replace(tolerance=_UNTANGLED))
         return least.q, least.iterations, least.linear_iterations
 
-    return jax.lax.cond(method.volume(start, jnp.ones((), start.dtype)) <= 0, away, lambda: (start, zero, zero))
+    return jax.lax.cond(potential.volume(start, jnp.ones((), start.dtype)) <= 0, away, lambda: (start, zero, zero))
 
 
-def _evaluated(method: Any, q: jax.Array, definite: Any, patience: Any, indefinite: Any, *counts: Any) -> _Point:
-    r, force, by = method.residual(q, jnp.ones((), q.dtype))
+def _evaluated(problem: Problem, q: jax.Array, definite: Any, patience: Any, indefinite: Any, *counts: Any) -> _Point:
+    r, force, by = problem.residual(q, jnp.ones((), q.dtype))
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
-    return _Point(q, method.energy(q), r, relative, by, definite, patience, indefinite, jnp.array(False), *counts)
+    energy = _potential(problem).energy(q)
+    return _Point(q, energy, r, relative, by, definite, patience, indefinite, jnp.array(False), *counts)
 
 
-def _iterate(method: Any, options: Any, c: _Point) -> _Point:
+def _iterate(problem: Problem, options: StepOptions, c: _Point) -> _Point:
     one, definite = jnp.ones((), c.q.dtype), c.definite > 0
     K = jax.lax.cond(
-        definite, lambda: method.definite(c.q, one, c.by, None), lambda: method.tangent(c.q, one, c.by, None)
+        definite,
+        lambda: _potential(problem).definite(c.q, one, c.by, None),
+        lambda: problem.tangent(c.q, one, c.by, None),
     )
     goal = 0.3 * options.tolerance / jnp.maximum(c.relative, 1e-300)
-    forcing = jnp.clip(jnp.minimum(options.linear_tolerance, jnp.sqrt(c.relative)), jnp.minimum(goal, 0.5), 0.5)
-    dq, linear, positive = method.solve(K, -c.r, forcing, options.max_linear_iterations)
+    forcing = jnp.clip(jnp.minimum(LINEAR_TOLERANCE, jnp.sqrt(c.relative)), jnp.minimum(goal, 0.5), 0.5)
+    dq, linear, positive = problem.solve(K, -c.r, forcing, MOST_LINEAR_ITERATIONS)
     slope = jnp.vdot(c.r, dq)
     usable = jnp.isfinite(slope) & (slope < 0) & (positive | definite)
-    t = _length(method, options, c, dq, slope, usable)
+    t = _length(problem, c, dq, slope, usable)
     moved = usable & (t > 0)
     failed = ~definite & ~moved
     new = _evaluated(
-        method,
+        problem,
         jnp.where(moved, c.q + t * dq, c.q),
         jnp.where(failed, c.patience, jnp.maximum(c.definite - 1, 0)),
         jnp.where(failed, jnp.minimum(2 * c.patience, _PATIENCE), jnp.where(definite, c.patience, 1)),
@@ -114,21 +126,21 @@ def _iterate(method: Any, options: Any, c: _Point) -> _Point:
     return new._replace(stuck=definite & ~moved)
 
 
-def _length(method: Any, options: Any, c: _Point, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
+def _length(problem: Problem, c: _Point, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
     """The first of 1, 1/2, 1/4, … with which the energy falls; 0 if there is none."""
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):
         q = c.q + t * dq
-        energy = method.energy(q)
+        energy = _potential(problem).energy(q)
         falls = energy <= c.energy + _FALL * t * slope
         level = abs(energy - c.energy) <= _ROUNDOFF * jnp.finfo(c.q.dtype).eps * abs(c.energy)
-        better = jnp.linalg.norm(method.residual(q, one)[0]) < size
+        better = jnp.linalg.norm(problem.residual(q, one)[0]) < size
         return falls | (level & better)
 
     def go_on(state):
         _, found, n = state
-        return usable & ~found & (n <= options.max_shortenings)
+        return usable & ~found & (n <= _MOST_SHORTENINGS)
 
     def halve(state):
         t, _, n = state

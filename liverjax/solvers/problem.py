@@ -1,0 +1,81 @@
+"""What a step's solvers are given: the problem, how hard to try, what is kept from step to step, what it took."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+#: Most iterations of one linear solve.
+MOST_LINEAR_ITERATIONS = 3000
+#: Tolerance of the linear solve for a direction, the loosest.
+LINEAR_TOLERANCE = 5e-2
+
+
+class StepStatistics(NamedTuple):
+    """What one step took; every field an array (one a lane under vmap)."""
+
+    status: jax.Array
+    iterations: jax.Array  # of Newton, all parts together
+    linear_iterations: jax.Array
+    cuts: jax.Array  # how often a part was halved
+    residual: jax.Array  # |r| over the forces at work
+
+
+class StepOptions(NamedTuple):
+    """How hard to try; all but the tolerance is static."""
+
+    tolerance: float = 1e-8  # of |r| relative to the forces at work
+    max_iterations: int = 25  # a part
+    one_step: bool = False  # one linear solve a step and no more; derivatives are not those of it
+    max_halvings: int = 6
+    max_cuts: int = 12
+
+
+class Kept(NamedTuple):
+    """A tangent that goes from step to step: good for the next one as long as iterations converge fast with it."""
+
+    tangent: Any
+    made: jax.Array  # False: there is none yet
+    pace: jax.Array  # linear iterations a digit, with its preconditioner when that was new
+    worn: jax.Array  # the preconditioner takes much longer by now
+
+
+class Problem(NamedTuple):
+    """Equations of a step, and how their linear systems are solved."""
+
+    #: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that it is small against, and what
+    #: `tangent` needs beside. May close over traced parameters; derivatives are exact at the root.
+    residual: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array, Any]]
+    #: (q, s, by, near) -> any pytree that stands for dr/dq, used again while iterations converge fast with it; near
+    #: is None, or whether an earlier one is near enough to take parts from, and that one.
+    tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
+    #: (tangent, b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations, whether dr/dq seems positive).
+    solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
+    #: tangent -> approximate inverse of dr/dq, for derivatives.
+    preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
+    #: (tangent, b, tolerance, max_iterations) -> as `solve`, with dr/dq itself, and the residual over |b|: for
+    #: derivatives, where dr/dq is symmetric. None: they are solved for with products of dr/dq.
+    adjoint: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]] | None = None
+    #: Whether dr/dq is.
+    symmetric: bool = True
+    #: Whether r depends on s.
+    moved: bool = True
+    #: |r| that the digits of q leave.
+    roundoff: Any = 0.0
+    #: What a step that cannot be followed is minimised with; None: it is not.
+    potential: "Potential | None" = None
+
+
+class Potential(NamedTuple):
+    """The energy of a step, for steps that cannot be followed."""
+
+    #: q -> energy of which r(q, 1) is the gradient.
+    energy: Callable[[jax.Array], jax.Array]
+    #: As `Problem.tangent`, of a matrix without negative eigenvalues.
+    definite: Callable[[jax.Array, jax.Array, Any, Any], Any]
+    #: (q, s) -> the least J of an element: not above 0 where elements are inverted.
+    volume: Callable[[jax.Array, Any], jax.Array]
+    #: The same of a body whose energy is finite where elements are inverted; None where it is already.
+    surrogate: Problem | None
+    #: Where the loads are followed from if the start is a guess, and whether it is; None where a start is a state.
+    rest: tuple[jax.Array, jax.Array] | None
