@@ -12,6 +12,7 @@ from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.physics import boundary
+from liverjax.physics.base import diagonal
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, equations, initial_state
 from liverjax.solvers import block_matrix
@@ -109,7 +110,7 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
             for b in range(4):
                 f = matrices.add(f, matrices.matvec(full[a][b], turned_back[b]))
             force = force.at[mesh.tetrahedra[:, a]].add(jnp.stack(matrices.matvec(R, f), axis=-1))
-        A = block_matrix.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, mass[:, 0] / dt**2)
+        A = block_matrix.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, diagonal(mass[:, 0] / dt**2))
         inverse = block_matrix.inverse_blocks(A.diagonal, mask)
 
         def precondition(r):
