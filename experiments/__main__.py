@@ -12,10 +12,17 @@ from experiments.pages.write import record, write
 HERE = Path(__file__).parent
 
 
+def module(script: str) -> str:
+    """The module of a script, by its name."""
+    (file,) = HERE.glob(f"*/{script}.py")
+    return f"experiments.{file.parent.name}.{script}"
+
+
 def run(script: str, quick: bool) -> bool:
     """One script in a process of its own; whether it ended well."""
     begin = time.perf_counter()
-    code = subprocess.run([sys.executable, str(HERE / f"{script}.py"), *(["--quick"] if quick else [])]).returncode
+    command = [sys.executable, "-m", module(script), *(["--quick"] if quick else [])]
+    code = subprocess.run(command, cwd=HERE.parent).returncode
     seconds = time.perf_counter() - begin
     print(f"{script}: {'done' if code == 0 else f'exit code {code}'} after {seconds:.0f} s", flush=True)
     if code == 0:

@@ -21,7 +21,8 @@ from liverjax.core.versions import versions
 
 #: Fewer cases and smaller ones, for a look at whether everything runs; published results stay as they are.
 QUICK = "--quick" in sys.argv[1:]
-RESULTS = Path(__file__).parent / "results" / ("quick" if QUICK else "")
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "experiments" / "results" / ("quick" if QUICK else "")
 plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.grid": True, "grid.alpha": 0.3, "savefig.dpi": 150})
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from experiments import assembly_rivals
-from experiments.baselines import corotational, critical_step, explicit
+from experiments.benchmarks.baselines import corotational, critical_step, explicit
+from experiments.chapter import assembly_rivals
 
 pytestmark = pytest.mark.quick_to_compile
 

@@ -1,4 +1,4 @@
-"""Every law against numbers from outside: law_values.json, which experiments/law_values.py computes with 50 digits.
+"""Every law against numbers from outside: law_values.json, computed with 50 digits (`experiments/sources`).
 
 Other tests compare an energy with its own derivatives. These see an energy that is wrong together with them.
 """
@@ -146,7 +146,7 @@ def test_the_table_has_the_known_moduli(name):
 def test_the_table_is_what_its_program_computes(name):
     pytest.importorskip("mpmath")
     sys.path.insert(0, str(ROOT))
-    from experiments import law_values
+    from experiments.sources import law_values
 
     assert law_values.CASES.keys() == CASES.keys()
     assert law_values.values(name) == CASES[name]

@@ -2,7 +2,7 @@
 
 Few parameters instead of a map: a smooth field spreads what is sharp, so its peak is no measure of an inclusion's
 modulus; a map says where to begin. The edge is as soft as the mesh is coarse, which keeps the sphere's place
-differentiable. Radius and modulus trade off: the elements should be small beside the sphere (`experiments/lesion.py`).
+differentiable. Radius and modulus trade off: the elements should be small beside the sphere.
 """
 
 from typing import Any

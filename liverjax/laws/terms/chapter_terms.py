@@ -118,7 +118,7 @@ def blocks(
     """d2W/dx_i dx_j per reference volume: G + H + I + Lambda + M + R of every k, and phi'' of a function of the sum.
 
     `regularised` changes the G of every product (not phi''). `constant` is `constant_matrices(D, pairs)`, stored in
-    advance as the chapter proposes; without it they are computed here, which is faster (experiments/fig4_assembly.py).
+    advance as the chapter proposes; without it they are computed here, which is faster (experiments/chapter).
     `write` writes what blocks share to memory, as `invariant_terms` does; here the compiler does better without.
     """
     keep = _written if write else lambda values: values

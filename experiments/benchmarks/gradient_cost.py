@@ -1,0 +1,150 @@
+"""What a gradient through a run costs: time and memory against the number of steps and what is kept, error beside.
+
+Every row is a process of its own, so that its peak of memory is its own. The error is that of the derivative by mu
+against forward mode (another way to the same number), and for short runs of a small body against central differences
+of several widths: the V-shaped curve.
+
+    python -m experiments gradient_cost [--quick]
+"""
+
+import json
+import resource
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import liverjax as lj
+from experiments.common import plt, save
+from experiments.liver import models, with_solve
+from liverjax.core.plotting import BLUE, GREEN, ORANGE
+from liverjax.core.struct import replace
+from liverjax.simulation import checkpoints, gradients
+
+
+def small() -> lj.Scene:
+    """The complete model on a block of 162 tetrahedra, in motion under its weight."""
+    mesh = lj.shapes.box((0.03, 0.03, 0.03), (3, 3, 3))
+    complete = models()["complete"]
+    return replace(
+        complete,
+        mesh=mesh,
+        porosity=replace(complete.porosity, drained=None),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_max"]),),
+        solve=replace(complete.solve, tolerance=1e-12),
+    )
+
+
+def scene_of(model: str, steps: int) -> lj.Scene:
+    """One of the liver's models to 1e-8, or the small one to 1e-12, in steps of 0.05 s."""
+    if model == "small":
+        return with_solve(small(), 0.05 * steps, 0.05)
+    return with_solve(models()[model], 0.05 * steps, 0.05, tolerance=1e-8)
+
+
+def loss(result: lj.Result) -> jax.Array:
+    """Mean square distance from the axes [m^2] over the whole run."""
+    return jnp.mean(result.positions**2)
+
+
+def fastest(program, *arguments, rounds: int) -> tuple[float, object]:
+    """Least wall time of some runs, and what came out."""
+    seconds = []
+    for _ in range(rounds):
+        begin = time.perf_counter()
+        out = jax.block_until_ready(program(*arguments))
+        seconds.append(time.perf_counter() - begin)
+    return min(seconds), out
+
+
+def measure(model: str, steps: int, store: str) -> dict:
+    """One row, in this process."""
+    scene, mu = scene_of(model, steps), jnp.asarray(770.0)
+    kept = int(store) if store.isdigit() else store
+    program = gradients._program(loss, kept, "reverse").lower(scene, {"law.mu": mu})
+    begin = time.perf_counter()
+    program = program.compile()
+    compiling = time.perf_counter() - begin
+    rounds = 1 if steps >= 1000 else 3
+    gradient_s, found = fastest(program, scene, {"law.mu": mu}, rounds=rounds)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+    def value(mu):
+        return loss(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})))
+
+    forward_s, _ = fastest(jax.jit(value).lower(mu).compile(), mu, rounds=rounds)
+    row = {
+        "model": model,
+        "tetrahedra": scene.mesh.number_of_elements,
+        "steps": steps,
+        "store": store,
+        "states_kept": checkpoints.number_kept(kept, steps),
+        "forward_s": forward_s,
+        "gradient_s": gradient_s,
+        "ratio": gradient_s / forward_s,
+        "compile_s": compiling,
+        "predicted_bytes": gradients.memory(scene, kept),
+        "planned_bytes": program.memory_analysis().temp_size_in_bytes,
+        "peak_resident_bytes": peak,
+        "code": int(found.status),
+    }
+    if model == "small" and steps <= 100:
+        tangent = jax.jit(lambda mu: jax.jvp(value, (mu,), (jnp.ones_like(mu),))[1])(mu)
+        row["against_forward_mode"] = float(abs(found.gradient["law.mu"] / tangent - 1))
+        run = jax.jit(value)
+        row["differences"] = {}
+        for h in 10.0 ** np.arange(-7, -0.5, 0.5):
+            slope = float(run(mu * (1 + h)) - run(mu * (1 - h))) / (2 * h * 770.0)
+            row["differences"][f"{h:.2g}"] = abs(float(found.gradient["law.mu"]) / slope - 1)
+    return row
+
+
+def main(quick: bool) -> None:
+    """All rows, table and figure."""
+    cases = [("small", n, s) for n in (10, 100, 1000, 10_000) for s in ("all", "sqrt")]
+    cases += [("hyperelastic", 100, "all"), ("viscous", 100, "all")]
+    cases += [("complete", n, s) for n in (10, 100, 1000) for s in ("all", "sqrt")]
+    if quick:
+        cases = [("small", 10, "all")]
+    rows = []
+    for case in cases:
+        command = [sys.executable, "-m", "experiments.benchmarks.gradient_cost", "--case", *map(str, case)]
+        rows.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+        shown = {k: v for k, v in rows[-1].items() if k != "differences"}
+        print(shown, flush=True)
+        save("gradient_cost", {"rows": rows}, figure(rows))
+
+
+def figure(rows: list[dict]) -> plt.Figure:
+    """Ratio and memory against steps, and the V-shaped curve."""
+    fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout="constrained")
+    for model, colour in (("complete", BLUE), ("small", ORANGE)):
+        for store, style in (("all", "o-"), ("sqrt", "s--")):
+            of = [r for r in rows if r["model"] == model and r["store"] == store]
+            label = f"{model if model == 'small' else 'liver, complete'}, {store}"
+            n = [r["steps"] for r in of]
+            axes[0].semilogx(n, [r["ratio"] for r in of], style, color=colour, label=label)
+            axes[1].loglog(n, [r["planned_bytes"] / 1e6 for r in of], style, color=colour, label=label)
+            axes[1].loglog(n, [r["predicted_bytes"] / 1e6 for r in of], "k+")
+    axes[0].set(xlabel="steps", ylabel="gradient over run [1]", title="Time (a settled run is cheap)", ylim=(0, 8))
+    axes[1].set(xlabel="steps", ylabel="memory [MB] (+: predicted)", title="Memory")
+    axes[0].legend(fontsize=7)
+    for r in rows:
+        if "differences" in r and r["store"] == "all":
+            h = [float(k) for k in r["differences"]]
+            colour, label = GREEN if r["steps"] == 10 else BLUE, f"{r['steps']} steps, small body"
+            axes[2].loglog(h, list(r["differences"].values()), "o-", color=colour, ms=3, label=label)
+    axes[2].legend(fontsize=7)
+    axes[2].set(xlabel="relative step of central differences", ylabel="relative difference", title="Error of d/d mu")
+    return fig
+
+
+if __name__ == "__main__":
+    if "--case" in sys.argv:
+        _, _, model, steps, store = sys.argv
+        print(json.dumps(measure(model, int(steps), store)))
+    else:
+        main("--quick" in sys.argv[1:])

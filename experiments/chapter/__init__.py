@@ -1,0 +1,1 @@
+"""What the chapter shows and claims, reproduced."""

@@ -1,0 +1,1 @@
+"""Parameters from measured and synthetic data."""

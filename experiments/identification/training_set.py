@@ -1,0 +1,149 @@
+"""A training set: 1,000 runs of the liver phantom by ``python -m liverjax sweep``, read back, and a surrogate of it.
+
+Static sagging under gravity of any direction, with shear and bulk modulus in a box of a factor of four: 1,000 rows of a
+Sobol sequence. A cubic polynomial in the parameters for the leading modes of the displacement is fitted to 800 rows and
+tried on the 200 others. ``python -m experiments training_set`` (8 minutes) writes results/training_set.json.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import h5py
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import liverjax as lj
+from experiments.common import either, save
+from experiments.liver import SCENE
+from liverjax.__main__ import main as command
+from liverjax.core.struct import replace
+
+RANGES = {
+    "law.mu": (700.0, 2800.0),
+    "law.bulk": (2200.0, 8800.0),
+    "body.gravity.0": (-2.0, 2.0),
+    "body.gravity.1": (-2.0, 2.0),
+    "body.gravity.2": (-2.0, 2.0),
+}
+ROWS, TRAINED, DEGREE, MODES = either(1000, 80), either(800, 60), either(3, 2), either((1, 2, 5, 10, 20, 40), (1, 5))
+
+
+def scene_file(folder: Path) -> Path:
+    """The liver phantom, static and without viscosity and fluid."""
+    mesh = SCENE.parent.joinpath("../../data/liver_phantom.vtu").resolve()
+    text = f"""
+[mesh]
+file = "{mesh.as_posix()}"
+[law]
+name = "arruda_boyce"
+mu = 715.0
+chain_length = 8.0
+bulk = 2200.0
+[body]
+density = 1060.0
+gravity = [0, 2.0, 0]
+[[fixed]]
+set = "vena_cava"
+[[fixed]]
+set = "suspensory_ligament"
+[solve]
+steps = 1
+tolerance = 1e-6
+"""
+    (folder / "scene.toml").write_text(text)
+    return folder / "scene.toml"
+
+
+def features(rows: np.ndarray) -> np.ndarray:
+    """Monomials up to DEGREE of the parameters, compliances instead of moduli, scaled to -1 … 1."""
+    low, high = np.array(list(RANGES.values())).T
+    stiff = np.array([name.startswith("law") for name in RANGES])
+    x = np.where(stiff, high / rows, rows)
+    low, high = np.where(stiff, 1.0, low), np.where(stiff, high / low, high)
+    x = 2 * (x - low) / (high - low) - 1
+    powers = [p for d in range(DEGREE + 1) for p in combinations_with_replacement(range(x.shape[1]), d)]
+    return np.stack([np.prod(x[:, p], axis=1) if p else np.ones(len(x)) for p in powers], axis=1)
+
+
+def surrogate(rows: np.ndarray, moved: np.ndarray) -> list[dict]:
+    """Error of polynomial and modes on the rows that were not used, against the number of modes."""
+    begin = time.perf_counter()
+    U, s, Vt = np.linalg.svd(moved[:TRAINED], full_matrices=False)
+    weights = np.linalg.lstsq(features(rows[:TRAINED]), U * s, rcond=None)[0]
+    fitting = time.perf_counter() - begin
+    errors = []
+    for n in MODES:
+        begin = time.perf_counter()
+        found = features(rows[TRAINED:]) @ weights[:, :n] @ Vt[:n]
+        evaluating = (time.perf_counter() - begin) / (ROWS - TRAINED)
+        missed = np.linalg.norm(found - moved[TRAINED:], axis=1) / np.linalg.norm(moved[TRAINED:], axis=1)
+        errors.append(
+            {
+                "modes": n,
+                "median_error": float(np.median(missed)),
+                "largest_error": float(missed.max()),
+                "seconds_a_row": evaluating,
+                "seconds_to_fit": fitting,
+            }
+        )
+    return errors
+
+
+def main() -> None:
+    """All of it."""
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        file, table, out = scene_file(folder), folder / "rows.csv", folder / "rows.h5"
+        command(["design", str(table), *(f"{n}={a}:{b}" for n, (a, b) in RANGES.items()), "--rows", str(ROWS)])
+        call = [sys.executable, "-m", "liverjax", "sweep", str(file), str(table), "--chunk", "50", "--devices", "2"]
+        begin = time.perf_counter()
+        code = subprocess.run(call, capture_output=True, text=True)
+        seconds = time.perf_counter() - begin
+        begin = time.perf_counter()
+        with h5py.File(out) as data:
+            rows, status = data["parameters"][:], data["status"][:]
+            moved = (data["final_positions"][:] - data["reference"][:]).reshape(ROWS, -1)
+        reading = time.perf_counter() - begin
+        size = out.stat().st_size
+        # A row read back is the run of its numbers.
+        scene, worst = lj.load_scene(file), 0.0
+        for k in (0, ROWS // 2, ROWS - 1):
+            law = replace(scene.law, mu=rows[k, 0], bulk=rows[k, 1])
+            body = replace(scene.body, gravity=rows[k, 2:])
+            again = jax.jit(lj.simulate)(replace(scene, law=law, body=body)).positions[-1] - scene.mesh.points
+            worst = max(worst, float(np.abs(np.asarray(again).ravel() - moved[k]).max()))
+    good = (status == 0).all(axis=1)
+    if not good.all():
+        raise RuntimeError(f"{(~good).sum()} rows failed: {code.stderr[-500:]}")
+    content = {
+        "rows": ROWS,
+        "ranges": {name: list(pair) for name, pair in RANGES.items()},
+        "seconds_sweep": seconds,
+        "seconds_reading": reading,
+        "bytes": size,
+        "largest_difference_to_single_runs_m": worst,
+        "largest_displacement_m": float(np.linalg.norm(moved.reshape(ROWS, -1, 3), axis=-1).max()),
+        "surrogate": surrogate(rows, moved),
+    }
+    save("training_set", content, _figure(content))
+
+
+def _figure(content: dict) -> plt.Figure:
+    figure, axis = plt.subplots(figsize=(4, 3), layout="constrained")
+    modes = [row["modes"] for row in content["surrogate"]]
+    for key, label, marker in (("median_error", "median", "o"), ("largest_error", "largest", "s")):
+        axis.loglog(
+            modes, [100 * row[key] for row in content["surrogate"]], marker=marker, label=f"{label} of 200 rows"
+        )
+    axis.set(xlabel="modes kept", ylabel="error of the displacement [%]", title="Surrogate from 800 runs")
+    axis.legend()
+    return figure
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How the files of data/ and tests/ were made."""

@@ -1,0 +1,1 @@
+"""Stiff and extreme cases, and runs that are killed."""
