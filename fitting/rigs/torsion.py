@@ -19,11 +19,13 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.elements import mjed
 from liverjax.laws import Law, isochoric_part, volumetric_part
-from liverjax.laws.terms import invariant_terms
 from liverjax.mesh import shapes
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 from liverjax.physics import viscosity
-from liverjax.physics.viscosity import Prony
+from liverjax.physics.base import End, Free, Physics, Step
+from liverjax.physics.elasticity import Elasticity
+from liverjax.physics.inertia import Inertia, Motion
+from liverjax.physics.viscosity import Prony, Viscoelasticity
 from liverjax.solvers import newton
 from liverjax.tensors.matrices import deformation_gradient
 
@@ -247,7 +249,7 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
     # A sin(w t) = Re(-i A e^(i w t)); the complex arc of the linearised discrete problem.
     arc = -1j * amplitude * (1 / (steady.stiffness * rig.radius) if by_torque else rig.radius)
     inverse = jax.lax.stop_gradient(rest.inverse if by_torque else _without_last(rest.inverse))
-    mass = None if rig.density is None else _nodal_mass(mesh, rig.density)
+    physics, free = _physics(rig, law, prony), Free(jnp.ones_like(mesh.points))
 
     def predicted(t):
         """Coordinates of the linear solution at time t."""
@@ -260,16 +262,14 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
         return q if by_torque else q[:-1]
 
     def step(carry, t):
-        q_old, history, motion = carry
-        memory = None if prony is None else viscosity.recall(prony, history, dt)
+        q_old, memories = carry
+        begin = Step(mesh, _positions(rig, *_unpack(rig, q_old)), 1, n_steps, dt, True, drive.options.tolerance, free)
+        solid, *nodal = (p.freeze(memory, begin) for p, memory in zip(physics, memories, strict=True))
 
         def forces(q):
             x = _positions(rig, *_unpack(rig, q))
-            F = deformation_gradient(mesh, x)
-            P = invariant_terms.first_piola(law, F) if prony is None else viscosity.first_piola(prony, memory, law, F)
-            f = mjed.nodal_force(mesh, P)
-            if mass is not None:
-                f = f + mass[:, None] * _acceleration(motion, x, dt)
+            f = mjed.nodal_force(mesh, solid.stress(deformation_gradient(mesh, x)))
+            f = sum((a.force(mesh, x, 1.0) for a in nodal), f)
             return _pack(rig, *_generalised(rig, x, f))
 
         load = jnp.zeros_like(q_old)
@@ -287,17 +287,14 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
         q = full(q, t)
         torque = load[-1] * rig.radius if by_torque else forces(q)[-1] * rig.radius
         x = _positions(rig, *_unpack(rig, q))
-        if prony is not None:
-            history = viscosity.advance(prony, history, law, deformation_gradient(mesh, x), dt)
-        if mass is not None:
-            a = _acceleration(motion, x, dt)
-            motion = (x, motion[1] + 0.5 * dt * (motion[2] + a), a)
+        end, each = End(x, deformation_gradient(mesh, x), None), zip(physics, memories, (solid, *nodal), strict=True)
+        memories = tuple(p.advance(memory, acting, end) for p, memory, acting in each)
         _, lift, angle = _unpack(rig, q)
-        return (q, history, motion), (angle, torque, lift, statistics)
+        return (q, memories), (angle, torque, lift, statistics)
 
-    q, history, motion = _initial(rig, law, prony, omega, dt, drive, steady.shape, arc, mass)
+    q, memories = _initial(rig, law, prony, omega, dt, drive, steady.shape, arc)
     times = dt * jnp.arange(1, n_steps + 1)
-    _, (angle, torque, lift, statistics) = jax.lax.scan(step, (q, history, motion), times)
+    _, (angle, torque, lift, statistics) = jax.lax.scan(step, (q, memories), times)
     _, lift_0, angle_0 = _unpack(rig, q)
     torque_0 = 0.0 if by_torque else rig.radius * jnp.real(steady.stiffness * arc) * (drive.start == "cycle")
     run = Run(
@@ -316,8 +313,14 @@ def _without_last(inverse: jax.Array) -> jax.Array:
     return inverse[:-1, :-1] - jnp.outer(b, b) / inverse[-1, -1]
 
 
-def _initial(rig, law, prony, omega, dt, drive, shape, arc, mass):
-    """Coordinates, memory and motion at time 0: at rest, or on the cycle of the linearised problem."""
+def _physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, ...]:
+    """The sample: its solid, and its mass where the rig has a density."""
+    solid = Elasticity(law=law) if prony is None else Viscoelasticity(law=law, prony=prony)
+    return (solid,) if rig.density is None else (solid, Inertia(density=rig.density, integrator="newmark"))
+
+
+def _initial(rig, law, prony, omega, dt, drive, shape, arc):
+    """Coordinates at time 0, and what the physics remember: at rest, or on the cycle of the linearised problem."""
     on_cycle = drive.start == "cycle"
     mesh = rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
@@ -332,32 +335,11 @@ def _initial(rig, law, prony, omega, dt, drive, shape, arc, mass):
         ratios = viscosity.complex_ratios(prony, omega, dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
         history = viscosity.History(gamma, None if history.stress is None else jnp.real(S_shape))
-    motion = None
-    if mass is not None:
-
-        def positions(q):
-            return _positions(rig, *_unpack(rig, q))
-
-        _, field = jax.linearize(positions, jnp.zeros_like(q))
-        on = 1.0 if on_cycle else 0.0
-        velocity, acceleration = (field(on * jnp.real(c * shape * arc)) for c in (1j * omega, -(omega**2)))
-        motion = (positions(q), velocity, acceleration)
-    return q, history, motion
-
-
-def _nodal_mass(mesh: TetMesh, density: Any) -> jax.Array:
-    """Lumped masses (V,) [kg]: a quarter of every element at each of its nodes."""
-    quarter = density * mesh.volumes / 4
-    mass = jnp.zeros(mesh.points.shape[0], mesh.points.dtype)
-    for a in range(4):
-        mass = mass.at[mesh.tetrahedra[:, a]].add(quarter)
-    return mass
-
-
-def _acceleration(motion, x, dt):
-    """Newmark's average acceleration: second order, without numerical damping."""
-    x_old, v, a = motion
-    return 4 / dt**2 * (x - x_old - dt * v) - a
+    if rig.density is None:
+        return q, (history,)
+    _, field = jax.linearize(lambda q: _positions(rig, *_unpack(rig, q)), jnp.zeros_like(q))
+    on = 1.0 if on_cycle else 0.0
+    return q, (history, Motion(*(field(on * jnp.real(c * shape * arc)) for c in (1j * omega, -(omega**2)))))
 
 
 @partial(jax.jit, static_argnames="drive")
