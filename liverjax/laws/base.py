@@ -13,7 +13,7 @@ differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_de
 written by hand.
 """
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from liverjax.core.struct import param, replace, static, struct
 from liverjax.laws.derivatives import First, Second, autodiff_derivatives, reduced, split_derivatives
 from liverjax.laws.terms import invariant_terms
 from liverjax.laws.terms.green_terms import components, material_axes
-from liverjax.laws.terms.invariant_terms import fibre_invariants, summands
+from liverjax.laws.terms.invariant_terms import fibre_invariants
 from liverjax.laws.volumetric import volumetric
 from liverjax.tensors.matrices import (
     Invariants,
@@ -44,37 +44,46 @@ class Law:
     """A hyperelastic law per reference volume [Pa]; see the module for what to override."""
 
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
+    #: The energies of a law; None: it has none of that kind.
+    isochoric_energy: Any = None
+    stretch_energy: Any = None
+    green_energy: Any = None
+    #: Their derivatives by hand; None: by automatic differentiation.
+    isochoric_derivatives: Any = None
+    stretch_derivatives: Any = None
+    green_derivatives: Any = None
+    #: The powers of a `stretch_energy`.
+    exponents: Any
+    #: Fields of the volumetric energy U(J), and of directions; None: the law has none.
     bulk: Any = None
-    if TYPE_CHECKING:  # of laws that have them
-        volumetric: Any
-        fibre: Any
-        exponents: Any
-        isochoric_energy: Any
-        stretch_energy: Any
-        green_energy: Any
+    volumetric: str
+    fibre: Any = None
+    sheet: Any
 
     # -- what a law states -------------------------------------------------------------------------------------------
 
     def strain_energy(self, I: Invariants) -> Any:
         """Energy density [Pa] of what the law names."""
         W = 0.0
-        if hasattr(self, "isochoric_energy"):
+        if self.isochoric_energy is not None:
             W = W + self.isochoric_energy(*reduced(I))
-        if hasattr(self, "stretch_energy"):
+        if self.stretch_energy is not None:
             W = W + self.stretch_energy(*(power_sum(I.stretches, a) for a in self.exponents()))
-        if hasattr(self, "green_energy"):
+        if self.green_energy is not None:
             W = W + self.green_energy(I.E)
-        return W if self.bulk is None else W + volumetric(self.volumetric, self.bulk, I.J)[0]
+        U = self.volumetric_part()
+        return W if U is None else W + U.strain_energy(I)
 
     def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
         """dW/dI_a and d2W/dI_a dI_b of scalar invariants; a missing key is a structural zero and costs nothing."""
         if type(self).strain_energy is not Law.strain_energy:
             return autodiff_derivatives(self, I)
-        first, second = split_derivatives(self, I) if hasattr(self, "isochoric_energy") else ({}, {})
-        if self.bulk is not None:
-            _, U1, U2 = volumetric(self.volumetric, self.bulk, I.J)
-            first["J"] = first["J"] + U1 if "J" in first else U1
-            second["J", "J"] = second["J", "J"] + U2 if ("J", "J") in second else U2
+        first, second = split_derivatives(self, I) if self.isochoric_energy is not None else ({}, {})
+        U = self.volumetric_part()
+        if U is not None:
+            slope, curvature = U.energy_derivatives(I)
+            _accumulate(first, "J", slope["J"])
+            _accumulate(second, ("J", "J"), curvature["J", "J"])
         return first, second
 
     def shear_modulus(self) -> Any:
@@ -83,11 +92,30 @@ class Law:
 
     def bulk_modulus(self) -> Any:
         """Ground-state bulk modulus [Pa]: `bulk` of a law whose other energies are isochoric."""
-        if type(self).strain_energy is not Law.strain_energy or hasattr(self, "green_energy"):
+        if type(self).strain_energy is not Law.strain_energy or self.green_energy is not None:
             raise InputError(
                 f"law {type(self).__name__} states no ground-state bulk modulus: define bulk_modulus(self)"
             )
         return 0.0 if self.bulk is None else self.bulk
+
+    def check(self) -> None:
+        """Raise `InputError` where fields do not go together; for laws that have such fields."""
+
+    # -- what a law is made of ----------------------------------------------------------------------------------------
+
+    def summands(self) -> tuple["Law", ...]:
+        """The laws that add up to this one: itself, unless it is a sum."""
+        return (self,)
+
+    def isochoric_part(self) -> Any:
+        """The law without U(J), or `None` where its energy has no such split (or is only volumetric)."""
+        if self.isochoric_energy is None and self.stretch_energy is None:
+            return None
+        return self if self.bulk is None else replace(self, bulk=None)
+
+    def volumetric_part(self) -> Any:
+        """U(J) as a law of its own, or `None` where there is none."""
+        return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
     # -- what a law can then do --------------------------------------------------------------------------------------
 
@@ -97,9 +125,9 @@ class Law:
         if "I4" in self.invariants:
             Fa = matvec(F, components(self.fibre, F[0][0]))
             I = I._replace(I4=dot(Fa, Fa))
-        if hasattr(self, "green_energy"):
+        if self.green_energy is not None:
             I = I._replace(E=green_strain(matmul(F, material_axes(self, F[0][0]))))
-        if hasattr(self, "stretch_energy"):
+        if self.stretch_energy is not None:
             I = I._replace(stretches=stretches(F))
         return I if self.bulk is None else I._replace(J=determinant(F))
 
@@ -113,7 +141,7 @@ class Law:
 
     def tangent(self, F: jax.Array) -> jax.Array:
         """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: the block of D = e_J, e_L."""
-        A = invariant_terms.tangent(self, unpack(_floating(F)))
+        A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
@@ -121,7 +149,7 @@ class Law:
     def __add__(self, other: "Law") -> "Sum":
         if not isinstance(other, Law):
             return NotImplemented
-        return Sum(laws=summands(self) + summands(other))
+        return Sum(laws=self.summands() + other.summands())
 
     def __radd__(self, other: Any) -> "Law":
         """0 + law, so that Python's `sum` adds a list of laws."""
@@ -140,6 +168,24 @@ class Sum(Law):
 
     laws: tuple = param("1", "laws that add up", unnamed=True)
 
+    def summands(self):
+        """The laws."""
+        return self.laws
+
+    def isochoric_part(self):
+        """Sum of the summands' but for those that are only volumetric; `None` where one of them has none."""
+        parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
+        return None if any(part is None for part in parts) else _added(parts)
+
+    def volumetric_part(self):
+        """Sum of the summands'."""
+        return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
+
+    def check(self):
+        """Check every summand."""
+        for law in self.laws:
+            law.check()
+
     def measures(self, F):
         """One set of invariants a summand: what two of them share is computed once."""
         return tuple(law.measures(F) for law in self.laws)
@@ -151,7 +197,7 @@ class Sum(Law):
     def energy_derivatives(self, I):
         """Sum of the scalar derivatives: summed before anything is assembled, so a second law costs only scalars."""
         first, second = {}, {}
-        fibres = fibre_invariants(self)
+        fibres = fibre_invariants(self.laws)
         for law, i in zip(self.laws, I, strict=True):
             own = {"I4": next((key for key, part in fibres.items() if part is law), None)}
             slopes, curvatures = law.energy_derivatives(i)
@@ -182,6 +228,10 @@ class Volumetric(Law):
     below: float | None = static(default=None, about="J below which U is its Taylor parabola there")
     invariants: ClassVar = ("J",)
 
+    def volumetric_part(self):
+        """The law itself."""
+        return self
+
     def strain_energy(self, I):
         """U(J)."""
         if self.below is None:
@@ -205,31 +255,21 @@ def _accumulate(total: dict, key: Any, value: Any) -> None:
     total[key] = total[key] + value if key in total else value
 
 
-def _isochoric(law: Law) -> Any:
-    if hasattr(law, "isochoric"):
-        return law.isochoric()
-    split = hasattr(law, "isochoric_energy") or hasattr(law, "stretch_energy")
-    return replace(law, bulk=None) if split else None
+def _added(parts: list) -> Any:
+    """The sum of laws, or `None` of no law."""
+    return sum(parts) if parts else None
 
 
-def _volumetric(law: Law) -> Any:
-    if isinstance(law, Volumetric):
-        return law
-    if hasattr(law, "volumetric_law"):
-        return law.volumetric_law()
-    return None if law.bulk is None else Volumetric(bulk=law.bulk, volumetric=law.volumetric)
+def summands(law: Law) -> tuple[Law, ...]:
+    """See `Law.summands`."""
+    return law.summands()
 
 
 def isochoric_part(law: Law) -> Any:
-    """The law without its volumetric energy, or `None` where an energy has no such split (or is only volumetric)."""
-    parts = [_isochoric(s) for s in summands(law)]
-    if any(p is None and not isinstance(s, Volumetric) for p, s in zip(parts, summands(law), strict=True)):
-        return None
-    kept = tuple(p for p in parts if p is not None)
-    return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)
+    """See `Law.isochoric_part`."""
+    return law.isochoric_part()
 
 
 def volumetric_part(law: Law) -> Any:
-    """U(J) of a split law as a law of its own, or `None` where there is none."""
-    kept = tuple(v for v in map(_volumetric, summands(law)) if v is not None)
-    return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)
+    """See `Law.volumetric_part`."""
+    return law.volumetric_part()

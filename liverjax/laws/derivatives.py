@@ -47,7 +47,7 @@ def split_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
 
 
 def _isochoric_derivatives(law: Any, Ibar: dict) -> tuple[First, Second]:
-    if hasattr(law, "isochoric_derivatives"):
+    if law.isochoric_derivatives is not None:
         return law.isochoric_derivatives(Ibar.get("I1"), Ibar.get("I2"))
     return _scalar_derivatives(lambda **I: law.isochoric_energy(I.get("I1"), I.get("I2")), Ibar)
 

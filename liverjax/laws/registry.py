@@ -11,7 +11,7 @@ import numpy as np
 from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
-from liverjax.laws.base import Law, Sum, summands
+from liverjax.laws.base import Law
 from liverjax.laws.continued import Continued
 from liverjax.laws.families.arruda_boyce import ArrudaBoyce
 from liverjax.laws.families.bogen import Bogen
@@ -85,7 +85,7 @@ def create(name: str, **values: Any) -> Law:
             continue  # an optional coefficient left out
         check_value(f"law {name}: {key}", known[key].metadata, value)
     law = cls(**{k: _sequence(v) if known[k].metadata.get("each") else v for k, v in values.items()})
-    if hasattr(law, "check") and not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(law)):
+    if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(law)):
         law.check()
     return law
 
@@ -128,8 +128,8 @@ def scaled(law: Law, factor: Any) -> Law:
         moduli = {f.name: getattr(s, f.name) for f in parameters(s) if f.metadata["unit"] == "Pa"}
         return replace(s, **{k: _times(v, factor) for k, v in moduli.items() if v is not None})
 
-    parts = tuple(one(s) for s in summands(law))
-    return parts[0] if len(parts) == 1 else Sum(laws=parts)
+    first, *others = (one(s) for s in law.summands())
+    return sum(others, first)
 
 
 def _times(value: Any, factor: Any) -> Any:
