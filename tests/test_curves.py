@@ -232,7 +232,7 @@ def test_eight_chains_no_worse_than_scipy_from_100_starts():
     found, _ = curves.read_curves([DATA / "rubber_curves.csv"])
     F = [jnp.asarray(c.F) for c in found]
     I1 = [np.asarray(jnp.einsum("nij,nij->n", f, f)) for f in F]
-    from liverjax.laws.arruda_boyce import COEFFICIENTS
+    from liverjax.laws.families.arruda_boyce import COEFFICIENTS
 
     def residuals(x):
         mu, N = 1e5 * np.exp(x[0]), np.exp(x[1])

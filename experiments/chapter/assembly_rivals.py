@@ -14,7 +14,6 @@ import jax.numpy as jnp
 
 from liverjax.elements import mjed
 from liverjax.laws.terms import chapter_terms, green_terms, invariant_terms, stretch_terms
-from liverjax.laws.terms.invariant_terms import summands
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.material_axes import SIX, six_of, symmetric
 from liverjax.tensors.matrices import (
@@ -74,7 +73,7 @@ def standard(mesh: TetMesh, law: Any, x: jax.Array, write: bool = False) -> tupl
     keep = _kept(write)
     F = keep(deformation_gradient(mesh, x))
     axes = green_terms.material_axes(law, F[0][0])
-    turned = hasattr(law, "fibre")
+    turned = law.fibre is not None
     FA = matmul(F, axes) if turned else F
     D = [matvec(transpose(axes), d) if turned else d for d in _shape_vectors(mesh)]
     S, moduli = keep(_elasticity(law, F, FA))
@@ -117,13 +116,13 @@ def _elasticity(law: Any, F: Matrix, FA: Matrix) -> tuple[Matrix, list]:
     slopes = {"I1": one, "I2": six_of(B), "J": tuple(J / 2 * c for c in six_of(inverse))}
     S = symmetric(tuple(_sum([2 * W * slopes[a][p] for a, W in first.items()] or [0.0 * J]) for p in range(6)))
     moduli = [[_sum(_parts(first, second, slopes, inverse, J, p, q)) for q in range(6)] for p in range(6)]
-    for part in summands(law):
-        if hasattr(part, "stretch_energy"):
+    for part in law.summands():
+        if part.stretch_energy is not None:
             frame = stretch_terms.principal(F)
             S = add_matrices(S, stretch_terms.stress(part, F, frame))
             more = stretch_terms.moduli(part, F, frame)
             moduli = [[moduli[p][q] + more[p][q] for q in range(6)] for p in range(6)]
-        if hasattr(part, "green_energy"):
+        if part.green_energy is not None:
             more, m = part.green_derivatives(green_terms.green_strain(FA))
             S, six = add_matrices(S, more), six_of(more)
             for p in range(6):

@@ -16,6 +16,7 @@ from fitting.methods.uncertainty import spread
 from fitting.readers.curves import Curve
 from liverjax import laws
 from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
 from liverjax.laws import Law, gradient_check, homogeneous
 from liverjax.laws.gradient_check import ellipticity
 
@@ -147,7 +148,7 @@ def _single(label: str, typical: Law) -> Candidate:
         return np.where(alpha, _exponents(rng, (n, len(names))), u)
 
     def law(p):
-        return laws.replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
+        return replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
 
     return Candidate(label, names, tuple("Pa" if m else "1" for m in modulus), values, law, random, notes)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from liverjax.laws.base import isochoric_part
+from liverjax.laws.base import Law
 from liverjax.laws.terms import green_terms, invariant_terms
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.tensors.matrices import (
@@ -75,7 +75,12 @@ def _unit(a: Vector, otherwise: Vector) -> Vector:
 
 
 def blocks(
-    parts: list[tuple[Any, Any]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+    parts: list[tuple[Any, Law]],
+    S: Matrix | None,
+    F: Matrix,
+    D: list[Vector],
+    pairs: tuple[tuple[int, int], ...],
+    volume: Scalars | None = None,
 ) -> list[Matrix]:
     """Blocks as `invariant_terms.blocks`, of which the element matrix has no negative eigenvalue.
 
@@ -85,6 +90,7 @@ def blocks(
         F: tuple matrix.
         D: shape vectors of the nodes.
         pairs: which blocks, as indices into D.
+        volume: derivatives of a volumetric energy beside them, or None.
     """
     first: dict[str, Any] = {}
     second: dict[tuple[str, str], Any] = {}
@@ -92,20 +98,23 @@ def blocks(
     metric = None if S is None else projected(S)
     for weight, law in parts:
         slopes, curvatures = law.energy_derivatives(law.measures(F))
-        fibres = invariant_terms.fibre_invariants(law)
+        fibres = invariant_terms.fibre_invariants(law.summands())
         for key, part in fibres.items():
             a = green_terms.components(part.fibre, F[0][0])
             added.append(_fibre(weight, slopes[key], curvatures.get((key, key), 0.0), a, F, D, pairs))
         _gather(first, weight, {k: v for k, v in slopes.items() if k not in fibres})
         _gather(second, weight, {k: v for k, v in curvatures.items() if not set(k) & set(fibres)})
-        for part in invariant_terms.summands(law):
-            if hasattr(part, "stretch_energy"):
-                stretched.append((weight, isochoric_part(part)))
-            if hasattr(part, "green_energy"):
+        for part in law.summands():
+            if part.stretch_energy is not None:
+                stretched.append((weight, part.isochoric_part()))
+            if part.green_energy is not None:
                 added.append([scale_matrix(weight, block) for block in green_terms.blocks(part, F, D, pairs)])
                 own = projected(scale_matrix(weight, green_terms.stress(part, F)))
                 metric = own if metric is None else add_matrices(metric, own)
-    result = _isotropic(Scalars(first, second, ("I1", "I2", "J")), stretched, F, D, pairs)
+    if volume is not None:
+        _gather(first, 1.0, volume.first)
+        _gather(second, 1.0, volume.second)
+    result = _isotropic(Scalars(first, second), stretched, F, D, pairs)
     if metric is not None:
         added.append([_diagonal(dot(D[i], matvec(metric, D[j]))) for i, j in pairs])
     for more in added:
@@ -114,12 +123,20 @@ def blocks(
 
 
 def regularised(
-    parts: list[tuple[Any, Any]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple[tuple[int, int], ...]
+    parts: list[tuple[Any, Law]],
+    S: Matrix | None,
+    F: Matrix,
+    D: list[Vector],
+    pairs: tuple[tuple[int, int], ...],
+    volume: Scalars | None = None,
 ) -> list[Matrix]:
     """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
     result = [_diagonal(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
-    for weight, law in parts:
-        K = invariant_terms.blocks(invariant_terms.state(law, F), D, pairs, regularised=True)
+    states = [(weight, invariant_terms.state(law, F)) for weight, law in parts]
+    if volume is not None:
+        states.append((1.0, invariant_terms.state_of(volume, F)))
+    for weight, state in states:
+        K = invariant_terms.blocks(state, D, pairs, regularised=True)
         result = [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
     return result
 
@@ -163,8 +180,9 @@ def _isotropic(scalars: Scalars, stretched: list, F: Matrix, D: list[Vector], pa
     at = frame(F)
     zero = jnp.zeros_like(at.s[0])
     diagonal = tuple(tuple(at.s[i] if i == j else zero for j in range(3)) for i in range(3))
-    tangents = [(1.0, invariant_terms.tangent(scalars, diagonal))]
-    tangents += [(weight, invariant_terms.tangent(law, diagonal)) for weight, law in stretched]
+    states = [(1.0, invariant_terms.state_of(scalars, diagonal))]
+    states += [(weight, invariant_terms.state(law, diagonal)) for weight, law in stretched]
+    tangents = [(weight, invariant_terms.tangent(state)) for weight, state in states]
 
     def entry(i, J, k, L):
         return sum((weight * A[J][L][i][k] for weight, A in tangents), 0.0)

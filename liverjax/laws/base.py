@@ -13,16 +13,17 @@ differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_de
 written by hand.
 """
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
+from liverjax.laws.derivatives import First, Second, autodiff_derivatives, reduced, split_derivatives
 from liverjax.laws.terms import invariant_terms
 from liverjax.laws.terms.green_terms import components, material_axes
-from liverjax.laws.terms.invariant_terms import fibre_invariants, summands
+from liverjax.laws.terms.invariant_terms import fibre_invariants
 from liverjax.laws.volumetric import volumetric
 from liverjax.tensors.matrices import (
     Invariants,
@@ -38,48 +39,51 @@ from liverjax.tensors.matrices import (
 )
 from liverjax.tensors.principal import power_sum, stretches
 
-First = dict[str, Any]
-Second = dict[tuple[str, str], Any]
-
-#: Scalar invariants in order; keys of second derivatives are pairs in this order.
-ORDER = ("I1", "I2", "I4", "J")
-
 
 class Law:
     """A hyperelastic law per reference volume [Pa]; see the module for what to override."""
 
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
+    #: The energies of a law; None: it has none of that kind.
+    isochoric_energy: Any = None
+    stretch_energy: Any = None
+    green_energy: Any = None
+    #: Their derivatives by hand; None: by automatic differentiation.
+    isochoric_derivatives: Any = None
+    stretch_derivatives: Any = None
+    green_derivatives: Any = None
+    #: The powers of a `stretch_energy`.
+    exponents: Any
+    #: Fields of the volumetric energy U(J), and of directions; None: the law has none.
     bulk: Any = None
-    if TYPE_CHECKING:  # of laws that have them
-        volumetric: Any
-        fibre: Any
-        exponents: Any
-        isochoric_energy: Any
-        stretch_energy: Any
-        green_energy: Any
+    volumetric: str
+    fibre: Any = None
+    sheet: Any
 
     # -- what a law states -------------------------------------------------------------------------------------------
 
     def strain_energy(self, I: Invariants) -> Any:
         """Energy density [Pa] of what the law names."""
         W = 0.0
-        if hasattr(self, "isochoric_energy"):
+        if self.isochoric_energy is not None:
             W = W + self.isochoric_energy(*reduced(I))
-        if hasattr(self, "stretch_energy"):
+        if self.stretch_energy is not None:
             W = W + self.stretch_energy(*(power_sum(I.stretches, a) for a in self.exponents()))
-        if hasattr(self, "green_energy"):
+        if self.green_energy is not None:
             W = W + self.green_energy(I.E)
-        return W if self.bulk is None else W + volumetric(self.volumetric, self.bulk, I.J)[0]
+        U = self.volumetric_part()
+        return W if U is None else W + U.strain_energy(I)
 
     def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
         """dW/dI_a and d2W/dI_a dI_b of scalar invariants; a missing key is a structural zero and costs nothing."""
         if type(self).strain_energy is not Law.strain_energy:
             return autodiff_derivatives(self, I)
-        first, second = split_derivatives(self, I) if hasattr(self, "isochoric_energy") else ({}, {})
-        if self.bulk is not None:
-            _, U1, U2 = volumetric(self.volumetric, self.bulk, I.J)
-            first["J"] = first["J"] + U1 if "J" in first else U1
-            second["J", "J"] = second["J", "J"] + U2 if ("J", "J") in second else U2
+        first, second = split_derivatives(self, I) if self.isochoric_energy is not None else ({}, {})
+        U = self.volumetric_part()
+        if U is not None:
+            slope, curvature = U.energy_derivatives(I)
+            _accumulate(first, "J", slope["J"])
+            _accumulate(second, ("J", "J"), curvature["J", "J"])
         return first, second
 
     def shear_modulus(self) -> Any:
@@ -88,11 +92,30 @@ class Law:
 
     def bulk_modulus(self) -> Any:
         """Ground-state bulk modulus [Pa]: `bulk` of a law whose other energies are isochoric."""
-        if type(self).strain_energy is not Law.strain_energy or hasattr(self, "green_energy"):
+        if type(self).strain_energy is not Law.strain_energy or self.green_energy is not None:
             raise InputError(
                 f"law {type(self).__name__} states no ground-state bulk modulus: define bulk_modulus(self)"
             )
         return 0.0 if self.bulk is None else self.bulk
+
+    def check(self) -> None:
+        """Raise `InputError` where fields do not go together; for laws that have such fields."""
+
+    # -- what a law is made of ----------------------------------------------------------------------------------------
+
+    def summands(self) -> tuple["Law", ...]:
+        """The laws that add up to this one: itself, unless it is a sum."""
+        return (self,)
+
+    def isochoric_part(self) -> Any:
+        """The law without U(J), or `None` where its energy has no such split (or is only volumetric)."""
+        if self.isochoric_energy is None and self.stretch_energy is None:
+            return None
+        return self if self.bulk is None else replace(self, bulk=None)
+
+    def volumetric_part(self) -> Any:
+        """U(J) as a law of its own, or `None` where there is none."""
+        return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
     # -- what a law can then do --------------------------------------------------------------------------------------
 
@@ -102,9 +125,9 @@ class Law:
         if "I4" in self.invariants:
             Fa = matvec(F, components(self.fibre, F[0][0]))
             I = I._replace(I4=dot(Fa, Fa))
-        if hasattr(self, "green_energy"):
+        if self.green_energy is not None:
             I = I._replace(E=green_strain(matmul(F, material_axes(self, F[0][0]))))
-        if hasattr(self, "stretch_energy"):
+        if self.stretch_energy is not None:
             I = I._replace(stretches=stretches(F))
         return I if self.bulk is None else I._replace(J=determinant(F))
 
@@ -118,7 +141,7 @@ class Law:
 
     def tangent(self, F: jax.Array) -> jax.Array:
         """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: the block of D = e_J, e_L."""
-        A = invariant_terms.tangent(self, unpack(_floating(F)))
+        A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
         return jnp.stack([r[0] for r in rows], axis=-3)
@@ -126,7 +149,7 @@ class Law:
     def __add__(self, other: "Law") -> "Sum":
         if not isinstance(other, Law):
             return NotImplemented
-        return Sum(laws=summands(self) + summands(other))
+        return Sum(laws=self.summands() + other.summands())
 
     def __radd__(self, other: Any) -> "Law":
         """0 + law, so that Python's `sum` adds a list of laws."""
@@ -145,6 +168,24 @@ class Sum(Law):
 
     laws: tuple = param("1", "laws that add up", unnamed=True)
 
+    def summands(self):
+        """The laws."""
+        return self.laws
+
+    def isochoric_part(self):
+        """Sum of the summands' but for those that are only volumetric; `None` where one of them has none."""
+        parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
+        return None if any(part is None for part in parts) else _added(parts)
+
+    def volumetric_part(self):
+        """Sum of the summands'."""
+        return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
+
+    def check(self):
+        """Check every summand."""
+        for law in self.laws:
+            law.check()
+
     def measures(self, F):
         """One set of invariants a summand: what two of them share is computed once."""
         return tuple(law.measures(F) for law in self.laws)
@@ -156,7 +197,7 @@ class Sum(Law):
     def energy_derivatives(self, I):
         """Sum of the scalar derivatives: summed before anything is assembled, so a second law costs only scalars."""
         first, second = {}, {}
-        fibres = fibre_invariants(self)
+        fibres = fibre_invariants(self.laws)
         for law, i in zip(self.laws, I, strict=True):
             own = {"I4": next((key for key, part in fibres.items() if part is law), None)}
             slopes, curvatures = law.energy_derivatives(i)
@@ -187,6 +228,10 @@ class Volumetric(Law):
     below: float | None = static(default=None, about="J below which U is its Taylor parabola there")
     invariants: ClassVar = ("J",)
 
+    def volumetric_part(self):
+        """The law itself."""
+        return self
+
     def strain_energy(self, I):
         """U(J)."""
         if self.below is None:
@@ -210,90 +255,21 @@ def _accumulate(total: dict, key: Any, value: Any) -> None:
     total[key] = total[key] + value if key in total else value
 
 
-def reduced(I: Invariants) -> tuple[Any, Any]:
-    """Isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2; NaN for J <= 0, where they do not exist."""
-    m = I.J ** (-2 / 3)
-    return (None if I.I1 is None else m * I.I1), (None if I.I2 is None else m * m * I.I2)
+def _added(parts: list) -> Any:
+    """The sum of laws, or `None` of no law."""
+    return sum(parts) if parts else None
 
 
-def split_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
-    """Chain rule from w(Ibar1, Ibar2) + U(J) to I1, I2, J (mathematics of the chapter's section 4.1.2, contracted)."""
-    m = I.J ** (-2 / 3)
-    inverse_J = 1 / I.J
-    Ibar = {"I1": m * I.I1} if "I1" in law.invariants else {}
-    if "I2" in law.invariants:
-        Ibar["I2"] = m * m * I.I2
-    power = {"I1": m, "I2": m * m}
-    p = {"I1": -2 / 3, "I2": -4 / 3}
-    w1, w2 = _isochoric_derivatives(law, Ibar)
-    slope_J = {a: p[a] * Ibar[a] * inverse_J for a in w1}  # dIbar_a/dJ
-
-    first = {a: w * power[a] for a, w in w1.items()}
-    first["J"] = sum(w * slope_J[a] for a, w in w1.items())
-    second = {key: w * power[key[0]] * power[key[1]] for key, w in w2.items()}
-    second["J", "J"] = sum(w * (p[a] - 1) * slope_J[a] * inverse_J for a, w in w1.items())
-    for a, w in w1.items():
-        second[a, "J"] = w * power[a] * p[a] * inverse_J
-    for (a, b), w in w2.items():
-        second[a, "J"] = second[a, "J"] + w * power[a] * slope_J[b]
-        if a != b:
-            second[b, "J"] = second[b, "J"] + w * power[b] * slope_J[a]
-        second["J", "J"] = second["J", "J"] + (1 if a == b else 2) * w * slope_J[a] * slope_J[b]
-    return first, second
-
-
-def _isochoric_derivatives(law: Law, Ibar: dict) -> tuple[First, Second]:
-    if hasattr(law, "isochoric_derivatives"):
-        return law.isochoric_derivatives(Ibar.get("I1"), Ibar.get("I2"))
-    return _scalar_derivatives(lambda **I: law.isochoric_energy(I.get("I1"), I.get("I2")), Ibar)
-
-
-def autodiff_derivatives(law: Law, I: Invariants) -> tuple[First, Second]:
-    """The scalar derivatives of `law.strain_energy` by forward mode: what a law gets that states only its energy."""
-    values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
-    return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
-
-
-def _scalar_derivatives(W: Any, values: dict) -> tuple[First, Second]:
-    names = list(values)
-
-    def slope(a):
-        tangents = {n: jnp.ones_like(v) if n == a else jnp.zeros_like(v) for n, v in values.items()}
-        return lambda v: jax.jvp(lambda v: W(**v), (v,), (tangents,))[1]
-
-    def curvature(a, b):
-        tangents = {n: jnp.ones_like(v) if n == b else jnp.zeros_like(v) for n, v in values.items()}
-        return jax.jvp(slope(a), (values,), (tangents,))[1]
-
-    first = {a: slope(a)(values) for a in names}
-    return first, {(a, b): curvature(a, b) for k, a in enumerate(names) for b in names[k:]}
-
-
-def _isochoric(law: Law) -> Any:
-    if hasattr(law, "isochoric"):
-        return law.isochoric()
-    split = hasattr(law, "isochoric_energy") or hasattr(law, "stretch_energy")
-    return replace(law, bulk=None) if split else None
-
-
-def _volumetric(law: Law) -> Any:
-    if isinstance(law, Volumetric):
-        return law
-    if hasattr(law, "volumetric_law"):
-        return law.volumetric_law()
-    return None if law.bulk is None else Volumetric(bulk=law.bulk, volumetric=law.volumetric)
+def summands(law: Law) -> tuple[Law, ...]:
+    """See `Law.summands`."""
+    return law.summands()
 
 
 def isochoric_part(law: Law) -> Any:
-    """The law without its volumetric energy, or `None` where an energy has no such split (or is only volumetric)."""
-    parts = [_isochoric(s) for s in summands(law)]
-    if any(p is None and not isinstance(s, Volumetric) for p, s in zip(parts, summands(law), strict=True)):
-        return None
-    kept = tuple(p for p in parts if p is not None)
-    return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)
+    """See `Law.isochoric_part`."""
+    return law.isochoric_part()
 
 
 def volumetric_part(law: Law) -> Any:
-    """U(J) of a split law as a law of its own, or `None` where there is none."""
-    kept = tuple(v for v in map(_volumetric, summands(law)) if v is not None)
-    return None if not kept else kept[0] if len(kept) == 1 else Sum(laws=kept)
+    """See `Law.volumetric_part`."""
+    return law.volumetric_part()

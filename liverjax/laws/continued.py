@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
-from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.laws.base import Law, Volumetric
 from liverjax.tensors.matrices import determinant
 
 
@@ -26,14 +26,14 @@ class Continued(Law):
         """Those of the law, and J."""
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
-    def isochoric(self) -> Law | None:
+    def isochoric_part(self) -> Law | None:
         """Without its volumetric energy; None where the law has no such split."""
-        part = isochoric_part(self.law)
+        part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
-    def volumetric_law(self) -> Law | None:
+    def volumetric_part(self) -> Law | None:
         """The volumetric energy alone, or None."""
-        part = volumetric_part(self.law)
+        part = self.law.volumetric_part()
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
     def measures(self, F):
@@ -44,7 +44,7 @@ class Continued(Law):
     def strain_energy(self, I):
         """That of the law at the replaced J, and the volumetric one at J."""
         I, J = I
-        W, volume = self._whole().strain_energy(I), self.volumetric_law()
+        W, volume = self._whole().strain_energy(I), self.volumetric_part()
         return W if volume is None else W + volume.strain_energy(I._replace(J=J))
 
     def energy_derivatives(self, I):
@@ -57,7 +57,7 @@ class Continued(Law):
             first = first | {"J": W_J * slope}
             mixed = {key: W * slope if "J" in key else W for key, W in second.items()}
             second = mixed | {("J", "J"): second.get(("J", "J"), 0.0) * slope * slope + W_J * curvature}
-        volume = self.volumetric_law()
+        volume = self.volumetric_part()
         if volume is not None:
             more, curved = volume.energy_derivatives(I._replace(J=J))
             first = first | {"J": first.get("J", 0.0) + more["J"]}
@@ -73,8 +73,8 @@ class Continued(Law):
         return self.law.bulk_modulus()
 
     def _whole(self) -> Law:
-        """The law without what `volumetric_law` is."""
-        part = isochoric_part(self.law)
+        """The law without its volumetric part."""
+        part = self.law.isochoric_part()
         return self.law if part is None else part
 
     def _replaced(self, J: Any) -> tuple[Any, Any, Any]:
@@ -101,13 +101,13 @@ def continued(law: Law, below: float) -> Law:
     """
     if isinstance(below, bool) or not isinstance(below, (int, float)) or not 0 < below < 1:
         raise InputError(f"law continued_below = {below!r} must lie between 0 and 1: give e.g. 0.1")
-    for part in summands(law):
+    for part in law.summands():
         kinds = {"stretch_energy": "principal stretches", "green_energy": "Green's strain", "fibre": "fibres"}
         for attribute, kind in kinds.items():
-            if hasattr(part, attribute):
+            if getattr(part, attribute) is not None:
                 raise InputError(
                     f"law continued_below is for energies of I1, I2 and J, not for {type(part).__name__} of {kind}: "
                     "leave it out"
                 )
-    parts = tuple(Continued(law=part, below=float(below)) for part in summands(law))
-    return parts[0] if len(parts) == 1 else Sum(laws=parts)
+    first, *others = (Continued(law=part, below=float(below)) for part in law.summands())
+    return sum(others, first)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.laws.base import Law, isochoric_part
+from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
 
@@ -46,8 +46,8 @@ def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
     det F = 1 as it is. `constant` says that F is data, with respect to which nothing will be differentiated: a
     stretch-based law is then much cheaper to differentiate with respect to its parameters.
     """
-    split = isochoric_part(law)
-    if constant and hasattr(split, "stretch_energy"):
+    split = law.isochoric_part()
+    if constant and split is not None and split.stretch_energy is not None:
         P = F @ pack(stress_at_constant(split, unpack(F)))
     else:
         P = (law if split is None else split).first_piola(F)

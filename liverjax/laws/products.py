@@ -7,14 +7,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.laws.arruda_boyce import COEFFICIENTS, ArrudaBoyce
 from liverjax.laws.base import Law, Volumetric
-from liverjax.laws.exponential_invariants import FungDemiray, VerondaWestmann
-from liverjax.laws.mooney_rivlin import MooneyRivlin
-from liverjax.laws.neo_hookean import NeoHookean, NeoHookeanCompressible
-from liverjax.laws.saint_venant_kirchhoff import SaintVenantKirchhoff
+from liverjax.laws.families.arruda_boyce import COEFFICIENTS, ArrudaBoyce
+from liverjax.laws.families.fung_demiray import FungDemiray
+from liverjax.laws.families.mooney_rivlin import MooneyRivlin
+from liverjax.laws.families.neo_hookean import NeoHookean, NeoHookeanCompressible
+from liverjax.laws.families.saint_venant_kirchhoff import SaintVenantKirchhoff
+from liverjax.laws.families.veronda_westmann import VerondaWestmann
+from liverjax.laws.families.yeoh import Yeoh
 from liverjax.laws.volumetric import volumetric
-from liverjax.laws.yeoh import Yeoh
 from liverjax.tensors.matrices import Invariants
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import param, struct
-from liverjax.laws.base import Law, volumetric_part
+from liverjax.laws.base import Law, Sum, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import element_mean, nodal_volumes, to_nodes
 from liverjax.mesh.tetrahedra import TetMesh
@@ -27,7 +27,7 @@ def _mean(mesh: TetMesh, J: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _invariants(law: Law, J: jax.Array) -> Any:
-    return tuple(Invariants(J=J) for _ in law.laws) if hasattr(law, "laws") else Invariants(J=J)
+    return tuple(Invariants(J=J) for _ in law.laws) if isinstance(law, Sum) else Invariants(J=J)
 
 
 def energy(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
@@ -81,7 +81,7 @@ class Averaged(VolumeStress):
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """The pressure of an element, which has no slope where those of the nodes are given."""
         p = element_mean(mesh, pressure)
-        return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)}, ("J",))
+        return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """See `energy` of this module."""

@@ -179,7 +179,7 @@ class Sponge(VolumeStress):
         """sigma_Heq(J) - P and its slope at given pressure."""
         J = determinant(F)
         stress = volumetric_stress(self.porosity, J) - element_mean(mesh, pressure)
-        return Scalars({"J": stress}, {("J", "J"): volumetric_slope(self.porosity, J)}, ("J",))
+        return Scalars({"J": stress}, {("J", "J"): volumetric_slope(self.porosity, J)})
 
 
 @struct

@@ -94,9 +94,7 @@ def check_scene(scene: Scene) -> None:
     check_choices(scene)
     check_bounds(scene)
     check_mesh(scene.mesh)
-    for part in laws.summands(scene.law):
-        if hasattr(part, "check"):
-            part.check()
+    scene.law.check()
     regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
     if scene.viscosity is not None:
         viscosity.check(scene.viscosity, scene.law)

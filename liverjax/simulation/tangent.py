@@ -38,13 +38,13 @@ def element_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -
     if kind == "true":
         summands = [solid.blocks(F, D, _OWN) for solid in e.solids]
         if volume is not None:
-            summands.append(invariant_terms.blocks(invariant_terms.state(volume, F), D, _OWN))
+            summands.append(invariant_terms.blocks(invariant_terms.state_of(volume, F), D, _OWN))
     else:
         make = projection.blocks if kind == "projected" else projection.regularised
         pairs = [solid.parts() for solid in e.solids]
-        parts = [part for laws, _ in pairs for part in laws] + ([] if volume is None else [(1.0, volume)])
+        parts = [part for laws, _ in pairs for part in laws]
         remembered = [S for _, S in pairs if S is not None]
-        summands = [make(parts, remembered[0] if remembered else None, F, D, _OWN)]
+        summands = [make(parts, remembered[0] if remembered else None, F, D, _OWN, volume)]
     K = summands[0]
     for more in summands[1:]:
         K = [add_matrices(a, b) for a, b in zip(K, more, strict=True)]

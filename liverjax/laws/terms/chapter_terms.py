@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.laws import products
-from liverjax.laws.base import summands
 from liverjax.tensors.matrices import (
     IDENTITY,
     Matrix,
@@ -75,7 +74,7 @@ def _at(law: Any, F: Matrix) -> _At:
     C, I = right_cauchy_green(F), invariants(("I1", "I2", "J"), F)
     B = tuple(tuple((I.I1 if r == c else 0.0) - C[r][c] for c in range(3)) for r in range(3))
     groups = []
-    for part in summands(law):
+    for part in law.summands():
         for group in products.groups(part):
             terms = [_term(k, I.I1, I.I2, I.J) for k in group.products]
             first, second = (1.0, 0.0) if group.slopes is None else group.slopes(sum(t.g * t.h for t in terms))

@@ -54,7 +54,7 @@ def components(direction: Any, like: Any) -> Vector:
 
 def material_axes(law: Any, like: Any) -> Matrix:
     """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes where a law has no fibre."""
-    if not hasattr(law, "fibre"):
+    if law.fibre is None:
         return IDENTITY
     f, s = components(law.fibre, like), components(law.sheet, like)
     s = unit(add(s, scale(-dot(f, s), f)))
@@ -72,7 +72,7 @@ def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     A = material_axes(law, F[0][0])
     FA = matmul(F, A)
     E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]
-    if not hasattr(law, "green_derivatives"):
+    if law.green_derivatives is None:
         half = [half_contracted(_autodiff_moduli(law, E), d) for d in turned]
         return [pushed(FA, anisotropic(half[j], turned[i])) for i, j in pairs]
     S, moduli = stored(law.green_derivatives(E))
@@ -87,7 +87,7 @@ def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
 
 
 def _stress(law: Any, E: Matrix) -> Matrix:
-    if hasattr(law, "green_derivatives"):
+    if law.green_derivatives is not None:
         return law.green_derivatives(E)[0]
     return symmetric(tuple(_slopes(lambda six: law.green_energy(symmetric(six)), six_of(E))))
 

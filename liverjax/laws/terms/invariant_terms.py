@@ -4,8 +4,7 @@ Chapter, section 4.1.2, contracted: with J as one more invariant and v_a,i = dI_
 
     d2W/dx_i dx_j = sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j
 
-No matrix is inverted. `law` is anything with `measures` and `energy_derivatives` (see `liverjax.laws.base`).
-Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
+No matrix is inverted. Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +12,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from liverjax.laws.terms import green_terms, stretch_terms
-from liverjax.tensors.material_axes import anisotropic, half_contracted, pushed
 from liverjax.tensors.matrices import (
     Matrix,
     Vector,
@@ -42,25 +40,16 @@ class Stress(NamedTuple):
 
 
 class Scalars(NamedTuple):
-    """Scalar derivatives at one deformation gradient, known beforehand: they stand where a law stands."""
+    """First and second derivatives of an energy with respect to invariants, at one deformation gradient."""
 
     first: dict
     second: dict
-    invariants: tuple[str, ...]
-
-    def measures(self, F: Matrix) -> Matrix:
-        """What `energy_derivatives` takes."""
-        return F
-
-    def energy_derivatives(self, _: Matrix) -> tuple[dict, dict]:
-        """The numbers themselves."""
-        return self.first, self.second
 
 
 class State(NamedTuple):
     """What force and stiffness share at one deformation gradient."""
 
-    law: Any
+    laws: tuple  # summands, whose energies of stretches and of Green's strain add up
     F: Matrix
     C: Matrix | None
     cof: Matrix
@@ -72,36 +61,40 @@ class State(NamedTuple):
     frame: Any  # principal stretches and axes, where a summand has an energy of stretches
 
 
-def summands(law: Any) -> tuple:
-    """The laws of a sum, or the law alone."""
-    return getattr(law, "laws", (law,))
-
-
 def state(law: Any, F: Matrix) -> State:
-    """Scalar derivatives of the law at F; C only where I2 needs it."""
-    first, second = law.energy_derivatives(law.measures(F))
+    """The law (`liverjax.laws.base.Law`) at F."""
+    return _state(Scalars(*law.energy_derivatives(law.measures(F))), F, law.summands())
+
+
+def state_of(scalars: Scalars, F: Matrix) -> State:
+    """An energy of I1, I2 and J at F, of which the derivatives are known."""
+    return _state(scalars, F, ())
+
+
+def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
+    """C only where I2 needs it, principal stretches only where a law does."""
+    first, second = scalars
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
     I1 = None if C is None else C[0][0] + C[1][1] + C[2][2]
-    fibres = {key: green_terms.components(part.fibre, F[0][0]) for key, part in fibre_invariants(law).items()}
-    frame = principal(F) if any(hasattr(part, "stretch_energy") for part in summands(law)) else None
-    return State(law, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres, frame)
+    fibres = {key: green_terms.components(part.fibre, F[0][0]) for key, part in fibre_invariants(laws).items()}
+    frame = principal(F) if any(part.stretch_energy is not None for part in laws) else None
+    return State(laws, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres, frame)
 
 
-def fibre_invariants(law: Any) -> dict[str, Any]:
-    """Names of the invariants a . C a of a law: each summand has its own fibre."""
-    parts = summands(law)
-    if len(parts) == 1:
-        return {"I4": parts[0]} if "I4" in parts[0].invariants else {}
-    return {f"I4.{k}": part for k, part in enumerate(parts) if "I4" in part.invariants}
+def fibre_invariants(laws: tuple) -> dict[str, Any]:
+    """Names of the invariants a . C a of a sum of laws: each has its own fibre."""
+    if len(laws) == 1:
+        return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
+    return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}
 
 
 def stress(s: State) -> Stress:
     """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; absent derivatives leave no term."""
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
     tensors = [scale_matrix(2 * s.first[key], outer(a, a)) for key, a in s.fibres.items()]
-    tensors += [stretch_terms.stress(part, s.F, s.frame) for part in summands(s.law) if hasattr(part, "stretch_energy")]
-    tensors += [green_terms.stress(part, s.F) for part in summands(s.law) if hasattr(part, "green_energy")]
+    tensors += [stretch_terms.stress(law, s.F, s.frame) for law in s.laws if law.stretch_energy is not None]
+    tensors += [green_terms.stress(law, s.F) for law in s.laws if law.green_energy is not None]
     if W2 is not None:
         diagonal = 2 * (W1 + s.I1 * W2)
         assert s.C is not None
@@ -243,23 +236,22 @@ def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regula
         s = s._replace(frame=stored(s.frame))
     parts = _parts(s, D, pairs)
     result = [_block(parts, pair, regularised) for pair in pairs]
-    for part in summands(s.law):
-        if hasattr(part, "stretch_energy"):
-            C = stored(stretch_terms.moduli(part, s.F, s.frame))
-            half = stored([half_contracted(C, d) for d in D])
-            more = [pushed(s.F, anisotropic(half[j], D[i])) for i, j in pairs]
-            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
-        if hasattr(part, "green_energy"):
-            more = green_terms.blocks(part, s.F, D, pairs)
-            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+    added = []
+    for law in s.laws:
+        if law.stretch_energy is not None:
+            added.append(stretch_terms.blocks(law, s.F, s.frame, D, pairs))
+        if law.green_energy is not None:
+            added.append(green_terms.blocks(law, s.F, D, pairs))
+    for more in added:
+        result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
     return result
 
 
 _UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def tangent(law: Any, F: Matrix, regularised: bool = False) -> list[list[Matrix]]:
+def tangent(s: State) -> list[list[Matrix]]:
     """d2W/dF dF [Pa] as nested [J][L] of matrices (i, k): the blocks of shape vectors e_J and e_L."""
     pairs = tuple((J, L) for J in range(3) for L in range(3))
-    A = blocks(state(law, F), list(_UNIT_VECTORS), pairs, regularised)
+    A = blocks(s, list(_UNIT_VECTORS), pairs)
     return [A[3 * J : 3 * J + 3] for J in range(3)]

@@ -18,8 +18,17 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from liverjax.tensors.material_axes import PAIRS, SIX, rotated, six_of, symmetric
-from liverjax.tensors.matrices import Matrix, Vector, add, determinant, dot, matmul, transpose
+from liverjax.tensors.material_axes import (
+    PAIRS,
+    SIX,
+    anisotropic,
+    half_contracted,
+    pushed,
+    rotated,
+    six_of,
+    symmetric,
+)
+from liverjax.tensors.matrices import Matrix, Vector, add, determinant, dot, matmul, stored, transpose
 from liverjax.tensors.principal import change, expanded_power_sum, principal, sinh_ratio
 
 #: Logarithms of the principal stretches and their axes (`liverjax.tensors.principal`): constants of differentiation.
@@ -42,7 +51,7 @@ class Principal(NamedTuple):
 
 def stretch_slopes(law: Any, X: tuple) -> tuple[tuple, dict]:
     """dw/dX_k and {(k, l): d2w/dX_k dX_l}: by hand where the law has them, else by scalar automatic differentiation."""
-    if hasattr(law, "stretch_derivatives"):
+    if law.stretch_derivatives is not None:
         return law.stretch_derivatives(*X)
     n = len(X)
     ones = [tuple(jnp.ones_like(x) if k == j else jnp.zeros_like(x) for j, x in enumerate(X)) for k in range(n)]
@@ -99,6 +108,13 @@ def stress(law: Any, F: Matrix, frame: Frame) -> Matrix:
 def moduli(law: Any, F: Matrix, frame: Frame) -> list[list]:
     """dS/dE [Pa] of w alone over six components each, in the coordinate axes, with `frame` = `principal(F)`."""
     return _square(_moduli(_arrays(law, F), F, frame))
+
+
+def blocks(law: Any, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
+    """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
+    C = stored(moduli(law, F, frame))
+    half = stored([half_contracted(C, d) for d in D])
+    return [pushed(F, anisotropic(half[j], D[i])) for i, j in pairs]
 
 
 def _arrays(law: Any, F: Matrix) -> Any:

@@ -1,0 +1,73 @@
+"""Scalar derivatives of a law's energy with respect to its invariants, by the chain rule and by forward mode."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.tensors.matrices import Invariants
+
+First = dict[str, Any]
+Second = dict[tuple[str, str], Any]
+
+#: Scalar invariants in order; keys of second derivatives are pairs in this order.
+ORDER = ("I1", "I2", "I4", "J")
+
+
+def reduced(I: Invariants) -> tuple[Any, Any]:
+    """Isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2; NaN for J <= 0, where they do not exist."""
+    m = I.J ** (-2 / 3)
+    return (None if I.I1 is None else m * I.I1), (None if I.I2 is None else m * m * I.I2)
+
+
+def split_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
+    """Chain rule from w(Ibar1, Ibar2) + U(J) to I1, I2, J (mathematics of the chapter's section 4.1.2, contracted)."""
+    m = I.J ** (-2 / 3)
+    inverse_J = 1 / I.J
+    Ibar = {"I1": m * I.I1} if "I1" in law.invariants else {}
+    if "I2" in law.invariants:
+        Ibar["I2"] = m * m * I.I2
+    power = {"I1": m, "I2": m * m}
+    p = {"I1": -2 / 3, "I2": -4 / 3}
+    w1, w2 = _isochoric_derivatives(law, Ibar)
+    slope_J = {a: p[a] * Ibar[a] * inverse_J for a in w1}  # dIbar_a/dJ
+
+    first = {a: w * power[a] for a, w in w1.items()}
+    first["J"] = sum(w * slope_J[a] for a, w in w1.items())
+    second = {key: w * power[key[0]] * power[key[1]] for key, w in w2.items()}
+    second["J", "J"] = sum(w * (p[a] - 1) * slope_J[a] * inverse_J for a, w in w1.items())
+    for a, w in w1.items():
+        second[a, "J"] = w * power[a] * p[a] * inverse_J
+    for (a, b), w in w2.items():
+        second[a, "J"] = second[a, "J"] + w * power[a] * slope_J[b]
+        if a != b:
+            second[b, "J"] = second[b, "J"] + w * power[b] * slope_J[a]
+        second["J", "J"] = second["J", "J"] + (1 if a == b else 2) * w * slope_J[a] * slope_J[b]
+    return first, second
+
+
+def _isochoric_derivatives(law: Any, Ibar: dict) -> tuple[First, Second]:
+    if law.isochoric_derivatives is not None:
+        return law.isochoric_derivatives(Ibar.get("I1"), Ibar.get("I2"))
+    return _scalar_derivatives(lambda **I: law.isochoric_energy(I.get("I1"), I.get("I2")), Ibar)
+
+
+def autodiff_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
+    """The scalar derivatives of `law.strain_energy` by forward mode: what a law gets that states only its energy."""
+    values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
+    return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
+
+
+def _scalar_derivatives(W: Any, values: dict) -> tuple[First, Second]:
+    names = list(values)
+
+    def slope(a):
+        tangents = {n: jnp.ones_like(v) if n == a else jnp.zeros_like(v) for n, v in values.items()}
+        return lambda v: jax.jvp(lambda v: W(**v), (v,), (tangents,))[1]
+
+    def curvature(a, b):
+        tangents = {n: jnp.ones_like(v) if n == b else jnp.zeros_like(v) for n, v in values.items()}
+        return jax.jvp(slope(a), (values,), (tangents,))[1]
+
+    first = {a: slope(a)(values) for a in names}
+    return first, {(a, b): curvature(a, b) for k, a in enumerate(names) for b in names[k:]}

@@ -1,0 +1,1 @@
+"""Families of material laws, one a file."""

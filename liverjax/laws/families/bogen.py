@@ -1,0 +1,39 @@
+"""Bogen: one power of the principal stretches.
+
+The chapter's Table 1 prints "- 1" in place of "- 3": then neither energy nor stress would be right at rest.
+"""
+
+from typing import Any, ClassVar
+
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law
+
+
+@struct
+class Bogen(Law):
+    """W = mu/alpha (Xi(alpha) - 3) + U(J).
+
+    Chapter, Table 1 (with - 3 for its - 1); Bogen 1987. One term of Ogden's law.
+    """
+
+    mu: Any = param("Pa", "mu; of alpha's sign for a stable law", typical=400.0)
+    alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
+    invariants: ClassVar = ("stretches", "J")
+
+    def exponents(self):
+        """alpha."""
+        return (self.alpha,)
+
+    def stretch_energy(self, X):
+        """mu/alpha X."""
+        return self.mu / self.alpha * X
+
+    def stretch_derivatives(self, X):
+        """mu/alpha, 0."""
+        return (self.mu / self.alpha,), {}
+
+    def shear_modulus(self):
+        """mu alpha / 2 [Pa]."""
+        return self.mu * self.alpha / 2

@@ -1,0 +1,43 @@
+"""Exponential of a power of the principal stretches.
+
+The chapter's Table 1 prints "- 1" in place of "- 3": then neither energy nor stress would be right at rest.
+"""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law
+
+
+@struct
+class Exponential(Law):
+    """W = c1 (exp(c2 (Xi(alpha) - 3)) - 1) + U(J).
+
+    Chapter, Table 1 (with - 3 for its - 1).
+    """
+
+    c1: Any = param("Pa", "scale", above=0.0, typical=385.0)
+    c2: Any = param("1", "exponent's factor", above=0.0, typical=0.25)
+    alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
+    invariants: ClassVar = ("stretches", "J")
+
+    def exponents(self):
+        """alpha."""
+        return (self.alpha,)
+
+    def stretch_energy(self, X):
+        """By expm1: no cancellation at rest."""
+        return self.c1 * jnp.expm1(self.c2 * X)
+
+    def stretch_derivatives(self, X):
+        """c1 c2 e and c1 c2^2 e, e = exp(c2 X)."""
+        slope = self.c1 * self.c2 * jnp.exp(self.c2 * X)
+        return (slope,), {(0, 0): self.c2 * slope}
+
+    def shear_modulus(self):
+        """c1 c2 alpha^2 / 2 [Pa]."""
+        return self.c1 * self.c2 * self.alpha**2 / 2

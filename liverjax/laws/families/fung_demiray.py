@@ -1,0 +1,35 @@
+"""Fung-Demiray: an exponential of the first invariant."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law
+
+
+@struct
+class FungDemiray(Law):
+    """W = c1/(2 c2) (exp(c2 (Ibar1 - 3)) - 1) + U(J).
+
+    Chapter, Table 1; Demiray 1972.
+    """
+
+    c1: Any = param("Pa", "ground-state shear modulus", above=0.0, typical=770.0)
+    c2: Any = param("1", "exponent", above=0.0, typical=1.0)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
+    invariants: ClassVar = ("I1", "J")
+
+    def isochoric_energy(self, I1, I2):
+        """By expm1: no cancellation at rest."""
+        return 0.5 * self.c1 / self.c2 * jnp.expm1(self.c2 * (I1 - 3))
+
+    def isochoric_derivatives(self, I1, I2):
+        """c1/2 e and c1 c2/2 e, e = exp(c2 (Ibar1 - 3))."""
+        slope = 0.5 * self.c1 * jnp.exp(self.c2 * (I1 - 3))
+        return {"I1": slope}, {("I1", "I1"): self.c2 * slope}
+
+    def shear_modulus(self):
+        """c1 [Pa]."""
+        return self.c1

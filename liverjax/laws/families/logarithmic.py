@@ -1,0 +1,44 @@
+"""Logarithm of a power of the principal stretches, infinite at a finite stretch."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law
+
+
+@struct
+class Logarithmic(Law):
+    """W = -c1 ln(1 - c2 (Xi(alpha) - 3)) + U(J).
+
+    Chapter, Table 1. Infinite where Xi(alpha) = 3 + 1/c2: NaN beyond.
+    """
+
+    c1: Any = param("Pa", "scale", above=0.0, typical=1925.0)
+    c2: Any = param("1", "1 / (largest Xi - 3)", above=0.0, typical=0.05)
+    alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
+    invariants: ClassVar = ("stretches", "J")
+
+    def exponents(self):
+        """alpha."""
+        return (self.alpha,)
+
+    def stretch_energy(self, X):
+        """By log1p: no cancellation at rest."""
+        return -self.c1 * jnp.log1p(-self._filled(X))
+
+    def _filled(self, X):
+        """c2 X, the part of the way to the pole; NaN beyond it."""
+        return jnp.where(self.c2 * X < 1, self.c2 * X, jnp.nan)
+
+    def stretch_derivatives(self, X):
+        """c1 c2/(1 - c2 X) and c1 c2^2/(1 - c2 X)^2."""
+        pole = self.c2 / (1 - self._filled(X))
+        return (self.c1 * pole,), {(0, 0): self.c1 * pole * pole}
+
+    def shear_modulus(self):
+        """c1 c2 alpha^2 / 2 [Pa]."""
+        return self.c1 * self.c2 * self.alpha**2 / 2

@@ -1,0 +1,46 @@
+"""Ogden: powers of the principal stretches.
+
+Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. A law of stretches receives X = Xi - 3, which is exact at rest.
+"""
+
+from typing import Any, ClassVar
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law
+
+
+@struct
+class Ogden(Law):
+    """W = sum_k mu_k/alpha_k (Xi(alpha_k) - 3) + U(J).
+
+    Chapter, Table 1; Ogden 1972. Others write mu_k/alpha_k^2: their mu_k is alpha_k times the one here. Stable for
+    every stretch where each mu_k alpha_k > 0.
+    """
+
+    mu: Any = param("Pa", "mu_k, one a term", each=True, typical=(700.0, -40.0))
+    alpha: Any = param("1", "alpha_k, one a term", nonzero=True, each=True, typical=(2.5, -4.0))
+    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    volumetric: str = static(default="quadratic", about="quadratic, log or simo")
+    invariants: ClassVar = ("stretches", "J")
+
+    def exponents(self):
+        """alpha_k."""
+        return tuple(self.alpha)
+
+    def stretch_energy(self, *X):
+        """Sum of the terms."""
+        return sum(m / a * x for m, a, x in zip(self.mu, self.alpha, X, strict=True))
+
+    def stretch_derivatives(self, *X):
+        """mu_k/alpha_k; all second derivatives are zero."""
+        return tuple(m / a for m, a in zip(self.mu, self.alpha, strict=True)), {}
+
+    def shear_modulus(self):
+        """sum mu_k alpha_k / 2 [Pa]."""
+        return sum(m * a for m, a in zip(self.mu, self.alpha, strict=True)) / 2
+
+    def check(self):
+        """InputError where terms do not pair."""
+        if len(self.mu) != len(self.alpha):
+            raise InputError(f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one of each a term")
