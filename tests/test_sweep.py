@@ -17,7 +17,6 @@ import liverjax as lj
 from liverjax.__main__ import OUTPUTS, main
 from liverjax.core import status
 from liverjax.jobs import design, parts, sweep
-from liverjax.scenes.scene_file import changed_content
 from liverjax.simulation.batch import strategy_for
 
 pytestmark = pytest.mark.quick_to_compile
@@ -224,6 +223,8 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
         ("law.nu\n700\n", "did you mean mu"),
         ("mesh.points.0\n700\n", "'mesh.points.0' is no number of the scene file"),
+        ("mesh.points.0.1\n700\n", "only all points can change"),
+        ("fixed.0.nodes.0\n3\n", "is no number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
     ],
 )
@@ -288,10 +289,13 @@ def test_unusable_options_are_refused(files, capsys):
         assert sentence in capsys.readouterr().err
 
 
-def test_one_table_stands_for_a_list_of_one():
-    content = {"traction": {"pressure": 4.0}, "law": [{"name": "neo_hookean", "mu": 1.0}]}
-    changed = changed_content(content, {"traction.0.pressure": 5.0, "law.mu": 2.0})
-    assert changed["traction"]["pressure"] == 5.0 and changed["law"][0]["mu"] == 2.0
+def test_one_table_stands_for_a_list_of_one(files):
+    one_law = SCENE.replace("[law]", "[[law]]").replace("770.0", "770")
+    (files / "scene.toml").write_text(one_law + "[traction]\nwhere = {z_max = 0.0}\npressure = 4.0\n")
+    (files / "rows.csv").write_text("traction.0.pressure,law.mu\n5,2\n")
+    table = sweep.read_sweep(files / "scene.toml", files / "rows.csv")
+    changed = lj.with_parameters(table.scene, dict(zip(table.names, table.rows[0].tolist(), strict=True)))
+    assert changed.traction[0].pressure == 5.0 and changed.law.mu == 2.0
 
 
 def test_the_help_names_every_output():

@@ -16,6 +16,7 @@ from fitting.reports import field_report
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
+from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
 
@@ -86,7 +87,7 @@ def identify(options: argparse.Namespace) -> int:
 def _numbers(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callable) -> int:
     names = options.parameters.split(",")
     for name in names:
-        scene_numbers.value_of(problem.scenes[0], name)
+        numbers_at(problem.scenes[0], name)
     writable(options.out, ("field.json",))
     with bar:
         found = scene_numbers.fit_numbers(problem, names, progress=told)

@@ -21,10 +21,11 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse.linalg
 
-from fitting.fits.scene_numbers import Problem, misfit, value_of
+from fitting.fits.scene_numbers import Problem, misfit
 from fitting.methods import prior as smooth
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try, from a nearly uniform body to a free one.
 DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
@@ -64,7 +65,7 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     for other in problem.scenes[1:]:
         if other.mesh.number_of_elements != E or not np.allclose(other.mesh.points, scene.mesh.points):
             raise InputError("the scenes have different meshes: a field needs one and the same")
-    base = value_of(scene, name)
+    base = numbers_at(scene, name)
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
         raise InputError(f"a field of {name!r} needs one number: name one of the list, e.g. {name}.0")
     if not np.all(np.asarray(base) > 0):

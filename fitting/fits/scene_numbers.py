@@ -13,8 +13,7 @@ from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.methods.uncertainty import spread
 from fitting.readers.displacements import Displacements, residuals
 from liverjax.core import status
-from liverjax.core.errors import InputError
-from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene import Scene, numbers_at
 
 
 class Problem(NamedTuple):
@@ -117,7 +116,7 @@ def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estim
     Raises:
         InputError: a name that a scene does not have, or one of no floating-point number.
     """
-    starts = [value_of(problem.scenes[0], name) for name in names]
+    starts = [numbers_at(problem.scenes[0], name) for name in names]
     sizes = [np.size(v) for v in starts]
     flat = np.concatenate([np.ravel(v) for v in starts])
     labels = [
@@ -141,29 +140,3 @@ def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estim
 
     lj.with_parameters(problem.scenes[0], dict(zip(names, starts, strict=True)))
     return fit(problem, values_of, natural_of, labels, np.zeros(len(flat)), **options)[0]
-
-
-def value_of(scene: Scene, name: str) -> Any:
-    """The number, or numbers, of a scene at a dotted name.
-
-    Raises:
-        InputError: a name that the scene does not have, or one of no number.
-    """
-    thing: Any = scene
-    path = name.split(".")
-    for k, key in enumerate(path):
-        rest = ".".join(path[k:])
-        if isinstance(thing, dict) and rest in thing:
-            thing = thing[rest]
-            break
-        if isinstance(thing, lj.laws.Continued):
-            thing = thing.law
-        if isinstance(thing, lj.laws.Sum) and key.isdigit():
-            thing = thing.laws
-        try:
-            thing = thing[int(key)] if key.isdigit() else getattr(thing, key)
-        except (AttributeError, IndexError, KeyError, TypeError):
-            thing = None
-    if thing is None or isinstance(thing, str) or not np.issubdtype(np.asarray(thing).dtype, np.floating):
-        raise InputError(f"parameter {name!r} is no number of the scene: use a name of the scene file, e.g. law.mu")
-    return thing if isinstance(thing, tuple) else jnp.asarray(thing, float)

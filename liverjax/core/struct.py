@@ -25,7 +25,7 @@ def param(
     above: float | None = None,
     nonzero: bool = False,
     each: bool = False,
-    unnamed: bool = False,
+    unnamed: bool | str = False,
     typical: Any = None,
     default: Any = dataclasses.MISSING,
 ) -> Any:
@@ -37,7 +37,8 @@ def param(
         lower, upper: inclusive bounds; ``above``: strict lower bound.
         nonzero: 0 is refused. `liverjax.core.bounds.check` reads all of these.
         each: a sequence, one number a term (or the components of a direction).
-        unnamed: structs inside it; the dotted names of scene files leave this field out.
+        unnamed: structs inside it; the dotted names of scene files leave this field out. A text is the method that
+            gives the places in this field of what a word names: `support.0` is the first of ``named("support")``.
         typical: value for a soft tissue of about 1 kPa shear modulus, used where a law is asked for by name alone.
         default: as in `dataclasses.field`.
     """

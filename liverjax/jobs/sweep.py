@@ -10,7 +10,6 @@ import errno
 import json
 import os
 import shutil
-import tomllib
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -25,8 +24,9 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.versions import versions
 from liverjax.jobs import parts
-from liverjax.scenes.scene import Scene, with_parameters
-from liverjax.scenes.scene_file import changed_content, check_numbers, load_scene
+from liverjax.scenes.scene import Scene, numbers_at, with_parameters
+from liverjax.scenes.scene_checks import check_numbers
+from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import simulate_batch
 
 #: What may be stored of every row, from its result and the reference positions.
@@ -78,12 +78,13 @@ def read_sweep(
     """
     scene = load_scene(scene_file)
     names, rows = read_table(parameters)
-    content = tomllib.loads(scene_file.read_text(encoding="utf-8"))
-    with_parameters(scene, dict(zip(names, rows[0], strict=True)))
+    for name in names:
+        if np.shape(numbers_at(scene, name)):
+            raise InputError(f"parameter {name!r} is no number of the scene file: it is a list, name one number of it")
     for k, row in enumerate(rows.tolist()):
         values = dict(zip(names, row, strict=True))
         try:
-            check_numbers(changed_content(content, values))
+            check_numbers(with_parameters(scene, values))
         except InputError as error:
             raise InputError(f"{parameters}: row {k + 1}: {error}") from None
     for name in outputs:

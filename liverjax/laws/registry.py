@@ -1,7 +1,6 @@
 """The laws by name: Table 1 of the chapter and three more; how to make, check and scale one."""
 
 import dataclasses
-import difflib
 from typing import Any
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 
 from liverjax.core import bounds
 from liverjax.core.errors import InputError
+from liverjax.core.names import hint
 from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 from liverjax.laws.continued import Continued
@@ -50,9 +50,7 @@ LAWS: dict[str, type[Law]] = {
 def find(name: str) -> type[Law]:
     """The class of a law's name; `InputError` offering the nearest known name."""
     if name not in LAWS:
-        near = difflib.get_close_matches(name, LAWS, n=1, cutoff=0.3)
-        hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(LAWS)}"
-        raise InputError(f"law {name!r} is not known: {hint}")
+        raise InputError(f"law {name!r} is not known: {hint(name, LAWS)}")
     return LAWS[name]
 
 
@@ -75,8 +73,7 @@ def create(name: str, **values: Any) -> Law:
     known = {f.name: f for f in dataclasses.fields(cls)}
     for key in values:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-            raise InputError(f"law {name} has no parameter {key!r}: did you mean {near[0]}?")
+            raise InputError(f"law {name} has no parameter {key!r}: {hint(key, known)}")
     for key, field in known.items():
         if key not in values and field.default is dataclasses.MISSING:
             raise InputError(f"law {name} needs parameter {key} [{field.metadata.get('unit', '')}]: give {key} = …")

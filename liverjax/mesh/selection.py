@@ -1,11 +1,11 @@
 """Parts of a mesh: nodes chosen by place or by name, triangles of its surface."""
 
-import difflib
 from typing import Any
 
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.names import hint
 from liverjax.mesh.tetrahedra import TetMesh
 
 AXES = "xyz"
@@ -38,8 +38,7 @@ def select(
     known = [f"{a}_{end}" for a in AXES for end in ("min", "max")]
     for key, bound in (where or {}).items():
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
-            raise InputError(f"{name}: {key!r} is not known: did you mean {near}?")
+            raise InputError(f"{name}: {key!r} is not known: {hint(key, known)}")
         if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not np.isfinite(bound):
             raise InputError(f"{name}: {key} = {bound!r} is not a length: give a number in metres")
         x = points[:, AXES.index(key[0])]

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from liverjax import laws
+from liverjax.core import names
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import param, struct
 from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import boundary
@@ -48,9 +48,8 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
     """
     for region in regions:
         for name, value in region.law.items():
-            path = name.split(".")
-            base = jnp.broadcast_to(jnp.asarray(_get(law, path, name), float), (number_of_elements,))
-            law = _put(law, path, base.at[region.elements].set(value))
+            base = jnp.broadcast_to(jnp.asarray(_number(law, name), float), (number_of_elements,))
+            law = names.put(law, name, base.at[region.elements].set(value), _refusal(name))
     return law
 
 
@@ -77,47 +76,17 @@ def check_numbers(law: Law, regions: tuple[Region, ...]) -> None:
     """
     for k, region in enumerate(regions):
         for name, value in region.law.items():
-            path = name.split(".")
-            _get(law, path, name)
-            laws.check_value(f"region.{k}: law.{name}", _metadata(law, path), value)
+            _number(law, name)
+            metadata = names.metadata(law, name, _refusal(name)) | {"each": False}
+            laws.check_value(f"region.{k}: law.{name}", metadata, value)
 
 
-def _owner(law: Law, path: list[str]) -> tuple[Law, list[str]]:
-    """The one law that a name is of, and the rest of the name."""
-    if isinstance(law, laws.Continued):
-        return _owner(law.law, path)
-    if isinstance(law, laws.Sum) and path[0].isdigit() and int(path[0]) < len(law.laws):
-        return _owner(law.laws[int(path[0])], path[1:])
-    return law, path
-
-
-def _metadata(law: Law, path: list[str]) -> dict[str, Any]:
-    owner, (key, *_) = _owner(law, path)
-    return {f.name: f.metadata for f in laws.parameters(owner)}[key] | {"each": False}
-
-
-def _get(law: Law, path: list[str], name: str) -> Any:
-    owner, path = _owner(law, path)
-    known = [f.name for f in laws.parameters(owner) if getattr(owner, f.name) is not None]
-    if not path or path[0] not in known:
-        raise InputError(f"region: the law has no number {name!r}: use one of {', '.join(known)}")
-    value = getattr(owner, path[0])
+def _number(law: Law, name: str) -> Any:
+    value = names.get(law, name, _refusal(name))
     if isinstance(value, tuple):
-        if len(path) != 2 or not path[1].isdigit() or int(path[1]) >= len(value):
-            raise InputError(f"region: {path[0]} is a list of {len(value)}: name one of them, {path[0]}.0")
-        return value[int(path[1])]
-    if len(path) > 1:
-        raise InputError(f"region: {path[0]} is one number: name it {path[0]}")
+        raise InputError(f"region: {name} is a list of {len(value)}: name one of them, {name}.0")
     return value
 
 
-def _put(law: Law, path: list[str], value: jax.Array) -> Law:
-    if isinstance(law, laws.Continued):
-        return replace(law, law=_put(law.law, path, value))
-    if isinstance(law, laws.Sum):
-        k = int(path[0])
-        return replace(law, laws=(*law.laws[:k], _put(law.laws[k], path[1:], value), *law.laws[k + 1 :]))
-    if len(path) == 2:
-        k, old = int(path[1]), getattr(law, path[0])
-        return replace(law, **{path[0]: (*old[:k], value, *old[k + 1 :])})
-    return replace(law, **{path[0]: value})
+def _refusal(name: str) -> str:
+    return f"region: the law has no number {name!r}"

@@ -1,13 +1,12 @@
 """A scene: a mesh, a law, the physics it has and no other, and what holds, moves and loads it."""
 
-import dataclasses
-import difflib
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from liverjax import laws
+from liverjax.core import names
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
 from liverjax.laws import Law
@@ -70,7 +69,7 @@ class Scene:
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
     traction: tuple[Traction, ...] = param("1", "loads", default=())
-    physics: tuple[Physics, ...] = param("1", "what else acts: supports, …", unnamed=True, default=())
+    physics: tuple[Physics, ...] = param("1", "what else acts: supports, …", unnamed="named", default=())
     solve: Solve = param("1", "how", default=Solve())
 
     def named(self, section: str) -> list[int]:
@@ -91,39 +90,31 @@ def with_parameters(scene: Scene, values: dict[str, Any]) -> Scene:
         InputError: a name that the scene does not have.
     """
     for name, value in values.items():
-        scene = _with(scene, name.split("."), value, name)
+        if name == "mesh.points":
+            scene = replace(scene, mesh=with_points(scene.mesh, value))
+            continue
+        if name.startswith("mesh."):
+            raise InputError(f"{_refusal(name)}: of a mesh only all points can change, mesh.points")
+        old = names.get(scene, name, _refusal(name))
+        like = (
+            tuple(value) if isinstance(old, tuple) else jnp.array(value, float) if isinstance(old, jax.Array) else value
+        )
+        scene = names.put(scene, name, like, _refusal(name))
     return scene
 
 
-def _with(thing: Any, path: list[str], value: Any, name: str) -> Any:
-    if not path:
-        if isinstance(thing, tuple):
-            return tuple(value)
-        return jnp.array(value, float) if isinstance(thing, jax.Array) else value
-    key, rest = path[0], path[1:]
-    if isinstance(thing, Scene) and rest and rest[0].isdigit() and int(rest[0]) < len(thing.named(key)):
-        k = thing.named(key)[int(rest[0])]
-        return replace(thing, physics=_with(thing.physics, [str(k), *rest[1:]], value, name))
-    if isinstance(thing, dict) and ".".join(path) in thing:
-        return thing | {".".join(path): value}
-    if isinstance(thing, TetMesh) and path == ["points"]:
-        return with_points(thing, value)
-    if isinstance(thing, laws.Continued):
-        return replace(thing, law=_with(thing.law, path, value, name))
-    if isinstance(thing, laws.Sum) and key.isdigit():
-        return replace(thing, laws=_with(thing.laws, path, value, name))
-    if isinstance(thing, tuple) and key.isdigit() and int(key) < len(thing):
-        k = int(key)
-        return (*thing[:k], _with(thing[k], rest, value, name), *thing[k + 1 :])
-    if key.isdigit() and hasattr(thing, "shape") and thing.ndim and int(key) < thing.shape[0] and not rest:
-        return thing.at[int(key)].set(value)
-    if dataclasses.is_dataclass(thing):
-        known = {f.name: f for f in dataclasses.fields(thing)}
-        if key in known and not known[key].metadata.get("static") and getattr(thing, key) is not None:
-            return replace(thing, **{key: _with(getattr(thing, key), rest, value, name)})
-        offered = [n for n, f in known.items() if not f.metadata.get("static") and getattr(thing, n) is not None]
-        near = difflib.get_close_matches(key, offered, n=1, cutoff=0.0)
-        raise InputError(
-            f"parameter {name!r}: the scene has no {key!r} there: did you mean {near[0] if near else '?'}?"
-        )
-    raise InputError(f"parameter {name!r}: {key!r} leads nowhere: use the names of the scene file")
+def numbers_at(scene: Scene, name: str) -> Any:
+    """The number, or numbers, of a scene at a dotted name.
+
+    Raises:
+        InputError: a name that the scene does not have, or one of no floating-point number.
+    """
+    found = names.get(scene, name, _refusal(name))
+    # Whole numbers are allowed where a user wrote one (`mu = 770`); an array of them holds places in the mesh.
+    if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):
+        raise InputError(f"{_refusal(name)}: use one like law.mu")
+    return found if isinstance(found, tuple) else jnp.asarray(found, float)
+
+
+def _refusal(name: str) -> str:
+    return f"parameter {name!r} is no number of the scene file"

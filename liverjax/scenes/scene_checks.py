@@ -85,6 +85,20 @@ def check_bounds(scene: Scene) -> None:
     regions.check_numbers(scene.law, scene.region)
 
 
+def check_numbers(scene: Scene) -> None:
+    """Refuse numbers that cannot be used, alone or together; looks at no mesh; host side.
+
+    Raises:
+        InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.
+    """
+    check_bounds(scene)
+    scene.law.check()
+    if scene.viscosity is not None:
+        viscosity.check(scene.viscosity, scene.law)
+    if scene.porosity is not None:
+        porosity.check(scene.porosity)
+
+
 def check_scene(scene: Scene) -> None:
     """Refuse a scene that cannot be simulated; host side, before any compile.
 
@@ -92,14 +106,9 @@ def check_scene(scene: Scene) -> None:
         InputError: an unusable mesh or viscosity, missing time step or mass, contradicting conditions, a loose body.
     """
     check_choices(scene)
-    check_bounds(scene)
+    check_numbers(scene)
     check_mesh(scene.mesh)
-    scene.law.check()
     regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
-    if scene.viscosity is not None:
-        viscosity.check(scene.viscosity, scene.law)
-    if scene.porosity is not None:
-        porosity.check(scene.porosity)
     for name, physics in _named_physics(scene):
         physics.check(scene.mesh, name)
     _no_two_normals(scene)

@@ -1,8 +1,6 @@
 """Scenes from TOML files; every key is known, every number checked."""
 
-import copy
 import dataclasses
-import difflib
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax import laws
-from liverjax.core import bounds
 from liverjax.core.errors import InputError
+from liverjax.core.names import hint
 from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.tetrahedra import UNITS, TetMesh, read_mesh
-from liverjax.physics import boundary, porosity, viscosity
+from liverjax.physics import boundary
 from liverjax.physics.base import Physics
 from liverjax.physics.boundary import Displaced, Fixed, Traction
 from liverjax.physics.porosity import Porosity
@@ -109,8 +107,7 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 def _known(name: str, table: dict, keys: tuple) -> None:
     for key in table:
         if key not in keys:
-            near = difflib.get_close_matches(key, keys, n=1, cutoff=0.0)[0]
-            raise InputError(f"{name} has an unknown key {key!r}: did you mean {near}?")
+            raise InputError(f"{name} has an unknown key {key!r}: {hint(key, keys)}")
 
 
 def _table(name: str, value: Any) -> dict:
@@ -301,44 +298,3 @@ def _solve(table: dict) -> Solve:
             raise InputError(f"[solve] {key} = {values[key]!r} is not known: use {' or '.join(allowed)}")
     values |= {key: _number(f"[solve] {key}", values[key]) for key in ("dt", "tolerance") if key in values}
     return Solve(**values)
-
-
-# -- checks and changes ------------------------------------------------------------------------------------------------
-
-
-def changed_content(content: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """The content of a scene file with values at dotted names."""
-    content = copy.deepcopy(content)
-    for name, value in values.items():
-        *path, last = [int(key) if key.isdigit() else key for key in name.split(".")]
-        table: Any = content if path[:1] != ["mesh"] else None  # the mesh is one for all
-        try:
-            for k, key in enumerate(path):
-                if k == 1 and isinstance(key, int) and isinstance(table, dict):
-                    continue  # [traction] for [[traction]]: one table stands for a list of one
-                table = table[key] if isinstance(key, int) else table.setdefault(key, {})
-            if path == ["law"] and isinstance(table, list) and len(table) == 1:
-                table = table[0]
-            table[last] = value
-        except (KeyError, IndexError, TypeError, AttributeError):
-            raise InputError(f"parameter {name!r} is no number of the scene file: name one that stands there") from None
-    return content
-
-
-def check_numbers(content: dict[str, Any]) -> None:
-    """Refuse numbers of a scene's content that are out of bounds; looks at no mesh.
-
-    Raises:
-        InputError: a parameter of law, viscosity, porosity, body or solve that cannot be used.
-    """
-    law = _law(content["law"])
-    prony = _section(content, "viscosity", _prony)
-    if prony is not None:
-        viscosity.check(prony, law)
-    if "porosity" in content:
-        sponge = {k: v for k, v in content["porosity"].items() if k != "drained"}
-        porosity.check(_porosity(None, sponge))
-    body = _section(content, "body", _body)
-    if body is not None:
-        bounds.check(body, "body")
-    bounds.check(_solve(_table("solve", content.get("solve", {}))), "solve")

@@ -1,0 +1,111 @@
+"""Dotted names, as scene files use them: `law.1.mu` leads to a number; an unknown word gets a hint."""
+
+import dataclasses
+import difflib
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+
+
+def hint(word: str, known: Iterable[str]) -> str:
+    """The end of a sentence about an unknown word: the nearest known word, or all where none is near."""
+    words = list(known)
+    near = difflib.get_close_matches(word, words, n=1, cutoff=0.3)
+    return f"did you mean {near[0]}?" if near else f"use one of {', '.join(words)}"
+
+
+class Step(NamedTuple):
+    """One step on the way to a number: from `owner` to what it holds at `key`."""
+
+    owner: Any  # a struct, tuple, dictionary or array
+    key: Any  # field, place or entry
+
+    def inside(self) -> Any:
+        """What the owner holds at the key."""
+        return getattr(self.owner, self.key) if dataclasses.is_dataclass(self.owner) else self.owner[self.key]
+
+    def with_inside(self, value: Any) -> Any:
+        """The owner with `value` at the key."""
+        owner, key = self
+        if dataclasses.is_dataclass(owner):
+            return replace(owner, **{key: value})
+        if isinstance(owner, dict):
+            return owner | {key: value}
+        if isinstance(owner, tuple):
+            return (*owner[:key], value, *owner[key + 1 :])
+        numbers = jnp.asarray(owner)
+        return numbers.at[key].set(jnp.asarray(value, numbers.dtype))
+
+
+def get(thing: Any, name: str, refusal: str) -> Any:
+    """What stands at a dotted name; arguments and errors as of `walk`."""
+    return walk(thing, name, refusal)[-1].inside()
+
+
+def put(thing: Any, name: str, value: Any, refusal: str) -> Any:
+    """A copy of `thing` with `value` (it may be traced) at a dotted name; arguments and errors as of `walk`."""
+    for step in reversed(walk(thing, name, refusal)):
+        value = step.with_inside(value)
+    return value
+
+
+def metadata(thing: Any, name: str, refusal: str) -> dict[str, Any]:
+    """Unit and bounds of the field that a dotted name leads to; arguments and errors as of `walk`."""
+    last = next(step for step in reversed(walk(thing, name, refusal)) if dataclasses.is_dataclass(step.owner))
+    return dict(last.owner.__dataclass_fields__[last.key].metadata)
+
+
+def walk(thing: Any, name: str, refusal: str) -> list[Step]:
+    """All steps from `thing` to what a dotted name means.
+
+    Args:
+        thing: a struct. Static fields and those that are None have no name.
+        name: fields, places in tuples and arrays, entries of dictionaries; fields declared `unnamed` are left out.
+        refusal: the beginning of the sentence that refuses a name.
+
+    Raises:
+        InputError: a name that leads nowhere, with a hint.
+    """
+    steps: list[Step] = []
+    path = name.split(".")
+    while path:
+        keys, path = _keys(thing, path, refusal)
+        for key in keys:
+            steps.append(Step(thing, key))
+            thing = steps[-1].inside()
+    return steps
+
+
+def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
+    """The keys that the first words of a path stand for, and the words after them."""
+    word, rest = path[0], path[1:]
+    if dataclasses.is_dataclass(thing):
+        return _keys_of_struct(thing, path, refusal)
+    if isinstance(thing, dict) and ".".join(path) in thing:
+        return [".".join(path)], []
+    several = isinstance(thing, tuple) or np.ndim(thing)
+    if word.isdigit() and several and int(word) < len(thing):
+        return [int(word)], rest
+    raise InputError(f"{refusal}: {word!r} leads nowhere")
+
+
+def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
+    word, rest = path[0], path[1:]
+    fields = [f for f in dataclasses.fields(thing) if not f.metadata.get("static")]
+    known = [f.name for f in fields if not f.metadata.get("unnamed") and getattr(thing, f.name) is not None]
+    if word in known:
+        return [word], rest
+    for field in fields:
+        unnamed = field.metadata.get("unnamed")
+        if isinstance(unnamed, str):
+            places = getattr(thing, unnamed)(word)
+            if rest and rest[0].isdigit() and int(rest[0]) < len(places):
+                return [field.name, places[int(rest[0])]], rest[1:]
+        elif unnamed and (word.isdigit() or not isinstance(getattr(thing, field.name), tuple)):
+            return [field.name], path
+    raise InputError(f"{refusal}: {hint(word, known) if known else f'{word!r} leads nowhere'}")
