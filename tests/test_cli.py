@@ -1,8 +1,10 @@
 """The command lines: contract of files and exit codes, one sentence for unusable input."""
 
+import importlib
 import json
 import subprocess
 import sys
+import tomllib
 
 import h5py
 import numpy as np
@@ -151,6 +153,47 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
 def test_help(module):
     run = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0 and "usage" in run.stdout
+
+
+@pytest.mark.core
+def test_installed_command_is_the_one_of_the_module():
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    module, name = scripts["liverjax"].split(":")
+    assert getattr(importlib.import_module(module), name) is liverjax_main
+
+
+COMMANDS = ["simulate", "sweep", "design", "laws", "check", "plot", "fit", "fit curves", "fit field"]
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_names_the_command_as_it_was_called(name, capsys):
+    for program, prog in (("liverjax", {}), ("python -m liverjax", {"prog": "python -m liverjax"})):
+        with pytest.raises(SystemExit) as stopped:
+            liverjax_main([*name.split(), "--help"], **prog)
+        assert stopped.value.code == 0
+        assert capsys.readouterr().out.startswith(f"usage: {program} {name} [-h]")
+
+
+@pytest.mark.core
+def test_fit_under_the_one_name_is_the_fit(tmp_path, capsys):
+    assert liverjax_main(["fit", str(tmp_path / "none.csv")]) == main([str(tmp_path / "none.csv")]) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == second and first.startswith("error: ")
+    given = ["--method", "closed-form", "--modes", "2", "--out", str(tmp_path)]
+    assert liverjax_main(["fit", str(PORCINE), *given]) == 0
+    assert np.isclose(json.loads((tmp_path / "fit.json").read_text())["shear_modulus"], 770, rtol=1e-4)
+
+
+def test_ctrl_c_is_one_word_and_exit_code_130(monkeypatch, capsys):
+    from fitting.readers import rheometer
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rheometer, "read_sweep", stopped)
+    assert main([str(PORCINE)]) == 130
+    assert capsys.readouterr().err == "stopped\n"
 
 
 def test_laws_lists_every_parameter(capsys):

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax.__main__ import OUTPUTS, main
+from liverjax.__main__ import main
+from liverjax.commands.sweep import OUTPUTS
 from liverjax.core import status
 from liverjax.jobs import design, parts, sweep
 from liverjax.simulation.batch import strategy_for

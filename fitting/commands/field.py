@@ -2,13 +2,12 @@
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from fitting.commands.exit_codes import EXIT_CODES
+from fitting.commands.progress import cost_bar
 from fitting.fits import field, inclusion, scene_numbers
 from fitting.fits.scene_numbers import Problem
 from fitting.readers.displacements import read_displacements
@@ -21,10 +20,10 @@ from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
 
 
-def parser() -> argparse.ArgumentParser:
-    """Options of the command."""
+def parser(prog: str) -> argparse.ArgumentParser:
+    """Options of the command, which --help calls `prog`."""
     command = argparse.ArgumentParser(
-        prog="python -m fitting field",
+        prog=prog,
         description="Find a map of stiffness, or a few numbers of a scene, from displacements measured at some points. "
         "Several loads on one body: a scene and a file of displacements for each.",
         epilog=EXIT_CODES,
@@ -72,23 +71,17 @@ def _problem(options: argparse.Namespace) -> Problem:
     return Problem(tuple(scenes), tuple(data))
 
 
-def identify(options: argparse.Namespace) -> int:
-    """Find a map, or a few numbers, of scenes; the exit code."""
-    problem = _problem(options)
-    bar = tqdm(unit=" iterations", disable=None, leave=False)
-
-    def told(_: int, cost: float) -> None:
-        bar.set_postfix(cost=f"{cost:.4g}")
-        bar.update()
-
-    return (_map if options.parameters is None else _numbers)(options, problem, bar, told)
+def run(options: argparse.Namespace) -> int:
+    """Find a map, or a few numbers, of scenes; 1 if a solve or the fit did not converge."""
+    return (_map if options.parameters is None else _numbers)(options, _problem(options))
 
 
-def _numbers(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callable) -> int:
+def _numbers(options: argparse.Namespace, problem: Problem) -> int:
     names = options.parameters.split(",")
     for name in names:
         numbers_at(problem.scenes[0], name)
     writable(options.out, ("field.json",))
+    bar, told = cost_bar("iterations")
     with bar:
         found = scene_numbers.fit_numbers(problem, names, progress=told)
     print(field_report.table_of_numbers(found))
@@ -97,7 +90,7 @@ def _numbers(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Cal
     return 0 if found.converged else 1
 
 
-def _map(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callable) -> int:
+def _map(options: argparse.Namespace, problem: Problem) -> int:
     mesh = problem.scenes[0].mesh
     field.start_of(problem, options.name)
     writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))
@@ -106,6 +99,7 @@ def _map(options: argparse.Namespace, problem: Problem, bar: tqdm, told: Callabl
     length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10
     file = options.out / "progress.h5"
     limit, resume = options.iterations, options.resume
+    bar, told = cost_bar("iterations")
     with bar:
         found = field.estimate(problem, options.name, length, limit, file=file, resume=resume, progress=told)
     good = all(c == status.CONVERGED for c in found.codes)

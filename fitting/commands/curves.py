@@ -1,0 +1,56 @@
+"""``python -m fitting curves LAW CURVES.csv …``: hyperelastic laws from stress-stretch curves."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fitting.commands.exit_codes import EXIT_CODES
+from liverjax import laws
+from liverjax.core.files import writable
+
+
+def parser(prog: str) -> argparse.ArgumentParser:
+    """Options of the command, which --help calls `prog`."""
+    command = argparse.ArgumentParser(
+        prog=prog,
+        description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves at once.",
+        epilog=EXIT_CODES,
+    )
+    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
+    command.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
+    command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="of Ogden's law (default 1, 2 and 3)")
+    command.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="Pa", help="of stress columns that name none")
+    command.add_argument(
+        "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
+    )
+    return command
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit one law, or all, to the curves; 1 if the best fit did not converge."""
+    from tqdm import tqdm
+
+    from fitting.fits import stress_stretch
+    from fitting.readers import curves
+    from fitting.reports import curves_report
+
+    candidates = stress_stretch.candidates(options.law, options.terms)
+    found, notes = curves.read_curves(options.files, options.unit)
+    if options.law == "all":
+        left = [n for n in laws.LAWS if not stress_stretch.incompressible_form(n)]
+        notes.append(f"left out, being no isochoric energy plus U(J): {', '.join(left)}")
+    for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
+        print(f"note: {note}", file=sys.stderr)
+    stress_stretch.initial_modulus(found)
+    writable(options.out, ("curves.json", "curves.png"))
+    bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
+    fits = [stress_stretch.fit(candidate, found) for candidate in bar]
+    curves_report.write(options.out, found, fits)
+    print(curves_report.table(fits))
+    for fit in curves_report.best_first(fits):
+        for sentence in fit.warnings:
+            print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
+    for sentence in stress_stretch.unfollowed(found, fits):
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/curves.json, curves.png")
+    return 0 if curves_report.best_first(fits)[0].converged else 1

@@ -1,0 +1,126 @@
+"""``python -m fitting SWEEP.csv``: a generalised Maxwell model from a rheometer's frequency sweep."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fitting.commands.exit_codes import EXIT_CODES
+from fitting.commands.progress import cost_bar
+from liverjax import laws
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
+
+if TYPE_CHECKING:
+    from fitting.fits.viscoelastic import Fit
+    from fitting.readers.rheometer import Sweep
+
+
+def parser(prog: str) -> argparse.ArgumentParser:
+    """Options of the command, which --help calls `prog`."""
+    command = argparse.ArgumentParser(
+        prog=prog,
+        description="Identify a generalised Maxwell (Prony) model from a rheometer's frequency sweep.",
+        epilog=f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
+        + EXIT_CODES,
+    )
+    command.add_argument(
+        "sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text"
+    )
+    command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
+    command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
+    command.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
+    command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
+    command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
+    command.add_argument(
+        "--density", type=float, metavar="KG_M3", help="of the sample: simulate its inertia (default: none)"
+    )
+    command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
+    command.add_argument("--steps", type=int, default=50, help="time steps a cycle of the simulation (default 50)")
+    command.add_argument(
+        "--scheme", choices=("exponential", "backward_euler", "chapter"), default="exponential", help="Prony recursion"
+    )
+    command.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
+    command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
+    command.add_argument(
+        "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
+    )
+    return command
+
+
+def _modes(text: str) -> int | str:
+    if text == "auto":
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit the model; 1 if the fit did not converge."""
+    from fitting.methods import uncertainty
+    from fitting.readers import rheometer
+    from fitting.reports import sweep_report
+
+    _check(options)
+    sweep = rheometer.read_sweep(options.sweep, options.table)
+    for note in sweep.notes:
+        print(f"note: {note}", file=sys.stderr)
+    fits = _fits(options, sweep)
+    profile = None
+    if options.profile:
+        profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
+    sweep_report.write(options.out, sweep, fits, profile)
+    print(sweep_report.table(sweep, fits))
+    for name, (low, high) in (profile or {}).items():
+        ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
+        print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
+    for sentence in fits[-1].warnings:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/fit.json, fit.png, fit.h5")
+    return 0 if fits[-1].converged else 1
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse numbers that no sample or simulation has."""
+    for name in ("radius", "height"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value <= 0.2:
+            meant = f"{value / 1000:g}" if 0.2 < value <= 200 else "0.004"
+            raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} {meant}")
+    if options.density is not None and not 100 <= options.density <= 25000:
+        raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
+    if options.density is not None and options.method == "closed-form":
+        raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
+    if not 4 <= options.steps <= 10000:
+        raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
+    laws.find(options.law)
+
+
+def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
+    """The closed form, and after it the fit through the simulation if asked for."""
+    from fitting.fits import viscoelastic
+    from fitting.methods import generalised_maxwell
+
+    if options.modes != "auto":
+        viscoelastic.check_modes(sweep, options.modes)
+    dense = generalised_maxwell.refuse_impossible(sweep)
+    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
+    if options.modes == "auto":
+        closed = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
+    else:
+        closed = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
+    if options.method == "closed-form":
+        return [closed]
+    simulation = viscoelastic.Simulation(
+        radius=options.radius or viscoelastic.Simulation().radius,
+        height=options.height or viscoelastic.Simulation().height,
+        law=options.law,
+        scheme=options.scheme,
+        steps=options.steps,
+        density=options.density,
+    )
+    bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
+    with bar:
+        return [closed, viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)]

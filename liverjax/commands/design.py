@@ -1,0 +1,26 @@
+"""``liverjax design PARAMETERS.csv NAME=LOW:HIGH …``: a table of parameters for a sweep."""
+
+import argparse
+from pathlib import Path
+
+
+def add(parsers: argparse._SubParsersAction) -> None:
+    """Declare the command."""
+    command = parsers.add_parser("design", help="write a table of parameters", description="Write a table for a sweep.")
+    command.add_argument("table", type=Path, metavar="PARAMETERS.csv")
+    command.add_argument("range", nargs="+", metavar="NAME=LOW:HIGH", help="e.g. law.mu=500:1000")
+    command.add_argument("--kind", default="sobol", metavar="KIND", help="grid | latin | sobol (sobol)")
+    command.add_argument("--rows", type=int, default=64, metavar="N", help="how many (64)")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of the random ones (0)")
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the table."""
+    from liverjax.jobs import design
+
+    ranges = design.read_ranges(options.range)
+    rows = design.design(ranges, options.rows, options.kind, options.seed)
+    design.write_table(options.table, list(ranges), rows, f"{options.kind}, seed {options.seed}")
+    print(f"{len(rows)} rows\nwritten: {options.table}")
+    return 0

@@ -1,0 +1,37 @@
+"""``liverjax laws``: every law with its energy, parameters, units and bounds."""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from liverjax import laws
+from liverjax.laws.volumetric import VOLUMETRIC
+
+
+def add(parsers: argparse._SubParsersAction) -> None:
+    """Declare the command."""
+    parsers.add_parser("laws", help="the laws, their parameters, units and bounds").set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print every law."""
+    print(f"every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
+    print("every law of I1, I2 and J: continued_below = 0.1, finite energy below that J (default off)")
+    for name, cls in laws.LAWS.items():
+        print(f"{name}\n    {(cls.__doc__ or name).splitlines()[0]}")
+        for field in laws.parameters(cls):
+            m = field.metadata
+            optional = ", optional" if field.default is None else ""
+            if field.default not in (None, dataclasses.MISSING):
+                optional = f", default {field.default}"
+            print(f"    {field.name:14s} [{m['unit']}]  {_bounds(m):8s} {m['about']}{optional}")
+    return 0
+
+
+def _bounds(metadata: Mapping[str, Any]) -> str:
+    parts = [f"> {metadata['above']:g}"] if metadata.get("above") is not None else []
+    parts += [f">= {metadata['lower']:g}"] if metadata.get("lower") is not None else []
+    parts += [f"<= {metadata['upper']:g}"] if metadata.get("upper") is not None else []
+    parts += ["not 0"] if metadata.get("nonzero") else []
+    return ", ".join(parts) or "any"

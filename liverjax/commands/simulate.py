@@ -1,0 +1,90 @@
+"""``liverjax simulate SCENE.toml``: one run of a scene file."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from liverjax.commands.arguments import add_out
+from liverjax.core.files import writable
+
+if TYPE_CHECKING:
+    from liverjax.jobs.long_run import Ran
+    from liverjax.scenes.scene import Scene
+
+
+def add(parsers: argparse._SubParsersAction) -> None:
+    """Declare the command."""
+    command = parsers.add_parser("simulate", help="run a scene file", description="Run a scene file.")
+    command.add_argument("scene", type=Path, metavar="SCENE.toml")
+    command.add_argument("--vtu", action="store_true", help="write a ParaView series as well")
+    command.add_argument("--png", action="store_true", help="draw the last state as well")
+    command.add_argument("--every", type=int, default=50, metavar="N", help="steps between two writes (50)")
+    command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
+    add_out(command)
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Simulate the scene and write its results; 1 if a step failed, with what was computed kept."""
+    import numpy as np
+    from tqdm import tqdm
+
+    from liverjax.core import status
+    from liverjax.jobs import long_run, output
+    from liverjax.scenes import scene_file
+
+    scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8")
+    target = options.out / "result.h5"
+    writable(options.out, (target.name,))
+    bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
+    report = None if bar.disable else lambda _: bar.update()
+    try:
+        ran = long_run.run(scene, text, target, options.every, options.resume, report)
+    except OSError as error:
+        print(f"stopped: {target}: {error.strerror}; go on with --resume when there is space", file=sys.stderr)
+        return 1
+    finally:
+        bar.close()
+    _write_and_tell(scene, text, ran, target)
+    written = [str(target)]
+    if options.vtu:
+        written.append(str(output.write_vtu(options.out / "vtu", scene, ran.result)))
+    if options.png:
+        output.picture(options.out / "result.png", scene, ran.result)
+        written.append(str(options.out / "result.png"))
+    print(f"written: {', '.join(written)}")
+    codes = np.asarray(ran.result.status)
+    for step in np.flatnonzero(codes != status.CONVERGED)[:5]:
+        print(f"failed: step {step + 1}: {status.advice(codes[step])}", file=sys.stderr)
+    return 1 if np.any(codes != status.CONVERGED) else 0
+
+
+def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path) -> None:
+    """Write the results in place of the parts of the run; print what it took and what to be cautious of."""
+    import numpy as np
+
+    from liverjax.core.versions import versions
+    from liverjax.jobs import output, parts
+    from liverjax.physics import porosity
+    from liverjax.simulation.cautions import cautions
+
+    attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
+    if scene.porosity is not None:
+        attributes["bulk"] = porosity.bulk_in_force(scene.porosity, scene.law)
+        print(attributes["bulk"])
+    said = cautions(scene, ran.result)
+    output.write_hdf5(target, scene, ran.result, attributes | {"warnings": said, "versions": versions()})
+    if parts.beside(target).exists():
+        parts.remove(parts.beside(target))
+    s, steps = ran.result.statistics, len(ran.result.times)
+    print(
+        f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {steps} steps: "
+        f"{int(np.sum(s.iterations))} Newton and {int(np.sum(s.linear_iterations))} linear iterations, "
+        f"largest residual {float(np.max(np.asarray(s.residual))):.1e} of the forces\n"
+        + (f"run {ran.run_time:.3g} s ({ran.steps / ran.run_time:.3g} steps a second), " if ran.steps else "")
+        + f"compile {ran.compile_time:.3g} s"
+        + (f"; {steps - ran.steps} steps found on disk" if ran.steps < steps else "")
+    )
+    for sentence in said:
+        print(f"caution: {sentence}")

@@ -1,0 +1,96 @@
+"""``liverjax sweep SCENE.toml PARAMETERS.csv``: one scene, once for every row of a table."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from liverjax.core.errors import InputError
+
+#: The names of `liverjax.jobs.sweep.OUTPUTS`, which --help shows without loading it.
+OUTPUTS = ("final_positions", "positions", "largest_displacement", "final_reactions", "largest_pressure")
+
+
+def add(parsers: argparse._SubParsersAction) -> None:
+    """Declare the command."""
+    command = parsers.add_parser(
+        "sweep",
+        help="run a scene for every row of a table",
+        description="Run a scene for every row of a table. A kill at any moment costs one chunk: --resume goes on.",
+    )
+    command.add_argument("scene", type=Path, metavar="SCENE.toml")
+    command.add_argument(
+        "parameters", type=Path, metavar="PARAMETERS.csv", help="a header of dotted names, one row a run"
+    )
+    command.add_argument("--out", type=Path, metavar="FILE.h5", help="the results (PARAMETERS.h5)")
+    command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
+    command.add_argument("--store", nargs="+", default=["final_positions"], metavar="WHAT", help="|".join(OUTPUTS))
+    command.add_argument("--probe", nargs="+", type=int, default=[], metavar="NODE", help="nodes to keep over time")
+    command.add_argument("--rows", nargs="+", type=int, default=[], metavar="N", help="these rows alone, from 1")
+    command.add_argument("--chunk", type=int, default=16, metavar="N", help="rows between two writes (16)")
+    command.add_argument("--devices", type=int, metavar="N", help="spread the rows over N CPU devices (1)")
+    where = "one of several processes; without HOST:PORT N I as the cluster (SLURM) says"
+    command.add_argument("--distributed", nargs="*", metavar="HOST:PORT N I", help=where)
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the rows; 1 if a row failed or the disk is full, with what was computed kept."""
+    import jax
+    from tqdm import tqdm
+
+    if options.devices is not None:
+        if options.devices < 1:
+            raise InputError(f"--devices {options.devices} must be above 0: give e.g. 2")
+        jax.config.update("jax_num_cpu_devices", options.devices)
+    process = (0, 1) if options.distributed is None else _share(options.distributed)
+
+    from liverjax.core import status
+    from liverjax.jobs import sweep
+
+    stored, probes, numbers = tuple(options.store), tuple(options.probe), tuple(options.rows)
+    table = sweep.read_sweep(options.scene, options.parameters, stored, probes, options.chunk, numbers)
+    out = options.out or options.parameters.with_suffix(".h5")
+    bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # on a terminal only
+    try:
+        done = sweep.run(table, out, options.resume, process, bar.update)
+    except OSError as error:
+        print(
+            f"error: {out}: {error.strerror or error}: finished chunks are kept, go on with --resume", file=sys.stderr
+        )
+        return 1
+    finally:
+        bar.close()
+    if done.file is None:
+        print(f"process {process[0]} of {process[1]}: {done.computed} rows; others have rows to do yet")
+        return 0
+    print(f"{len(table.rows)} rows, {done.computed} computed now, {len(done.failed)} failed\nwritten: {done.file}")
+    for row, code in list(done.failed.items())[:20]:
+        print(f"failed: row {row}: {status.advice(code)}", file=sys.stderr)
+    if done.failed:
+        print(f"again: --rows {' '.join(map(str, done.failed))} --out OTHER.h5", file=sys.stderr)
+    return 1 if done.failed else 0
+
+
+def _share(given: list[str]) -> tuple[int, int]:
+    """Number of this process and of all, from JAX's distributed runtime: HOST:PORT N I, or nothing on a cluster."""
+    import jax
+
+    option = f"--distributed {' '.join(given)}"
+    if len(given) not in (0, 3) or not all(n.isdigit() for n in given[1:]):
+        raise InputError(f"{option}: give HOST:PORT, number of processes and this one's, or nothing")
+    if given and int(given[2]) >= int(given[1]):
+        raise InputError(f"{option}: processes are numbered from 0 to {int(given[1]) - 1}")
+    try:
+        if given:
+            jax.distributed.initialize(given[0], int(given[1]), int(given[2]))
+        else:
+            jax.distributed.initialize()
+        process = (jax.process_index(), jax.process_count())
+        # Rows need no communication: left at once, so that a process that dies stops no other.
+        jax.distributed.shutdown()
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"--distributed: the processes did not find each other ({reason}): give HOST:PORT N I"
+        ) from None
+    return process
