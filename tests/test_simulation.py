@@ -76,7 +76,6 @@ def test_patch_test_is_exact(verified):
     assert np.abs(np.asarray(q).reshape(-1, 3)[inner] - x[inner]).max() < 1e-11 * 0.1
 
 
-@pytest.mark.core
 def test_static_solution_and_reactions_balance():
     mesh = box()
     scene = lj.Scene(

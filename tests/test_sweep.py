@@ -62,7 +62,6 @@ def content(file) -> dict[str, bytes]:
         return {name: value[()].tobytes() for name, value in out.items()}
 
 
-@pytest.mark.core
 def test_a_batch_is_the_loop_and_a_lane_that_fails_spoils_no_other(files):
     scene = lj.load_scene(files / "scene.toml")
     density = jnp.array([1000.0, 1e12, 1100.0])  # the second falls further than any law holds
