@@ -1,4 +1,4 @@
-"""What the front page quotes: the main job, what to choose for an error, and one or two numbers of every part."""
+"""What the front page and the two guides quote: the main job, choices by error, a few numbers of each part."""
 
 from collections.abc import Callable
 from typing import Any
@@ -45,7 +45,7 @@ def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
     return {
         "moduli by the torsion simulation: recursion, steps a cycle": (
             steps,
-            lambda r: f"{r['scheme']}, {r['steps']}",
+            lambda r: f"{r['scheme'].replace('chapter', 'backward_euler')}, {r['steps']}",
         ),
         "the same: mesh, its linear bias divided out or not": (
             meshes,
@@ -228,13 +228,6 @@ def extremes() -> str:
     )
 
 
-PARTS = {
-    "job": job,
-    "choices": choices,
-    "simulation": simulation,
-    "runs": runs,
-    "gradients": gradients,
-    "maps": maps,
-    "together": together,
-    "extremes": extremes,
-}
+PARTS = {"job": job, "choices": choices}
+SIMULATOR = {"simulation": simulation, "gradients": gradients, "runs": runs, "extremes": extremes}
+FITS = {"maps": maps, "together": together}

@@ -11,6 +11,8 @@ HERE = Path(__file__).parent.parent
 END = "<!-- end of numbers -->"
 PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     HERE.parent / "README.md": front.PARTS,
+    HERE.parent / "fitting" / "README.md": front.FITS,
+    HERE.parent / "liverjax" / "README.md": front.SIMULATOR,
     HERE / "README.md": overview.PARTS,
     HERE / "TABLES.md": tables.PARTS | porosity.PARTS | identification.PARTS | stability.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
