@@ -14,7 +14,7 @@ import numpy as np
 
 import liverjax as lj
 from experiments.common import either, plain_ticks, plt, save
-from experiments.liver import models, with_solve
+from experiments.liver import ONE_STEP, found, models, with_solve
 from liverjax.core import status
 from liverjax.core.plotting import BLUE, GREY, ORANGE
 from liverjax.core.struct import replace
@@ -98,7 +98,7 @@ def liver_steps() -> list[dict]:
         heavy = replace(base, body=replace(base.body, gravity=gravity))
         for dt, steps in STEPS:
             for iterations in (1, 25):
-                scene = with_solve(heavy, dt * steps, dt, newton_iterations=iterations, tolerance=1e-8)
+                scene = with_solve(heavy, dt * steps, dt, **(ONE_STEP if iterations == 1 else {"tolerance": 1e-8}))
                 scenes[load, dt, iterations] = scene
                 programs[load, dt, iterations] = (lj.simulate, scene)
     results, seconds = medians(programs, 3)
@@ -106,7 +106,7 @@ def liver_steps() -> list[dict]:
     for (load, dt, iterations), result in results.items():
         x, exact = (np.asarray(results[load, dt, n].positions) for n in (iterations, 25))
         s, steps = result.statistics, len(result.times)
-        converged = np.asarray(result.status) == status.CONVERGED
+        converged = found(result)
         rows.append(
             {
                 "gravity": load,
