@@ -159,6 +159,22 @@ def test_parts_of_a_split_law_add_up():
     assert lj.laws.volumetric_part(LAWS["saint_venant_kirchhoff"]) is None
 
 
+def test_parts_of_sums_and_of_laws_without_bulk():
+    @lj.struct
+    class Bare(lj.Law):
+        mu: Any = lj.param("Pa")
+
+        def isochoric_energy(self, I1, I2):
+            return self.mu / 2 * (I1 - 3)
+
+    bare, fluid = Bare(mu=770.0), lj.laws.Volumetric(bulk=7700.0)
+    assert bare.isochoric_part() is bare and bare.volumetric_part() is None
+    assert (bare + fluid).isochoric_part() is bare and (bare + fluid).volumetric_part() is fluid
+    assert fluid.isochoric_part() is None and (bare + LAWS["saint_venant_kirchhoff"]).isochoric_part() is None
+    with pytest.raises(lj.InputError, match="one of each a term"):
+        (bare + lj.laws.Ogden(mu=(1.0, 2.0), alpha=(2.0,), bulk=1.0)).check()
+
+
 @pytest.mark.parametrize(
     ("name", "values", "sentence"),
     [

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from liverjax.laws.base import Law
+from liverjax.laws.derivatives import accumulate
 from liverjax.laws.terms import green_terms, invariant_terms
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.tensors.matrices import (
@@ -132,10 +133,10 @@ def regularised(
 ) -> list[Matrix]:
     """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
     result = [_diagonal(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
-    states = [(weight, invariant_terms.state(law, F)) for weight, law in parts]
+    added = [(weight, invariant_terms.state(law, F)) for weight, law in parts]
     if volume is not None:
-        states.append((1.0, invariant_terms.state_of(volume, F)))
-    for weight, state in states:
+        added.append((1.0, invariant_terms.state_of(volume, F)))
+    for weight, state in added:
         K = invariant_terms.blocks(state, D, pairs, regularised=True)
         result = [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
     return result
@@ -143,7 +144,7 @@ def regularised(
 
 def _gather(total: dict, weight: Any, values: dict) -> None:
     for key, value in values.items():
-        total[key] = total[key] + weight * value if key in total else weight * value
+        accumulate(total, key, weight * value)
 
 
 def _diagonal(value: Any) -> Matrix:
@@ -180,9 +181,9 @@ def _isotropic(scalars: Scalars, stretched: list, F: Matrix, D: list[Vector], pa
     at = frame(F)
     zero = jnp.zeros_like(at.s[0])
     diagonal = tuple(tuple(at.s[i] if i == j else zero for j in range(3)) for i in range(3))
-    states = [(1.0, invariant_terms.state_of(scalars, diagonal))]
-    states += [(weight, invariant_terms.state(law, diagonal)) for weight, law in stretched]
-    tangents = [(weight, invariant_terms.tangent(state)) for weight, state in states]
+    tangents = [(1.0, invariant_terms.tangent(invariant_terms.state_of(scalars, diagonal)))]
+    for weight, law in stretched:
+        tangents.append((weight, invariant_terms.tangent(invariant_terms.state(law, diagonal))))
 
     def entry(i, J, k, L):
         return sum((weight * A[J][L][i][k] for weight, A in tangents), 0.0)

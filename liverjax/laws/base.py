@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
-from liverjax.laws.derivatives import First, Second, autodiff_derivatives, reduced, split_derivatives
+from liverjax.laws.derivatives import First, Second, accumulate, autodiff_derivatives, reduced, split_derivatives
 from liverjax.laws.terms import invariant_terms
 from liverjax.laws.terms.green_terms import components, material_axes
 from liverjax.laws.terms.invariant_terms import fibre_invariants
@@ -82,8 +82,8 @@ class Law:
         U = self.volumetric_part()
         if U is not None:
             slope, curvature = U.energy_derivatives(I)
-            _accumulate(first, "J", slope["J"])
-            _accumulate(second, ("J", "J"), curvature["J", "J"])
+            accumulate(first, "J", slope["J"])
+            accumulate(second, ("J", "J"), curvature["J", "J"])
         return first, second
 
     def shear_modulus(self) -> Any:
@@ -202,9 +202,9 @@ class Sum(Law):
             own = {"I4": next((key for key, part in fibres.items() if part is law), None)}
             slopes, curvatures = law.energy_derivatives(i)
             for a, value in slopes.items():
-                _accumulate(first, own.get(a, a), value)
+                accumulate(first, own.get(a, a), value)
             for (a, b), value in curvatures.items():
-                _accumulate(second, (own.get(a, a), own.get(b, b)), value)
+                accumulate(second, (own.get(a, a), own.get(b, b)), value)
         return first, second
 
     def shear_modulus(self):
@@ -249,10 +249,6 @@ class Volumetric(Law):
     def shear_modulus(self):
         """A fluid has none."""
         return 0.0
-
-
-def _accumulate(total: dict, key: Any, value: Any) -> None:
-    total[key] = total[key] + value if key in total else value
 
 
 def _added(parts: list) -> Any:

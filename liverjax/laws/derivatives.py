@@ -14,6 +14,11 @@ Second = dict[tuple[str, str], Any]
 ORDER = ("I1", "I2", "I4", "J")
 
 
+def accumulate(total: dict, key: Any, value: Any) -> None:
+    """Add to an entry of a table of derivatives, in place; an absent entry begins with the value."""
+    total[key] = total[key] + value if key in total else value
+
+
 def reduced(I: Invariants) -> tuple[Any, Any]:
     """Isochoric invariants Ibar1 = J^(-2/3) I1 and Ibar2 = J^(-4/3) I2; NaN for J <= 0, where they do not exist."""
     m = I.J ** (-2 / 3)

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law
+from liverjax.laws.derivatives import accumulate
 
 _POWERS = {"c10": (1, 0), "c01": (0, 1), "c20": (2, 0), "c11": (1, 1), "c02": (0, 2)} | {
     "c30": (3, 0),
@@ -55,21 +56,17 @@ class MooneyRivlin(Law):
         """Derivatives of the monomials; terms that vanish identically are left out."""
         a, b = I1 - 3, I2 - 3
         first, second = {}, {}
-
-        def put(table, key, value):
-            table[key] = table[key] + value if key in table else value
-
         for c, i, j in self.terms():
             if i:
-                put(first, "I1", c * _monomial(i, (a, i - 1), (b, j)))
+                accumulate(first, "I1", c * _monomial(i, (a, i - 1), (b, j)))
             if j:
-                put(first, "I2", c * _monomial(j, (a, i), (b, j - 1)))
+                accumulate(first, "I2", c * _monomial(j, (a, i), (b, j - 1)))
             if i > 1:
-                put(second, ("I1", "I1"), c * _monomial(i * (i - 1), (a, i - 2), (b, j)))
+                accumulate(second, ("I1", "I1"), c * _monomial(i * (i - 1), (a, i - 2), (b, j)))
             if i and j:
-                put(second, ("I1", "I2"), c * _monomial(i * j, (a, i - 1), (b, j - 1)))
+                accumulate(second, ("I1", "I2"), c * _monomial(i * j, (a, i - 1), (b, j - 1)))
             if j > 1:
-                put(second, ("I2", "I2"), c * _monomial(j * (j - 1), (a, i), (b, j - 2)))
+                accumulate(second, ("I2", "I2"), c * _monomial(j * (j - 1), (a, i), (b, j - 2)))
         return first, second
 
     def shear_modulus(self):
