@@ -25,6 +25,7 @@ from fitting.fits.scene_numbers import Problem, misfit
 from fitting.methods import prior as smooth
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.files import whole
 from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try, from a nearly uniform body to a free one.
@@ -120,13 +121,11 @@ class _Search:
         """The point reached, whole or not at all."""
         if self.file is None:
             return
-        part = self.file.with_suffix(".part")
-        with h5py.File(part, "w") as f:
+        with whole(self.file) as new, h5py.File(new, "w") as f:
             f["z"], f["k"] = self.z, self.k
             f["history"] = np.array([[row[c] for c in _HISTORY] for row in self.history]).reshape(-1, len(_HISTORY))
             f.attrs["name"], f.attrs["base"] = self.name, float(jnp.sum(self.base))
             f.attrs["count"] = self.problem.components
-        part.replace(self.file)
 
     def read(self) -> None:
         """Go on from what an earlier run wrote.

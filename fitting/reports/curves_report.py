@@ -11,7 +11,7 @@ import numpy as np
 from fitting.fits.stress_stretch import LawFit, unfollowed
 from fitting.readers.curves import Curve
 from fitting.reports.sweep_report import numbers
-from liverjax.core.plotting import COLOURS, GREY
+from liverjax.core.plotting import COLOURS, GREY, pyplot, save
 from liverjax.core.versions import versions
 from liverjax.laws import homogeneous
 
@@ -64,21 +64,16 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
         "versions": versions(),
     }
     (out / "curves.json").write_text(json.dumps(numbers(content), indent=1, allow_nan=False) + "\n")
-    figure(curves, ordered).savefig(out / "curves.png", dpi=150)
+    save(figure(curves, ordered), out / "curves.png")
 
 
 def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
     """Every curve with the best laws, and below the error of each law beside its number of parameters."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     shown = ordered[: len(COLOURS)]
     columns = min(4, len(curves))
     rows = -(-len(curves) // columns)
     size = (max(7.0, 3.4 * columns), 2.8 * rows + 0.26 * len(ordered) + 1.3)
-    fig = plt.figure(figsize=size, layout="constrained")
+    fig = pyplot().figure(figsize=size, layout="constrained")
     halves: Any = fig.subfigures(2, 1, height_ratios=(2.8 * rows, 0.26 * len(ordered) + 1.3))
     top, bottom = halves
     axes = np.atleast_1d(top.subplots(rows, columns)).ravel()
@@ -99,7 +94,6 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
     bars.set(yticks=at, yticklabels=[f.label for f in ordered], xlabel="error, relative to a curve's stress [%]")
     bars.set_xlim(0, 145 * max(f.mean_relative_error for f in ordered))
     bars.invert_yaxis()
-    plt.close(fig)
     return fig
 
 

@@ -5,19 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import matplotlib
 import numpy as np
 
 from fitting.fits.field import Field
 from fitting.fits.scene_numbers import Estimate
 from fitting.readers.displacements import locate
 from fitting.reports.sweep_report import numbers
+from liverjax.core.plotting import pyplot, save
 from liverjax.core.status import NAMES
 from liverjax.core.versions import versions
 from liverjax.mesh.tetrahedra import TetMesh, write_mesh
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 
 def of_numbers(found: Estimate) -> dict[str, Any]:
@@ -67,9 +64,7 @@ def write(out: Path, mesh: TetMesh, content: dict[str, Any], found: Field | None
             f[name] = values
         f["eigenvalues"] = found.eigenvalues
         f.attrs["name"] = found.name
-    figure = picture(mesh, found)
-    figure.savefig(out / "field.png", dpi=150)
-    plt.close(figure)
+    save(picture(mesh, found), out / "field.png")
 
 
 def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n: int = 200) -> tuple[np.ndarray, tuple]:
@@ -85,10 +80,10 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
     return shown.reshape(n, n), tuple(100 * v for v in (low[a], high[a], low[b], high[b]))
 
 
-def picture(mesh: TetMesh, found: Field) -> plt.Figure:
+def picture(mesh: TetMesh, found: Field) -> Any:
     """Sections through the place of the largest departure: the factor on the scene's number, and its uncertainty."""
     middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
-    figure, axes = plt.subplots(2, 3, figsize=(11, 5.5), layout="constrained")
+    figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")
     rows = (
         (np.exp(found.log_factor), f"{found.name} over the scene's [1]", "viridis"),
         (found.sd, "standard deviation of its logarithm", "magma"),

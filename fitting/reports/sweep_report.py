@@ -11,7 +11,7 @@ import numpy as np
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import moduli
 from fitting.readers.rheometer import Sweep
-from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE
+from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
 
 
@@ -69,7 +69,7 @@ def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | No
         content.get("closed_form", content)["profile_intervals_95"] = profile
     content = numbers(content)
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    _figure(out / "fit.png", sweep, fits)
+    save(figure(sweep, fits), out / "fit.png")
     _store(out / "fit.h5", sweep, fits, content)
     return content
 
@@ -93,29 +93,16 @@ def _store(path: Path, sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -
             group["covariance"].attrs["order"] = list(fit.uncertainty.names)
 
 
-def _figure(path: Path, sweep: Sweep, fits: list[Fit]) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    fig = figure(sweep, fits)
-    fig.savefig(path, dpi=150)
-    plt.close(fig)
-
-
 def figure(sweep: Sweep, fits: list[Fit]) -> Any:
     """Moduli and residuals on the left; time constants and the table of parameters on the right.
 
     Lengths are inches: the picture grows with the table, so that no panel shrinks and no line is lost.
     """
-    import matplotlib.pyplot as plt
-
     fit = fits[-1]
     lines = _parameter_rows(fit)
     foot = 0.16 * len(lines) + 0.35
     height = max(5.6, 3.4 + foot)
-    fig = plt.figure(figsize=(10, height), layout="constrained")
+    fig = pyplot().figure(figsize=(10, height), layout="constrained")
     halves: Any = fig.subfigures(1, 2, width_ratios=(5.6, 4.4))
     left, right = halves
     top, rest = left.subplots(2, 1, sharex=True, height_ratios=(height - 1.9, 1.9))

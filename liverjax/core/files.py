@@ -1,6 +1,8 @@
-"""Folders for results, tried before anything is computed."""
+"""Folders for results, tried before anything is computed; files that are there whole or not at all."""
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from liverjax.core.errors import InputError
@@ -23,3 +25,22 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
             pass
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}; name a folder that can be written") from None
+
+
+@contextmanager
+def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
+    """Write to the path that this gives: it stands beside `file` and becomes it at the end.
+
+    A kill leaves `file` as it was. An error does too, and removes what was written.
+
+    Args:
+        file: what is to be there whole or not at all.
+        ending: of the path beside; one of its own for each process where several may write `file`.
+    """
+    beside = file.with_suffix(ending)
+    try:
+        yield beside
+        beside.replace(file)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise

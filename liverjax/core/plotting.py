@@ -1,4 +1,24 @@
-"""Okabe and Ito's colours, distinct for every kind of colour vision."""
+"""Pictures: colours, and a Matplotlib that draws to files."""
 
+from pathlib import Path
+from typing import Any
+
+#: Okabe and Ito's, distinct for every kind of colour vision.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+
+def pyplot() -> Any:
+    """Matplotlib's `pyplot`, which needs no screen here; imported only where a picture is drawn, as that takes long."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot
+
+    return matplotlib.pyplot
+
+
+def save(figure: Any, file: Path) -> None:
+    """Write a figure to a file and forget it."""
+    figure.savefig(file, dpi=150)
+    pyplot().close(figure)

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from liverjax.core import status
-from liverjax.core.plotting import BLUE, GREY
+from liverjax.core.files import whole
+from liverjax.core.plotting import BLUE, GREY, pyplot, save
 from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result
@@ -17,8 +18,7 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
     """times, positions, reactions, reference, tetrahedra; status, iterations and `attributes` as attributes."""
     import h5py
 
-    temporary = file.with_suffix(".part")
-    with h5py.File(temporary, "w") as out:
+    with whole(file) as new, h5py.File(new, "w") as out:
         for name, unit in (("times", "s"), ("positions", "m"), ("reactions", "N")):
             out[name] = np.asarray(getattr(result, name))
             out[name].attrs["unit"] = unit
@@ -36,7 +36,6 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
             out.attrs[name] = np.asarray(getattr(result.statistics, name))
         for name, value in attributes.items():
             out.attrs[name] = value if isinstance(value, (str, int, float)) else json.dumps(value)
-    temporary.replace(file)  # a killed run leaves no half-written result
 
 
 def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
@@ -62,16 +61,12 @@ def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
 
 def picture(file: Path, scene: Scene, result: Result) -> None:
     """The body's surface before (grey) and after, coloured by displacement."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     triangles = boundary_triangles(scene.mesh)
     before, after = np.asarray(scene.mesh.points), np.asarray(result.positions[-1])
     moved = np.linalg.norm(after - before, axis=1)[triangles].mean(axis=1)
-    figure = plt.figure(figsize=(6.5, 5.5), layout="constrained")
+    figure = pyplot().figure(figsize=(6.5, 5.5), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     edges = Poly3DCollection(before[triangles], facecolor="none", edgecolor=GREY, lw=0.15)
     surface = Poly3DCollection(after[triangles], lw=0.1, edgecolor="black")
@@ -88,5 +83,4 @@ def picture(file: Path, scene: Scene, result: Result) -> None:
     figure.colorbar(surface, ax=axes, shrink=0.6, label="displacement [m]")
     worst = float(np.asarray(result.statistics.residual).max())
     axes.set_title(f"step {len(result.times)}, largest residual {worst:.1e} of the forces", color=BLUE, fontsize=9)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+    save(figure, file)

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.files import whole
 
 
 def beside(out: Path) -> Path:
@@ -37,16 +38,10 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
     with h5py.File(memory, "w") as datasets:
         for name, value in content.items():
             datasets[name] = value
-    temporary = file.with_suffix(f".{os.getpid()}")
-    try:
-        with temporary.open("wb") as out:
-            out.write(memory.getbuffer())
-            out.flush()
-            os.fsync(out.fileno())
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    temporary.replace(file)
+    with whole(file, f".{os.getpid()}") as new, new.open("wb") as out:
+        out.write(memory.getbuffer())
+        out.flush()
+        os.fsync(out.fileno())
 
 
 def make_folder(folder: Path) -> None:
@@ -89,9 +84,8 @@ def same(identity: dict[str, Any], file: Path) -> None:
     """
     identity = json.loads(json.dumps(identity))
     if not file.exists():
-        temporary = file.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps(identity))
-        temporary.replace(file)
+        with whole(file, f".{os.getpid()}") as new:
+            new.write_text(json.dumps(identity))
         return
     for key, value in json.loads(file.read_text()).items():
         if identity.get(key) != value:

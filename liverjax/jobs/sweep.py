@@ -22,6 +22,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.files import whole
 from liverjax.core.versions import versions
 from liverjax.jobs import parts
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
@@ -256,24 +257,23 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
     needed = sum(f.stat().st_size for f in files) + mesh.points.nbytes + mesh.tetrahedra.nbytes + sweep.rows.nbytes
     if shutil.disk_usage(out.parent).free < needed + _HEADERS:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    temporary, n = out.with_suffix(".joining"), len(sweep.rows)
-    with h5py.File(temporary, "w") as whole:
+    n = len(sweep.rows)
+    with whole(out) as new, h5py.File(new, "w") as joined:
         for k, file in enumerate(files):
             with h5py.File(file) as part:
                 for name, value in part.items():
-                    if name not in whole:
-                        whole.create_dataset(name, (n, *value.shape[1:]), value.dtype)
-                        whole[name].attrs["unit"] = _UNITS.get(name, "1" if name in ("status", "residual") else "m")
-                    whole[name][_of(sweep, k).start : _of(sweep, k).stop] = value[:]
-        whole["row"], whole["parameters"] = sweep.numbers, sweep.rows
-        whole["parameters"].attrs["names"] = list(sweep.names)
+                    if name not in joined:
+                        joined.create_dataset(name, (n, *value.shape[1:]), value.dtype)
+                        joined[name].attrs["unit"] = _UNITS.get(name, "1" if name in ("status", "residual") else "m")
+                    joined[name][_of(sweep, k).start : _of(sweep, k).stop] = value[:]
+        joined["row"], joined["parameters"] = sweep.numbers, sweep.rows
+        joined["parameters"].attrs["names"] = list(sweep.names)
         if sweep.probes:
-            whole["probe_nodes"] = np.array(sweep.probes, dtype=int)
-        whole["reference"] = np.asarray(sweep.scene.mesh.points)
-        whole["tetrahedra"] = np.asarray(sweep.scene.mesh.tetrahedra)
-        whole.attrs["sweep"] = json.dumps(sweep.identity)
-        codes = whole["status"][:]
-    temporary.replace(out)
+            joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
+        joined["reference"] = np.asarray(sweep.scene.mesh.points)
+        joined["tetrahedra"] = np.asarray(sweep.scene.mesh.tetrahedra)
+        joined.attrs["sweep"] = json.dumps(sweep.identity)
+        codes = joined["status"][:]
     return codes
 
 

@@ -3,15 +3,11 @@
 from pathlib import Path
 
 import jax
-import matplotlib
 import numpy as np
 
-from liverjax.core.plotting import BLUE, COLOURS, GREY, ORANGE
+from liverjax.core.plotting import BLUE, COLOURS, GREY, ORANGE, pyplot, save
 from liverjax.laws import Law, homogeneous
 from liverjax.laws.gradient_check import Check
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 
 def _stress(law: Law, test: str, driven: np.ndarray) -> np.ndarray:
@@ -26,7 +22,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
         file: picture to write.
         stretches: range of stretch; shear goes to its upper end minus 1.
     """
-    figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")
+    figure, axes = pyplot().subplots(1, 4, figsize=(13, 3.4), layout="constrained")
     for axis, (test, what) in zip(axes, homogeneous.TESTS.items(), strict=True):
         driven = np.linspace(0.0, stretches[1] - 1, 101) if what == "shear" else np.linspace(*stretches, 201)
         ends = []
@@ -46,13 +42,12 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     else:
         axes[0].legend(fontsize=8)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+    save(figure, file)
 
 
 def gradient_check(result: Check, name: str, file: Path) -> None:
     """The V-shaped errors of difference quotients, and stress-stretch curves with their stable range."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8), layout="constrained")
     for (label, errors), colour in zip(result.difference_errors.items(), (BLUE, ORANGE), strict=True):
         left.loglog(result.steps, errors, "o-", ms=3, color=colour, label=label)
     left.set(xlabel="step of the difference quotient", ylabel="relative error", title=f"{name}: derivatives")
@@ -68,5 +63,4 @@ def gradient_check(result: Check, name: str, file: Path) -> None:
     )
     right.grid(alpha=0.3)
     right.legend(fontsize=8)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+    save(figure, file)

@@ -1,0 +1,51 @@
+"""Dotted names of scene files, and files that are there whole or not at all."""
+
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core import names
+from liverjax.core.files import whole
+
+LAW = lj.laws.Sum(
+    laws=(
+        lj.laws.Continued(law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0), below=0.1),
+        lj.laws.Ogden(mu=(1.0, 2.0), alpha=np.array([2.0, -2.0]), bulk=3.0),
+    )
+)
+
+
+@pytest.mark.parametrize("name, value", [("0.mu", 770.0), ("1.mu.1", 2.0), ("1.alpha.0", 2.0)])
+def test_what_is_put_is_got(name, value):
+    assert names.get(LAW, name, "no") == value
+    changed = names.put(LAW, name, 5.0, "no")
+    assert names.get(changed, name, "no") == 5.0 and names.get(LAW, name, "no") == value
+    assert names.metadata(LAW, name, "no")["unit"] == ("1" if "alpha" in name else "Pa")
+
+
+@pytest.mark.parametrize(
+    "name, sentence",
+    [
+        ("0.nu", "no: did you mean mu?"),
+        ("0.volumetric", "no: use one of mu, bulk"),
+        ("1.mu.2", "no: '2' leads nowhere"),
+        ("2.mu", "no: '2' leads nowhere"),
+        ("mu", "no: 'mu' leads nowhere"),
+        ("0.mu.0", "no: '0' leads nowhere"),
+        ("", "no: '' leads nowhere"),
+    ],
+)
+def test_names_that_lead_nowhere_are_refused(name, sentence):
+    with pytest.raises(lj.InputError) as error:
+        names.get(LAW, name, "no")
+    assert str(error.value) == sentence
+
+
+def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
+    file = tmp_path / "result.txt"
+    with whole(file) as new:
+        new.write_text("first")
+    with pytest.raises(KeyboardInterrupt), whole(file) as new:
+        new.write_text("half")
+        raise KeyboardInterrupt
+    assert file.read_text() == "first" and list(tmp_path.iterdir()) == [file]
