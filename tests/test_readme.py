@@ -17,6 +17,8 @@ import liverjax.__main__
 from experiments.pages import porosity, write
 from liverjax.scenes.scene_file import scene_from
 
+pytestmark = pytest.mark.quick_to_compile
+
 GUIDES = {name: ROOT / name for name in ("README.md", "fitting/README.md", "liverjax/README.md")}
 #: What the pieces of scene files in the guides are pieces of.
 BODY = """

@@ -113,9 +113,9 @@ def simulation() -> str:
         [
             *lines,
             "",
-            'The error is implicit Euler\'s, which damps; `integrator = "newmark"` does not. A cube of '
+            'The error is that of implicit Euler, which damps; `integrator = "newmark"` does not. A cube of '
             f"{cube['tetrahedra']:,} tetrahedra",
-            f"pulled by 20 % in one load step takes {cube['seconds']:.2g} s (residual {cube['residual']:.0e}).",
+            f"that is pulled by 20 % in one load step takes {cube['seconds']:.2g} s (residual {cube['residual']:.0e}).",
         ]
     )
 
@@ -217,12 +217,12 @@ def extremes() -> str:
     compiling = [r["compile_s"]["projected"] / r["compile_s"]["off"] for r in cost["rows"]]
     part = "all" if left.least == 1 else f"at least {percent(left.least)}"
     return (
-        f"From the start itself the minimiser brings back {span(mild)} of {inverted['seeds']} scrambled starts a law "
-        f"({half.laws} laws) with up to a fifth\nof the elements inverted, and {span(half)} with half of them "
-        "inverted; "
-        f"{percent(half.folded)} of the others end folded, in another\nequilibrium. At rest a start is but a guess: "
-        f"`projected` leaves an inverted one for the reference shape, and {part} come\nback because the load can be "
-        "followed from there. Where robustness is not needed it costs\n"
+        f"From the start itself the minimiser brings back {span(mild)} of {inverted['seeds']} scrambled starts for "
+        f"each law ({half.laws} laws) if up to\na fifth of the elements are inverted, "
+        f"and {span(half)} if half of them are; "
+        f"{percent(half.folded)} of the others end folded, in\nanother equilibrium. At rest a start is only a guess. "
+        f"`projected` leaves an inverted one for the reference shape, and\n{part} come back, because the load can be "
+        "followed from there. Where robustness is not needed, it costs\n"
         f"{100 * max(over - 1, 0):.0f} % of run time at most, and compiling takes "
         f"{min(compiling):.2g} to {max(compiling):.2g} times as long."
     )

@@ -14,7 +14,7 @@ LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
 
 
 def linear_solver(scene: Scene) -> str:
-    """cg or direct; where the numbers are traced, and so not known, cg."""
+    """The solver for a scene: cg or direct. If its numbers are traced, they are not known: cg."""
     mesh, solve = scene.mesh, scene.solve
     small = mesh.number_of_elements <= LARGEST
     if solve.kind != "static" or not small or any(load.pressure is not None for load in scene.traction):
@@ -33,7 +33,7 @@ def linear_solver(scene: Scene) -> str:
 
 
 def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:
-    """Least quality of an element."""
+    """The smallest quality of all elements."""
     return float(np.min(qualities(points, tetrahedra, volumes)))
 
 

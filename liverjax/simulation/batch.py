@@ -1,7 +1,7 @@
-"""Many runs of one scene with other numbers: one compiled program, lanes spread over the devices of the process.
+"""Many runs of one scene with other numbers: one compiled program on all devices of the process.
 
-On a CPU one lane after another per device (a vectorised step is slower: loops run to the slowest lane); on a GPU all
-lanes of a device at once.
+A lane is one run of the batch. On a CPU each device runs one lane after another; a vectorised step is slower there,
+because its loops run until the slowest lane is done. On a GPU each device runs all of its lanes at once.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ STRATEGIES = ("map", "vmap")
 
 @struct
 class Batch:
-    """Results of many lanes; `result.status` is (N, T), and a lane that failed spoils no other."""
+    """Results of N lanes; `result.status` is (N, T). A lane that failed does not change the others."""
 
     result: Result = param("1", "every field with a leading axis of N lanes")
     strategy: str = static(
@@ -31,18 +31,18 @@ class Batch:
 
 
 def strategy_for(platform: str) -> str:
-    """What is fastest on a platform: map on cpu, vmap elsewhere."""
+    """The fastest strategy of a platform: map on cpu, vmap elsewhere."""
     return "map" if platform == "cpu" else "vmap"
 
 
 def simulate_batch(
     scene: Scene, parameters: dict[str, Any], strategy: str | None = None, devices: list | None = None
 ) -> Batch:
-    """Run a scene for every lane of its parameters; may be jitted and differentiated.
+    """Run a scene once for each lane of its parameters; may be jitted and differentiated.
 
     Args:
         scene: `Scene`.
-        parameters: dotted names, as of `with_parameters` -> values with a leading axis of N lanes.
+        parameters: dotted names, as in `with_parameters` -> values with a leading axis of N lanes.
         strategy: "map" or "vmap"; None: by the platform.
         devices: to spread the lanes over; None: all of the process.
 

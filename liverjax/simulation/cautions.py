@@ -1,4 +1,4 @@
-"""What a run should be read with care for, though it converged: one sentence each, on the host."""
+"""Cautions about a run that converged: one sentence each, on the host."""
 
 import numpy as np
 
@@ -16,11 +16,11 @@ LEAST_J, MOST_J = 0.2, 5.0
 
 
 def cautions(scene: Scene, result: Result) -> list[str]:
-    """Sentences on the mesh and on the volumes of a run, none where all is well.
+    """Sentences about the mesh and the volumes of a run; an empty list if all is well.
 
     Args:
         scene: `Scene`, not traced.
-        result: of it.
+        result: what its run returned.
     """
     return [*_of_mesh(scene.mesh), *_of_volumes(scene, result)]
 

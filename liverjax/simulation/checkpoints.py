@@ -1,8 +1,8 @@
-"""What reverse mode keeps of a run: the state and the root of every step, or a few states and the rest made again.
+"""What reverse mode keeps of a run: the state and the root of every step, or a few states; it computes the rest again.
 
-A step's root, named in `liverjax.solvers.continuation`, stays; forces and tangent there are evaluated again when the
-derivative comes by, Newton's iterations are not. With fewer states kept than steps (Griewank and Walther 2008, 12) the
-steps between two of them are run a second time, in whole.
+The root of a step (its name is set in `liverjax.solvers.continuation`) is kept. The derivative evaluates forces and
+tangent at the root again, but does not repeat Newton's iterations. If fewer states than steps are kept (Griewank and
+Walther 2008, 12), the steps between two of them run a second time.
 """
 
 import math
@@ -16,7 +16,7 @@ from liverjax.solvers.continuation import ROOT
 
 
 def number_kept(store: str | int, steps: int) -> int:
-    """How many states are kept of so many steps.
+    """Number of states to keep of a run of `steps` steps.
 
     Args:
         store: "all", "sqrt", or a number above 0.
@@ -40,7 +40,7 @@ def lengths(steps: int, kept: int) -> tuple[int, int, int]:
 
 
 def one_step(step: Callable) -> Callable:
-    """`step` of which reverse mode keeps arguments and root only."""
+    """`step`, of which reverse mode keeps only the arguments and the root."""
     policy = jax.checkpoint_policies.save_only_these_names(ROOT)
     return jax.checkpoint(step, policy=policy, prevent_cse=False)
 

@@ -17,7 +17,7 @@ from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient
 
 
 class State(NamedTuple):
-    """What a step hands to the next."""
+    """What one step passes to the next."""
 
     x: jax.Array  # (V, 3) [m]
     memories: tuple  # one of every physics, in order; None where it remembers nothing
@@ -49,17 +49,17 @@ class Equations(NamedTuple):
 
     @property
     def solids(self) -> list[Solid]:
-        """What acts in elements by their deformation gradient."""
+        """Physics that depend on the deformation gradient of elements."""
         return [a for a in self.acting if isinstance(a, Solid)]
 
     @property
     def volume(self) -> VolumeStress | None:
-        """What acts on their volume."""
+        """Physics that act on the volume of elements."""
         return next((a for a in self.acting if isinstance(a, VolumeStress)), None)
 
     @property
     def nodal(self) -> list[NodalForce]:
-        """What acts at nodes."""
+        """Physics that act at nodes."""
         return [a for a in self.acting if isinstance(a, NodalForce)]
 
     @property
@@ -84,7 +84,7 @@ class Forces(NamedTuple):
 
 
 def free_directions(scene: Scene) -> Free:
-    """Where the body can move."""
+    """Directions in which the body can move."""
     free = Free(free_degrees(scene.mesh, scene.fixed, scene.displaced))
     for physics in scene.physics:
         free = physics.constrain(free)
@@ -92,7 +92,7 @@ def free_directions(scene: Scene) -> Free:
 
 
 def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
-    """At rest in the reference positions, or at positions `start` (V, 3) [m]."""
+    """The state at the beginning: at rest in the reference positions, or at positions `start` (V, 3) [m]."""
     x = scene.mesh.points if start is None else start
     physics, free = physics_of(scene), free_directions(scene)
 
@@ -112,7 +112,7 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """What forces are measured against where loads do not say."""
+    """Sizes [N] of the forces of a stretch along x and of rounded positions; the tolerance needs them without loads."""
     mesh, law = scene.mesh, law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
@@ -171,7 +171,7 @@ def forces(e: Equations, q: jax.Array, s: Any) -> Forces:
 
 
 def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, Any]:
-    """Out of balance forces (3 V,) [N] at part s of the step, the size of those at work, and the pressures."""
+    """Out-of-balance forces (3 V,) [N] at part s of the step, the size of all forces, and the pressures."""
     f = forces(e, q, s)
     at_work = e.noise + jnp.linalg.norm(f.internal)
     for force in f.nodal:
@@ -180,7 +180,7 @@ def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, 
 
 
 def energy(e: Equations, q: jax.Array) -> jax.Array:
-    """What a step makes least [J]; its gradient is the residual. All are incremental potentials."""
+    """The energy [J] that a step minimises: the sum of incremental potentials. Its gradient is the residual."""
     x = positions(e, q, 1.0)
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.volumes * sum(solid.energy(F) for solid in e.solids))
@@ -196,7 +196,7 @@ def advanced(e: Equations, end: End) -> State:
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
-    """What the physics show of a state beside positions and reactions."""
+    """Results of the physics at a state, beside positions and reactions."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
         shown |= physics.output(memory)

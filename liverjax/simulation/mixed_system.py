@@ -1,7 +1,7 @@
-"""The mixed system of positions and nodal pressures: put together, and its pressures eliminated.
+"""The mixed system of positions and nodal pressures: assemble it, and eliminate its pressures.
 
-What acts on the volume of elements with pressures at the nodes brings a matrix of these pressures: a sponge in which a
-fluid flows, or volume changes averaged at the nodes, where each pressure stands by itself.
+A physics that acts on the volume of elements has pressures at the nodes and a matrix of these pressures. In a sponge
+the fluid flows, so the matrix couples them. Where volume changes are averaged at the nodes, the matrix is diagonal.
 """
 
 from typing import Any
@@ -49,8 +49,8 @@ def eliminated(
 ) -> tuple[jax.Array, ...]:
     """Forces, columns (V,), of a motion that changes pressures too, from `both` = A (dx, 0) of the `coupled` matrix A.
 
-    Without `flow` nothing flows: the matrix of the pressures is diagonal. With it their equation is solved nearly, or
-    `exactly`: to its tolerance.
+    Without `flow` the matrix of the pressures is diagonal. With `flow` their equation is solved approximately, or, if
+    `exactly` is set, to its tolerance.
     """
     *forces, balance = both
     if flow is None:

@@ -1,8 +1,8 @@
 """The tangent of a scene's forces, from hand-derived blocks, and linear solves with it.
 
-What the scene has decides the matrix and the method: conjugate gradients, with nodal pressures eliminated where there
-are some; BiCGSTAB where loads follow the body. All with the same preconditioner: the inverse diagonal blocks and, where
-slow motions hold them up, a coarse space.
+The physics of the scene decide the method. Conjugate gradients solve symmetric systems, after nodal pressures are
+eliminated. BiCGSTAB solves systems with loads that follow the body. The preconditioner is the same for all: the inverse
+diagonal blocks and, where slow motions would slow them down, a coarse space.
 """
 
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def stiffness(e: Equations, pressure: Any, x: jax.Array, kind: str = "true") -> 
 
 
 def node_blocks(e: Equations) -> Block | None:
-    """What nodes add to the diagonal (V,) [N/m]; None: nothing."""
+    """Diagonal entries (V,) [N/m] of physics at nodes; None: there are none."""
     total: Block | None = None
     for a in e.nodal:
         own = a.stiffness()

@@ -1,7 +1,7 @@
 """Symmetric matrices of node blocks in padded rows: assembled from element blocks, multiplied without a search.
 
-Only the blocks of edges are scattered, each once: a matrix of forces that do not change under translation has its
-diagonal blocks as minus the sum of its rows, and what else stands there is given.
+Each block of an edge is scattered once. Forces do not change under translation, so a diagonal block is minus the sum of
+the other blocks in its row. Callers give what else belongs on the diagonal.
 """
 
 from collections.abc import Sequence
@@ -117,7 +117,7 @@ def _across(A: Block, normals: jax.Array) -> Block:
 
 
 def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """A block a node, m x k of (V,), times its part of the vector with these k columns (V,)."""
+    """The block of each node, m x k of (V,), times the k entries of the vector at this node, as columns (V,)."""
     return tuple(_row(row, columns) for row in blocks)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 
 class LinearStatistics(NamedTuple):
-    """What a solve did."""
+    """What one solve took: iterations and residual."""
 
     iterations: jax.Array
     residual: jax.Array  # |b - A x| / |b|, recomputed at the end
@@ -27,9 +27,9 @@ def conjugate_gradients(
     Args:
         matvec, precondition: A and an approximation of its inverse.
         tolerance: of the recursive residual relative to |b|.
-        max_iterations: iterations after which what was reached is returned.
+        max_iterations: the solve ends after so many iterations.
 
-    Stops as well on a direction of no positive curvature. The statistics hold the true residual.
+    It also stops at a direction without positive curvature. The statistics hold the true residual.
     """
     goal = tolerance * jnp.linalg.norm(b)
 
@@ -131,7 +131,7 @@ def differentiable_solve(
     solver: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None,
     diagonal: jax.Array | None = None,
 ) -> jax.Array:
-    """A solve as a linear map of `b`: its derivatives are further solves, not those of iterations.
+    """A solve as a linear map of `b`: its derivatives are solves as well, not derivatives of the iterations.
 
     `solver` (b) solves the same by itself, for a symmetric A, and tells the true residual over |b|.
 
@@ -167,7 +167,7 @@ def refined(
     matvec: Callable[[jax.Array], jax.Array],
     b: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Solve A x = b by repeated solves of a system near it: few products with a dear A (iterative refinement).
+    """Solve A x = b by repeated solves with an approximation of A (iterative refinement): few products with A itself.
 
     Returns the solution and its residual relative to |b|.
 

@@ -11,7 +11,7 @@ from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
 
 
 class NewtonStatistics(NamedTuple):
-    """What a solve did; every field an array (one a lane under vmap)."""
+    """What one solve took; every field is an array (under vmap, one entry for each run)."""
 
     status: jax.Array
     iterations: jax.Array
@@ -20,7 +20,7 @@ class NewtonStatistics(NamedTuple):
 
 
 class NewtonOptions(NamedTuple):
-    """How hard to try; all static."""
+    """Tolerances and limits; all fixed when compiled."""
 
     tolerance: float = 1e-8  # of |r| relative to the scale given
     max_iterations: int = 25
@@ -73,7 +73,7 @@ class _Point(NamedTuple):
 
 
 def _iterate(residual, start, precondition, scale, options):
-    """Newton with step halving on |r|. Residual and tangent stand in the program once: it compiles twice as fast."""
+    """Newton with step halving on |r|. The program has residual and tangent only once, so it compiles twice as fast."""
     goal = options.tolerance * scale
 
     def norm(r):

@@ -1,7 +1,7 @@
-"""A coarse space for the linear solves: on each of some tens of patches of nodes, the affine motions.
+"""A coarse space for the linear solves: the affine motions of each of a few dozen patches of nodes.
 
-Block-Jacobi removes short waves; the motions that vary slowly over the body are solved for directly. The two together,
-added, are a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
+Block-Jacobi removes short waves. The coarse space solves directly for motions that vary slowly over the body. Their sum
+is a two-level Schwarz preconditioner (Smith, Bjorstad and Gropp 1996).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,14 +18,14 @@ Columns = Sequence[jax.Array]
 
 
 class Coarse(NamedTuple):
-    """The inverse of a matrix as the coarse space sees it."""
+    """The inverse of a matrix, restricted to the coarse space."""
 
     inverse: jax.Array  # (4 m P, 4 m P)
     used: jax.Array  # False: left out
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
-    """Set up for the leading m x m blocks; where they are not positive definite, or `used` is false, left out.
+    """The coarse space for the leading m x m blocks. Left out if they are not positive definite or `used` is false.
 
     Args:
         mesh: `TetMesh`.
@@ -50,7 +50,7 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
 
 
 def worthwhile(A: BlockMatrix, inertia: Any) -> Any:
-    """Whether slow motions hold up block-Jacobi: where inertia is less than a thirtieth of the diagonal."""
+    """Whether slow motions slow down block-Jacobi: true if inertia is less than a thirtieth of the diagonal."""
     if inertia is None:
         return jnp.array(True)
     total = sum(jnp.sum(A.diagonal[r][r]) for r in range(3)) / 3
