@@ -133,13 +133,14 @@ def regularised(
 ) -> list[Matrix]:
     """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
     result = [_diagonal(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
-    added = [(weight, invariant_terms.state(law, F)) for weight, law in parts]
-    if volume is not None:
-        added.append((1.0, invariant_terms.state_of(volume, F)))
-    for weight, state in added:
+
+    def with_more(weight: Any, state: invariant_terms.State) -> list[Matrix]:
         K = invariant_terms.blocks(state, D, pairs, regularised=True)
-        result = [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
-    return result
+        return [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
+
+    for weight, law in parts:
+        result = with_more(weight, invariant_terms.state(law, F))
+    return result if volume is None else with_more(1.0, invariant_terms.state_of(volume, F))
 
 
 def _gather(total: dict, weight: Any, values: dict) -> None:

@@ -236,14 +236,13 @@ def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regula
         s = s._replace(frame=stored(s.frame))
     parts = _parts(s, D, pairs)
     result = [_block(parts, pair, regularised) for pair in pairs]
-    added = []
     for law in s.laws:
         if law.stretch_energy is not None:
-            added.append(stretch_terms.blocks(law, s.F, s.frame, D, pairs))
+            more = stretch_terms.blocks(law, s.F, s.frame, D, pairs)
+            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
         if law.green_energy is not None:
-            added.append(green_terms.blocks(law, s.F, D, pairs))
-    for more in added:
-        result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
+            more = green_terms.blocks(law, s.F, D, pairs)
+            result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
     return result
 
 
