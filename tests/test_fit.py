@@ -10,6 +10,7 @@ from conftest import ROOT
 
 from fitting.fits import viscoelastic
 from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods.estimate import spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import Sweep, read_sweep
@@ -361,5 +362,5 @@ def test_a_point_without_derivatives_is_not_gone_to():
     assert float(found.u[0]) <= 1 and np.all(np.isfinite(found.jacobian))
     lost = levenberg_marquardt(residuals, 1.5 * jnp.ones(1))
     assert not bool(lost.converged)
-    half, _ = uncertainty.spread(np.full((3, 1), np.nan), 1.0, np.ones((1, 1)))
+    half, _ = spread(np.full((3, 1), np.nan), 1.0, np.ones((1, 1)))
     assert np.all(np.isinf(half))

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits.field import Field, start_of
-from fitting.fits.scene_numbers import Estimate, Problem, fit
+from fitting.fits.scene_numbers import Problem, fit
+from fitting.methods.estimate import Estimate
 
 #: Width of the edge over the elements' mean size.
 _EDGE = 0.25

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.fits.scene_numbers import Estimate
 from fitting.methods import generalised_maxwell
+from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.least_squares import levenberg_marquardt_host
-from fitting.methods.uncertainty import parameter_names, parameter_vector, spread
+from fitting.methods.uncertainty import parameter_names, parameter_vector
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
 from liverjax import laws
@@ -118,20 +118,7 @@ def fit(
 
     found = levenberg_marquardt_host(evaluate, generalised_maxwell.unconstrained(start), max_iterations, progress)
     evaluate(found.u)
-    r, n = np.asarray(found.residuals), len(found.u)
-    noise = max(1.0, float(np.sqrt(r @ r / max(1, len(r) - n))))
-    half, _ = spread(np.asarray(found.jacobian), noise, np.asarray(jax.jacfwd(parameter_vector)(found.u)))
-    errors = np.linalg.norm(half, axis=1)
-    return Estimate(
-        names=parameter_names((n - 1) // 2),
-        values=np.asarray(parameter_vector(found.u)),
-        standard_errors=errors,
-        correlation=half @ half.T / np.maximum(np.outer(errors, errors), 1e-300),
-        chi2=float(r @ r),
-        components=len(r),
-        noise=noise,
-        iterations=int(found.iterations),
-        converged=bool(found.converged) and all(c == status.CONVERGED for c in worst),
-        codes=tuple(worst),
-        seconds=time.perf_counter() - begin,
-    )
+    names = parameter_names((len(found.u) - 1) // 2)
+    converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
+    estimate = estimated(names, parameter_vector, found, len(found.residuals))
+    return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)

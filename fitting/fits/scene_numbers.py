@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
+from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
-from fitting.methods.uncertainty import spread
 from fitting.readers.displacements import Displacements, residuals
 from liverjax.core import status
 from liverjax.scenes.scene import Scene, numbers_at
@@ -26,22 +26,6 @@ class Problem(NamedTuple):
     def components(self) -> int:
         """Number of measured components."""
         return sum(d.components for d in self.data)
-
-
-class Estimate(NamedTuple):
-    """Numbers with their uncertainty."""
-
-    names: tuple[str, ...]
-    values: np.ndarray
-    standard_errors: np.ndarray
-    correlation: np.ndarray
-    chi2: float  # sum of squared residuals over the noise
-    components: int  # measured components
-    noise: float  # factor on the errors: 1, or what the misfit asks for
-    iterations: int
-    converged: bool
-    codes: tuple[int, ...]  # worst code of each scene's run
-    seconds: float
 
 
 def misfit(problem: Problem, values: dict[str, Any], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
@@ -89,25 +73,10 @@ def fit(
 
     found = levenberg_marquardt_host(evaluate, jnp.asarray(start, float), max_iterations, progress)
     ended = tuple(int(c) for c in np.asarray(with_jacobian(problem, found.u)[2]))
-    r = np.asarray(found.residuals)
-    # Components that were not measured have residual 0 and count for nothing.
-    noise = max(1.0, float(np.sqrt(r @ r / max(1, problem.components - len(names)))))
-    half, _ = spread(np.asarray(found.jacobian), noise, np.asarray(jax.jacfwd(natural_of)(found.u)))
-    errors = np.linalg.norm(half, axis=1)
-    estimate = Estimate(
-        names=tuple(names),
-        values=np.asarray(natural_of(found.u)),
-        standard_errors=errors,
-        correlation=half @ half.T / np.maximum(np.outer(errors, errors), 1e-300),
-        chi2=float(r @ r),
-        components=problem.components,
-        noise=noise,
-        iterations=int(found.iterations),
-        converged=bool(found.converged) and all(c == status.CONVERGED for c in ended),
-        codes=ended,
-        seconds=time.perf_counter() - begin,
-    )
-    return estimate, found
+    converged = bool(found.converged) and all(c == status.CONVERGED for c in ended)
+    seconds = time.perf_counter() - begin
+    estimate = estimated(names, natural_of, found, problem.components)
+    return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
 
 
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:

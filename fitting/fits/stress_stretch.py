@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
+from fitting.methods.estimate import errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
-from fitting.methods.uncertainty import spread
 from fitting.readers.curves import Curve
 from liverjax import laws
 from liverjax.core.errors import InputError
@@ -277,18 +277,18 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
     n, p = sum(len(c.stress) for c in curves), len(u)
     misfit = r[:n]
     values = np.asarray(candidate.values(jnp.asarray(u), scale))
-    noise = float(np.sqrt(np.sum(misfit**2) / max(1, n - p)))
+    noise = noise_factor(misfit, n - p, deviations_given=False)
     limits = _limits(candidate, values, scale)
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
     # Of a parameter at its limit nothing more is known; the others' errors are those of the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
     half, s = spread(J[:n, known], noise, slope[np.ix_(known, known)])
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
+    its_errors, its_correlation = errors_and_correlation(half)
     if n > p:
-        errors[known] = np.linalg.norm(half, axis=1)
+        errors[known] = its_errors
     if np.all(np.isfinite(half)):
-        lengths = np.maximum(np.linalg.norm(half, axis=1), 1e-300)[:, None]
-        correlation[np.ix_(known, known)] = (half / lengths) @ (half / lengths).T
+        correlation[np.ix_(known, known)] = its_correlation
     law = candidate.law(jnp.asarray(values))
     split = np.split(misfit, np.cumsum([len(c.stress) for c in curves])[:-1])
     criterion = n * np.log(max(np.sum(misfit**2) / n, 1e-300))

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt, levenberg_marquardt_host
-from fitting.methods.uncertainty import Uncertainty
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import torsion
 from liverjax import laws
@@ -28,7 +28,7 @@ class Fit(NamedTuple):
     method: str
     model: Maxwell
     solution: Solution
-    uncertainty: Uncertainty
+    uncertainty: Estimate
     converged: bool
     storage: np.ndarray  # fitted G' at the measured frequencies [Pa]
     loss: np.ndarray

@@ -1,28 +1,15 @@
 """How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 
 from fitting.methods import generalised_maxwell
+from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.rheometer import Sweep
-
-
-class Uncertainty(NamedTuple):
-    """Of the parameters in the order of `names`: G0, ratios, relaxation times."""
-
-    names: tuple[str, ...]
-    values: np.ndarray  # (2N + 1,)
-    covariance: np.ndarray  # (2N + 1, 2N + 1); huge where the data leave a direction free
-    standard_errors: np.ndarray
-    correlation: np.ndarray
-    equilibrium_error: float  # of G0 (1 - sum g) [Pa]
-    noise: float  # factor on the given scales: 1, or what the residuals ask for
-    quantile: float  # of Student's t for a 95 % interval
 
 
 def parameter_vector(u: jax.Array) -> jax.Array:
@@ -37,62 +24,22 @@ def parameter_names(modes: int) -> tuple[str, ...]:
     return ("shear_modulus", *ratios, *times)
 
 
-def noise_factor(residuals: np.ndarray, n_parameters: int, deviations_given: bool) -> float:
-    """Noise over the residual scales.
-
-    Without deviations the residuals estimate it. Given deviations are believed, except where the residuals are larger
-    than they allow: then errors grow with the misfit and never shrink (the rule of the Particle Data Group).
-    """
-    freedom = max(1, len(residuals) - n_parameters)
-    estimate = float(np.sqrt(np.sum(residuals**2) / freedom))
-    return max(1.0, estimate) if deviations_given else estimate
+def estimate(found: Solution, deviations_given: bool) -> Estimate:
+    """Values, errors and correlation of G0, ratios and relaxation times at the minimum."""
+    names = parameter_names((len(found.u) - 1) // 2)
+    return estimated(names, parameter_vector, found, len(found.residuals), deviations_given)
 
 
-def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Square root A of the covariance A A^T of natural parameters (delta method), and scaled singular values.
-
-    Args:
-        jacobian: of the residuals by unconstrained parameters u.
-        noise: standard deviation of a residual.
-        to_natural: derivative of the natural parameters by u.
-    """
-    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # nothing is known: a fit that could not begin
-        return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
-    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
-    return noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0]), s
+def equilibrium_error(u: Estimate) -> float:
+    """Standard error of the equilibrium modulus G0 (1 - sum g) [Pa]; infinite for a fluid."""
+    modes = (len(u.values) - 1) // 2
+    rest = 1 - u.values[1 : modes + 1].sum()
+    # Through the square root of the covariance, which keeps it non-negative.
+    slope = np.concatenate([[rest], np.full(modes, -u.values[0]), np.zeros(modes)])
+    return float(np.linalg.norm(slope @ u.root)) if rest > 1e-10 else np.inf
 
 
-def estimate(found: Solution, deviations_given: bool) -> Uncertainty:
-    """Linearised covariance at the minimum, carried to the natural parameters by the delta method."""
-    u, J, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
-    noise = noise_factor(r, len(u), deviations_given)
-    to_natural = np.asarray(jax.jacfwd(parameter_vector)(found.u))
-    half, _ = spread(J, noise, to_natural)
-    values = np.asarray(parameter_vector(found.u))
-    covariance = half @ half.T
-    errors = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.maximum(np.outer(errors, errors), 1e-300)
-    # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
-    stuck = np.abs(to_natural).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
-    errors = np.where(stuck, np.inf, errors)
-    modes = (len(u) - 1) // 2
-    # d(G0 (1 - sum g)): through the square root of the covariance, which keeps it non-negative.
-    slope = np.concatenate([[1 - values[1 : modes + 1].sum()], np.full(modes, -values[0]), np.zeros(modes)])
-    return Uncertainty(
-        parameter_names(modes),
-        values,
-        covariance,
-        errors,
-        correlation,
-        float(np.linalg.norm(slope @ half)) if 1 - values[1 : modes + 1].sum() > 1e-10 else np.inf,
-        noise,
-        float(scipy.stats.t.ppf(0.975, max(1, len(r) - len(u)))),
-    )
-
-
-def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Uncertainty, points: int = 21) -> dict[str, Any]:
+def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> dict[str, Any]:
     """95 % intervals by profile likelihood, closed form: all other parameters refitted along each one.
 
     Returns:
@@ -155,7 +102,7 @@ def supported_modes(sweep: Sweep) -> int:
     return max(1, int(_decades(sweep) + 1 + 1e-9))  # a decade is a decade in spite of rounding
 
 
-def superfluous(sweep: Sweep, u: Uncertainty) -> list[str]:
+def superfluous(sweep: Sweep, u: Estimate) -> list[str]:
     """Sentences that advise against some of the modes; none for a number of modes that may be chosen."""
     modes = (len(u.values) - 1) // 2
     fewer = "use fewer modes or a wider sweep" if modes > 1 else "use a wider sweep"
@@ -195,7 +142,7 @@ def superfluous(sweep: Sweep, u: Uncertainty) -> list[str]:
     return out
 
 
-def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
+def cautions(sweep: Sweep, u: Estimate, found: Solution) -> list[str]:
     """Sentences on what the data do not tell, each with the number it rests on and what to do."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
@@ -210,7 +157,7 @@ def cautions(sweep: Sweep, u: Uncertainty, found: Solution) -> list[str]:
             )
     ratios = u.values[1 : modes + 1].sum()
     equilibrium = u.values[0] * (1 - ratios)
-    if not equilibrium > 2 * u.equilibrium_error:
+    if not equilibrium > 2 * equilibrium_error(u):
         out.append(
             f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
             "from zero (a fluid); measure at lower frequencies"

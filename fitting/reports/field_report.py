@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from fitting.fits.field import Field
-from fitting.fits.scene_numbers import Estimate
+from fitting.methods.estimate import Estimate
 from fitting.readers.displacements import locate
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import pyplot, save

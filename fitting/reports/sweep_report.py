@@ -10,6 +10,7 @@ import numpy as np
 
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import moduli
+from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
@@ -41,7 +42,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
         "relaxation_times": fit.model.relaxation_times.tolist(),
         "standard_errors": {
             "shear_modulus": e[0],
-            "equilibrium_modulus": u.equilibrium_error,
+            "equilibrium_modulus": equilibrium_error(u),
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },
@@ -174,7 +175,7 @@ def _parameter_rows(fit: Fit) -> list[str]:
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
     rows = [
         f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa",
-        f"G_inf {equilibrium:9.4g} ± {u.equilibrium_error:.2g} Pa",
+        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa",
         "",
         f"{'mode':4s} {'ratio [1]':>20s} {'relaxation time [s]':>22s}",
     ]
@@ -193,7 +194,7 @@ def _lines(fit: Fit) -> list[str]:
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
     rows = [
         row("G0", u.values[0], u.standard_errors[0], "Pa"),
-        row("G_inf", equilibrium, u.equilibrium_error, "Pa"),
+        row("G_inf", equilibrium, equilibrium_error(u), "Pa"),
     ]
     for i in range(n):
         rows.append(row(f"g{i + 1}", u.values[1 + i], u.standard_errors[1 + i], ""))

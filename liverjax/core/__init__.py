@@ -1,1 +1,1 @@
-"""What every room needs: frozen structs, errors, status codes, files, versions, plotting."""
+"""What every room needs: frozen structs, errors, status codes, names, files, versions, plotting."""

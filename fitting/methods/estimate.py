@@ -1,0 +1,108 @@
+"""What every fit hands over: numbers, their standard errors and correlation, from the Jacobian at the minimum."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.stats
+
+from fitting.methods.least_squares import Solution
+
+
+class Estimate(NamedTuple):
+    """Numbers in the order of `names`, and how well the data determine them."""
+
+    names: tuple[str, ...]
+    values: np.ndarray  # (P,)
+    root: np.ndarray  # (P, k) square root of the covariance; huge where the data leave a direction free
+    standard_errors: np.ndarray
+    correlation: np.ndarray
+    chi2: float  # sum of squared residuals over the noise
+    components: int  # measured numbers
+    noise: float  # factor on the given scales: 1, or what the residuals ask for
+    iterations: int
+    converged: bool
+    codes: tuple[int, ...] = ()  # worst code of each simulation
+    seconds: float = 0.0
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the numbers (P, P)."""
+        return self.root @ self.root.T
+
+    @property
+    def quantile(self) -> float:
+        """Of Student's t for a 95 % interval."""
+        return float(scipy.stats.t.ppf(0.975, max(1, self.components - len(self.names))))
+
+
+def estimated(
+    names: Sequence[str],
+    natural_of: Callable[[jax.Array], jax.Array],
+    found: Solution,
+    components: int,
+    deviations_given: bool = True,
+) -> Estimate:
+    """The estimate at a minimum: covariance of u, carried to the reported numbers by the delta method.
+
+    Args:
+        names: of the numbers to report.
+        natural_of: u -> these numbers (P,).
+        found: minimum over u.
+        components: how many of the residuals are measured; those that are not are 0 and count for nothing.
+        deviations_given: as of `noise_factor`.
+    """
+    u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
+    noise = noise_factor(r, components - len(u), deviations_given)
+    values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
+    root, _ = spread(jacobian, noise, to_natural)
+    errors, correlation = errors_and_correlation(root)
+    # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
+    stuck = np.abs(to_natural).max(axis=1) <= 1e-10 * np.maximum(np.abs(values), 1e-300)
+    return Estimate(
+        names=tuple(names),
+        values=values,
+        root=root,
+        standard_errors=np.where(stuck, np.inf, errors),
+        correlation=correlation,
+        chi2=float(r @ r),
+        components=components,
+        noise=noise,
+        iterations=int(found.iterations),
+        converged=bool(found.converged),
+    )
+
+
+def noise_factor(residuals: np.ndarray, freedom: int, deviations_given: bool) -> float:
+    """Noise over the residual scales.
+
+    Without deviations the residuals estimate it. Given deviations are believed, except where the residuals are larger
+    than they allow: then errors grow with the misfit and never shrink (the rule of the Particle Data Group).
+    """
+    estimate = float(np.sqrt(np.sum(residuals**2) / max(1, freedom)))
+    return max(1.0, estimate) if deviations_given else estimate
+
+
+def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Square root A of the covariance A A^T of natural parameters (delta method), and scaled singular values.
+
+    Args:
+        jacobian: of the residuals by unconstrained parameters u.
+        noise: standard deviation of a residual.
+        to_natural: derivative of the natural parameters by u.
+    """
+    if not (np.all(np.isfinite(jacobian)) and np.any(jacobian)):  # nothing is known: a fit that could not begin
+        return np.full((len(to_natural), jacobian.shape[1]), np.inf), np.zeros(min(jacobian.shape))
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
+    return noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0]), s
+
+
+def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard errors (P,) and correlation (P, P) of the square root of a covariance."""
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite where nothing is known
+        covariance = root @ root.T
+        errors = np.sqrt(np.diag(covariance))
+        return errors, covariance / np.maximum(np.outer(errors, errors), 1e-300)
