@@ -43,10 +43,11 @@ by = [0.002, 0.0, 0.0]
 
 
 def blocks(language: str) -> list:
-    """Examples of the three pages in one language, each with its page and number."""
+    """Examples of the three pages in one language, by page and number."""
     fence = re.compile(rf"^```{language}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+    # tests/test_rigs.py has quicker fits of several tests.
     found = [
-        pytest.param(block, id=f"{name}-{k}")
+        pytest.param(block, id=f"{name}-{k}", marks=[pytest.mark.slow] if "joint.fit" in block else [])
         for name, page in GUIDES.items()
         for k, block in enumerate(fence.findall(page.read_text()))
     ]

@@ -1,1 +1,1 @@
-"""Pages that quote numbers of the scripts: README.md and those of this folder, written from their JSON."""
+"""Pages that quote numbers of the scripts: the front page, the guides, those of this folder, from their JSON."""
