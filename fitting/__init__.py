@@ -1,3 +1,9 @@
 """Identification of material parameters from measurements, on top of `liverjax`."""
 
-import liverjax  # noqa: F401  (64-bit mode and the check of the jax release come first)
+from types import ModuleType
+
+from liverjax.core import addresses  # 64-bit mode and the check of the jax release come first
+
+
+def __getattr__(name: str) -> ModuleType:
+    return addresses.moved("fitting", name)

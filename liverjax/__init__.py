@@ -4,7 +4,7 @@ Importing turns on JAX's 64-bit mode unless the environment sets ``JAX_ENABLE_X6
 """
 
 import os
-import sys
+from types import ModuleType
 
 import jax
 
@@ -17,6 +17,7 @@ if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
 from liverjax import laws
+from liverjax.core import addresses
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.elements import mjed, reference
@@ -31,16 +32,11 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve, with_parameters
 from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.scene_file import load_scene
-from liverjax.simulation import gradients
 from liverjax.simulation.batch import Batch, simulate_batch
 from liverjax.simulation.gradients import Gradient, value_and_gradient
 from liverjax.simulation.run import Result, simulate
 
 __version__ = "0.1.0"
-
-# `from liverjax.shapes import box` and the like, as users have written them, still find these modules.
-for _module in (boundary, gradients, mjed, reference, shapes, viscosity):
-    sys.modules[f"liverjax.{_module.__name__.rpartition('.')[2]}"] = _module
 
 __all__ = [
     "Batch",
@@ -78,3 +74,9 @@ __all__ = [
     "with_parameters",
     "write_mesh",
 ]
+
+addresses.keep_loaded("liverjax")
+
+
+def __getattr__(name: str) -> ModuleType:
+    return addresses.moved("liverjax", name)

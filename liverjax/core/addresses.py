@@ -1,0 +1,64 @@
+"""Addresses of modules before they moved into rooms: what users have written goes on working."""
+
+import importlib
+import sys
+from types import ModuleType
+
+#: Old address -> new one.
+MOVED = {
+    "liverjax.batch": "liverjax.simulation.batch",
+    "liverjax.boundary": "liverjax.physics.boundary",
+    "liverjax.check": "liverjax.laws.gradient_check",
+    "liverjax.design": "liverjax.jobs.design",
+    "liverjax.errors": "liverjax.core.errors",
+    "liverjax.gradients": "liverjax.simulation.gradients",
+    "liverjax.homogeneous": "liverjax.laws.homogeneous",
+    "liverjax.long_run": "liverjax.jobs.long_run",
+    "liverjax.mjed": "liverjax.elements.mjed",
+    "liverjax.output": "liverjax.jobs.output",
+    "liverjax.porosity": "liverjax.physics.porosity",
+    "liverjax.reference": "liverjax.elements.reference",
+    "liverjax.regions": "liverjax.scenes.regions",
+    "liverjax.scene": "liverjax.scenes.scene",
+    "liverjax.scene_checks": "liverjax.scenes.scene_checks",
+    "liverjax.scene_file": "liverjax.scenes.scene_file",
+    "liverjax.shapes": "liverjax.mesh.shapes",
+    "liverjax.status": "liverjax.core.status",
+    "liverjax.struct": "liverjax.core.struct",
+    "liverjax.sweep": "liverjax.jobs.sweep",
+    "liverjax.versions": "liverjax.core.versions",
+    "liverjax.viscosity": "liverjax.physics.viscosity",
+    "fitting.curves": "fitting.readers.curves",
+    "fitting.displacements": "fitting.readers.displacements",
+    "fitting.field": "fitting.fits.field",
+    "fitting.fit": "fitting.fits.viscoelastic",
+    "fitting.inclusion": "fitting.fits.inclusion",
+    "fitting.joint": "fitting.fits.joint",
+    "fitting.least_squares": "fitting.methods.least_squares",
+    "fitting.prior": "fitting.methods.prior",
+    "fitting.prony": "fitting.methods.generalised_maxwell",
+    "fitting.report": "fitting.reports.sweep_report",
+    "fitting.rheometer": "fitting.readers.rheometer",
+    "fitting.scenes": "fitting.fits.scene_numbers",
+    "fitting.stress_stretch": "fitting.fits.stress_stretch",
+    "fitting.torsion": "fitting.rigs.torsion",
+    "fitting.uncertainty": "fitting.methods.uncertainty",
+}
+
+
+def keep_loaded(package: str) -> None:
+    """Let `from PACKAGE.MODULE import …` find those moved modules that are loaded already."""
+    for old, new in MOVED.items():
+        if old.startswith(f"{package}.") and new in sys.modules:
+            sys.modules.setdefault(old, sys.modules[new])
+
+
+def moved(package: str, name: str) -> ModuleType:
+    """The module that was at PACKAGE.NAME.
+
+    Raises:
+        AttributeError: there was none.
+    """
+    if f"{package}.{name}" not in MOVED:
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    return importlib.import_module(MOVED[f"{package}.{name}"])
