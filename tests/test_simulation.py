@@ -13,6 +13,7 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.physics import boundary
+from liverjax.physics.inertia import Motion
 from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.step import step
 from liverjax.solvers import continuation
@@ -186,7 +187,8 @@ def test_implicit_euler_only_dissipates():
     advance = jax.jit(lambda state, k: step(equations(scene, state, k))[0])
 
     def energy(state):
-        kinetic = 0.5 * np.sum(mass[:, None] * np.asarray(state.velocity) ** 2)
+        (motion,) = (memory for memory in state.memories if isinstance(memory, Motion))
+        kinetic = 0.5 * np.sum(mass[:, None] * np.asarray(motion.velocity) ** 2)
         weight = np.sum(mass * 9.81 * np.asarray(state.x)[:, 2])
         return float(mjed.energy(mesh, LAW, state.x)) + kinetic + weight
 
