@@ -20,8 +20,10 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 FILE = Path(__file__).parents[2] / "tests" / "rig_values.json"
-#: Height over radius, bulk over shear modulus, and the punch's radius over that of the sample.
-ASPECTS, RATIOS, PUNCH = (0.2, 0.5, 1.0, 2.0, 5.0), (3.0, 20.0, 100.0, 1e4), 0.4
+#: Height over radius, and bulk over shear modulus.
+ASPECTS, RATIOS = (0.2, 0.5, 1.0, 2.0, 5.0), (3.0, 20.0, 100.0, 1e4)
+#: The punch's radius over that of the sample: in all these cases, and in some.
+PUNCH, OTHERS = 0.4, (0.1, 0.8)
 #: Distance of line t from a rim goes as t to this power: at an exponent of 0.5 of the displacement, order 4 is kept.
 GRADING = 4.0
 
@@ -153,13 +155,13 @@ def tension(height: float, ratio: float, cells: int, mixed: bool = True) -> floa
     return stiffness(system(mesh, ratio, mixed), held, n + top) / 2
 
 
-def punch(height: float, ratio: float, cells: int, mixed: bool = True) -> float:
-    """Force over mu R d of a glued flat punch of radius `PUNCH` R, pressed by d into a cylinder on a glued plate."""
-    under, beside = lines(PUNCH, cells, "1"), PUNCH + lines(1 - PUNCH, cells, "01")[1:]
+def punch(height: float, ratio: float, cells: int, mixed: bool = True, radius: float = PUNCH) -> float:
+    """Force over mu R d of a glued flat punch of `radius` R, pressed by d into a cylinder on a glued plate."""
+    under, beside = lines(radius, cells, "1"), radius + lines(1 - radius, cells, "01")[1:]
     mesh = grid(np.concatenate([under, beside]), lines(height, 2 * cells, "01"))
     r, z = mesh.nodes.T
     n, bottom, axis = len(r), np.flatnonzero(z == 0), np.flatnonzero(r == 0)
-    pressed = np.flatnonzero((z == height) & (r <= PUNCH))
+    pressed = np.flatnonzero((z == height) & (r <= radius))
     held = np.unique(np.concatenate([bottom, n + bottom, axis, pressed]))
     return stiffness(system(mesh, ratio, mixed), held, n + pressed)
 
@@ -183,37 +185,39 @@ def creep(height: float, ratio: float, cells: int, mixed: bool = True) -> float:
 TESTS = {"tension": tension, "punch": punch, "creep": creep}
 
 
-def converged(test: str, height: float, ratio: float, cells: int) -> dict[str, Any]:
-    """A number on three grids, the observed order, and its extrapolation; an estimate of what is left [1]."""
-    coarse, middle, fine = (TESTS[test](height, ratio, n) for n in (cells // 4, cells // 2, cells))
+def converged(test: str, height: float, ratio: float, cells: int, **other: float) -> dict[str, Any]:
+    """A number on three grids, the observed order, its extrapolation, and how far that is from the finest [1]."""
+    coarse, middle, fine = (TESTS[test](height, ratio, n, **other) for n in (cells // 4, cells // 2, cells))
     order = math.log2(abs((middle - coarse) / (fine - middle)))
     value = fine + (fine - middle) / (2 ** max(order, 1.0) - 1)
     return {
         "test": test,
         "height_over_radius": height,
         "bulk_over_shear": ratio,
+        **{f"punch_{name}": size for name, size in other.items()},
         "value": value,
         "grids": [coarse, middle, fine],
         "order": order,
         "left": abs(value / fine - 1),
-        "displacements_alone": TESTS[test](height, ratio, cells // 2, mixed=False),
+        "displacements_alone": TESTS[test](height, ratio, cells // 2, mixed=False, **other),
     }
 
 
 def main() -> None:
-    """The table, and the two numbers of another program at small strain."""
+    """The table: every test at every height and ratio, and other punches at some."""
+    own = {"tension": {}, "punch": {"radius": PUNCH}, "creep": {}}
+    cases = [(test, h, k, own[test]) for test in TESTS for h in ASPECTS for k in RATIOS]
+    cases += [("punch", h, k, {"radius": a}) for a in OTHERS for h in (ASPECTS[0], 1.0) for k in (3.0, 1e4)]
     rows = []
-    for test in TESTS:
-        for height in ASPECTS:
-            for ratio in RATIOS:
-                rows.append(converged(test, height, ratio, 48 if test == "punch" else 32))
-                print({k: v for k, v in rows[-1].items() if k != "grids"}, flush=True)
+    for test, height, ratio, other in cases:
+        rows.append(converged(test, height, ratio, 48 if test == "punch" else 32, **other))
+        print({k: v for k, v in rows[-1].items() if k != "grids"}, flush=True)
     words = {
         "tension": "force / (mu R d), both plates glued, pulled apart by d",
-        "punch": f"force / (mu R d) on a glued punch of radius {PUNCH} R, pressed by d; the bottom glued",
+        "punch": "force / (mu R d) on a glued flat punch of radius punch_radius R, pressed by d; the bottom glued",
         "creep": "mean displacement of the top / (R t / mu), pulled by t on its top; the bottom glued",
     }
-    content = {"made_by": "experiments/sources/axisymmetric_reference.py", "what": words, "punch": PUNCH, "rows": rows}
+    content = {"made_by": "experiments/sources/axisymmetric_reference.py", "what": words, "rows": rows}
     FILE.write_text(json.dumps(content, indent=1) + "\n")
 
 

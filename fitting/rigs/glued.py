@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from liverjax.mesh.promotion import quadratic
 
 import liverjax as lj
 from liverjax.core.errors import InputError
@@ -24,14 +25,21 @@ from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
 
 READINGS = ("force", "displacement")
-#: Corners of the polygon that stands for the circle, of which a sector has one edge.
-CORNERS = 24
-#: Length of the cells at the rim of a plate and at a punch's edge, over the shortest length there.
-RIM, EDGE = 0.04, 0.02
-#: Longest cells over the radius.
-LARGEST = 0.34
 #: A punch narrower than this part of the sample, or a gap beside it, is below what the mesh is made for.
 NARROWEST = 0.01
+
+
+class Cells(NamedTuple):
+    """The mesh of a rig; the default is within 1 % of the converged answer (experiments/TABLES.md)."""
+
+    size: float | None = None  # [m] one for all cells, of the whole cylinder; None: a graded sector
+    rim: float = 0.04  # cells of a sector at the rim of a plate, over the shortest length there
+    edge: float = 0.02  # the same at a punch's edge
+    largest: float = 0.34  # longest cells of a sector over the radius; along the axis twice as long
+    growth: float = cylinders.GROWTH  # of cells away from rims and edge
+    corners: int = 24  # of the polygon that stands for the circle, of which a sector has one edge
+    order: int = 2  # of the elements
+    volumetric: str = "element"  # how volume changes are treated, as of `lj.Solve`
 
 
 @struct
@@ -53,6 +61,7 @@ class _Sample(NamedTuple):
     physics: tuple
     parts: float  # how many such meshes are a cylinder
     under: np.ndarray  # nodes of the top within the punch, or of all of it
+    volumetric: str
 
 
 def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]:
@@ -73,14 +82,15 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
     return (result.positions[:, rig.nodes, 2] - rest[None]) @ rig.weights, result.status
 
 
-def tension(radius: float, height: float, dt: float, strains: Any, cell_size: float | None = None) -> Rig:
+def tension(radius: float, height: float, dt: float, strains: Any, cell_size: float | Cells | None = None) -> Rig:
     """A cylinder pulled (or pressed) between glued plates; the force is read.
 
     Args:
         radius, height: of the sample [m].
         dt: time step [s].
         strains: nominal strain at the end of every step (T,).
-        cell_size: edge length [m] of a mesh of the whole cylinder with cells of one size; default a graded sector.
+        cell_size: edge length [m] of a mesh of the whole cylinder with cells of one size, or `Cells`; default a graded
+            sector.
 
     Raises:
         InputError: lengths or times that are not positive, strains that are not finite or flatten the sample.
@@ -88,14 +98,14 @@ def tension(radius: float, height: float, dt: float, strains: Any, cell_size: fl
     strains = _finite("strains", strains)
     if strains.min() <= -0.9:
         raise InputError(f"strains reach {strains.min():g}: keep them above -0.9")
-    _check(radius, height, dt, cell_size)
-    rim = RIM * min(radius, height / 2)
-    sample = _sample({radius: rim}, {0.0: rim, height: rim}, cell_size)
+    cells = _cells(radius, height, dt, cell_size)
+    rim = cells.rim * min(radius, height / 2)
+    sample = _sample({radius: rim}, {0.0: rim, height: rim}, cells)
     return _driven(sample, dt, height * strains)
 
 
 def indentation(
-    radius: float, height: float, punch: float, dt: float, depths: Any, cell_size: float | None = None
+    radius: float, height: float, punch: float, dt: float, depths: Any, cell_size: float | Cells | None = None
 ) -> Rig:
     """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; the force on it.
 
@@ -106,26 +116,28 @@ def indentation(
         InputError: as of `tension`; a punch wider than the sample, or far narrower.
     """
     depths = _finite("depths", depths)
-    _check(radius, height, dt, cell_size)
+    cells = _cells(radius, height, dt, cell_size)
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(
             f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} of the radius {radius:g}: mend "
             "one of them"
         )
-    edge = EDGE * min(punch, radius - punch, height)
-    rings = {punch: edge, radius: RIM * min(radius - punch, height)}
-    layers = {0.0: RIM * min(radius, height), height: edge}
-    return _driven(_sample(rings, layers, cell_size, punch), dt, -depths)
+    edge = cells.edge * min(punch, radius - punch, height)
+    rings = {punch: edge, radius: cells.rim * min(radius - punch, height)}
+    layers = {0.0: cells.rim * min(radius, height), height: edge}
+    return _driven(_sample(rings, layers, cells, punch), dt, -depths)
 
 
-def creep(radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | None = None) -> Rig:
+def creep(
+    radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | Cells | None = None
+) -> Rig:
     """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the mean displacement of the top.
 
     The pull comes up over the first step, as it does in a rheometer over some time. The mean is that over the area.
     """
-    _check(radius, height, dt, cell_size)
-    rim = RIM * min(radius, height)
-    sample = _sample({radius: rim}, {0.0: rim, height: height}, cell_size)
+    cells = _cells(radius, height, dt, cell_size)
+    rim = cells.rim * min(radius, height)
+    sample = _sample({radius: rim}, {0.0: rim, height: height}, cells)
     mesh, top = sample.mesh, jnp.asarray(sample.under)
     triangles = jnp.asarray(boundary.boundary_triangles(mesh, sample.under))
     unit = lj.Traction(triangles=triangles, value=jnp.array([0.0, 0.0, 1.0]))
@@ -143,41 +155,56 @@ def _finite(name: str, values: Any) -> np.ndarray:
     return values
 
 
-def _check(radius: float, height: float, dt: float, cell_size: float | None) -> None:
+def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | None) -> Cells:
+    """What a mesh is made of, after a look at all numbers."""
+    cells = cell_size if isinstance(cell_size, Cells) else Cells(size=cell_size)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(f"dt = {dt} must be positive: give the time step in seconds")
-    for name, value in (("radius", radius), ("height", height), ("cell_size", cell_size)):
+    for name, value in (("radius", radius), ("height", height), ("cell_size", cells.size)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"{name} = {value} must be positive and finite: give a length in metres")
+    return cells
 
 
-def _sample(rings: dict, layers: dict, cell_size: float | None, punch: float | None = None) -> _Sample:
-    """A sector with cells of given lengths at given radii and heights; whole, of one cell size, where one is given."""
+def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
+    """A sector with cells of given lengths at given radii and heights; whole, of one cell size, where that is given."""
     radius, height = max(rings), max(layers)
-    if cell_size:
-        rings, layers = (dict.fromkeys(places, cell_size) for places in (rings, layers))
-    largest = min(cell_size or LARGEST * radius, radius / 2)
-    radii, heights = cylinders.graded(radius, rings, largest), cylinders.graded(height, layers, 2 * largest)
-    if cell_size:
+    if cells.size is not None:
+        rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))
+    largest = min(cells.size or cells.largest * radius, radius / 2)
+    radii = cylinders.graded(radius, rings, largest, cells.growth)
+    heights = cylinders.graded(height, layers, 2 * largest, cells.growth)
+    if cells.size is not None:
         mesh, normal, parts = cylinders.graded_cylinder(radii, heights), None, 1.0
     else:
-        mesh, normal, parts, _ = cylinders.sector(radii, heights, CORNERS)
+        mesh, normal, parts, _ = cylinders.sector(radii, heights, cells.corners)
+    mesh = _with_punch(mesh, radii, punch)
+    if cells.order == 2:
+        mesh = quadratic(mesh)
     sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
-    under = sets["top"]
+    bottom = lj.Fixed(nodes=jnp.asarray(sets["bottom"]))
+    if normal is None:
+        return _Sample(mesh, (bottom,), (), parts, sets["under"], cells.volumetric)
+    # The axis is in both planes: the nodes in the middle of its edges too.
+    axis = np.intersect1d(sets["start"], sets["end"])
+    fixed = (
+        bottom,
+        lj.Fixed(nodes=jnp.asarray(sets["start"]), axes="y"),
+        lj.Fixed(nodes=jnp.asarray(axis), axes="xy"),
+    )
+    slides = SlidingSupport(nodes=jnp.asarray(np.setdiff1d(sets["end"], axis)), normal=jnp.asarray(normal))
+    return _Sample(mesh, fixed, (slides,), parts, sets["under"], cells.volumetric)
+
+
+def _with_punch(mesh: lj.TetMesh, radii: np.ndarray, punch: float | None) -> lj.TetMesh:
+    """The mesh with a node set `under`: the top within the ring at `punch`, or all of it."""
+    top = np.asarray(mesh.node_sets["top"])
     if punch is not None:
         # The nodes of a layer are numbered from the axis outwards, ring after ring.
-        distance = np.hypot(*np.asarray(mesh.points)[under, :2].T)
-        ends = np.flatnonzero(np.diff(distance) > 1e-9 * radius)
-        under = under[: 1 + ends[np.argmin(np.abs(radii - punch))]]
-    fixed = [lj.Fixed(nodes=jnp.asarray(sets["bottom"]))]
-    if normal is None:
-        return _Sample(mesh, tuple(fixed), (), parts, under)
-    fixed += [
-        lj.Fixed(nodes=jnp.asarray(sets["start"]), axes="y"),
-        lj.Fixed(nodes=jnp.asarray(sets["axis"]), axes="xy"),
-    ]
-    slides = SlidingSupport(nodes=jnp.asarray(np.setdiff1d(sets["end"], sets["axis"])), normal=jnp.asarray(normal))
-    return _Sample(mesh, tuple(fixed), (slides,), parts, under)
+        distance = np.hypot(*np.asarray(mesh.points)[top, :2].T)
+        ends = np.flatnonzero(np.diff(distance) > 1e-9 * radii[-1])
+        top = top[: 1 + ends[np.argmin(np.abs(radii - punch))]]
+    return replace(mesh, node_sets=mesh.node_sets | {"under": jnp.asarray(top)})
 
 
 def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
@@ -196,6 +223,6 @@ def _scene(sample: _Sample, dt: float, steps: int, **loads: Any) -> lj.Scene:
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
         fixed=sample.fixed,
         physics=sample.physics,
-        solve=lj.Solve(dt=dt, steps=steps, tolerance=1e-9),
+        solve=lj.Solve(dt=dt, steps=steps, tolerance=1e-9, volumetric=sample.volumetric),
         **loads,
     )

@@ -14,20 +14,21 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: How much longer a cell is than one nearer to a rim, over the distance between them.
+#: How fast cells grow away from a rim: with quadratic elements finer ones gain little (experiments/TABLES.md).
 GROWTH = 0.7
 
 
-def graded(length: float, cells: Mapping[float, float], largest: float) -> np.ndarray:
+def graded(length: float, cells: Mapping[float, float], largest: float, growth: float = GROWTH) -> np.ndarray:
     """Places from 0 to `length`, close together near some of them.
 
     Args:
         length: [m].
         cells: place [m] -> length of a cell there [m]; every place becomes one of the result.
         largest: no cell is longer [m].
+        growth: how much longer a cell is than one nearer to such a place, over the distance between them.
 
     Returns:
-        Rising places (n,) [m]: a cell at distance d of a place is about `GROWTH` d longer than the cell there.
+        Rising places (n,) [m].
     """
     stops = np.unique([0.0, *cells, length])
     parts = [np.zeros(1)]
@@ -37,7 +38,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float) -> np.nd
         x = low + (high - low) * np.concatenate([half, 1 - half[-2::-1]])
         cell = np.full_like(x, largest)
         for place, size in cells.items():
-            cell = np.minimum(cell, size + GROWTH * np.abs(x - place))
+            cell = np.minimum(cell, size + growth * np.abs(x - place))
         count = np.concatenate([np.zeros(1), np.cumsum((1 / cell[1:] + 1 / cell[:-1]) / 2 * np.diff(x))])
         n = max(1, int(np.ceil(count[-1] - 1e-6)))
         parts.append(np.interp(np.linspace(0.0, count[-1], n + 1)[1:], count, x))
