@@ -192,7 +192,7 @@ def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None)
         lj.Fixed(nodes=jnp.asarray(sets["start"]), axes="y"),
         lj.Fixed(nodes=jnp.asarray(axis), axes="xy"),
     )
-    slides = SlidingSupport(nodes=jnp.asarray(np.setdiff1d(sets["end"], axis)), normal=jnp.asarray(normal))
+    slides = SlidingSupport(nodes=jnp.asarray(sets["end"]), normal=jnp.asarray(normal))
     return _Sample(mesh, fixed, (slides,), parts, sets["under"], cells.volumetric)
 
 
