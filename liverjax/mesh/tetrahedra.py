@@ -1,4 +1,7 @@
-"""Meshes of linear tetrahedra: positions, constant shape vectors, node sets; read and written by meshio."""
+"""Meshes of straight tetrahedra: positions, constant shape vectors, node sets.
+
+An element has 4 nodes, or 10: vertices and the middles of its edges (`liverjax.mesh.quadratic`).
+"""
 
 import contextlib
 import dataclasses
@@ -14,36 +17,104 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
-from liverjax.mesh.adjacency import Pattern, pattern
+from liverjax.core.struct import param, static, struct
+from liverjax.mesh.adjacency import PAIRS, Pattern, pattern
+from liverjax.mesh.basis import basis
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 
 @struct
 class TetMesh:
-    """Linear tetrahedra with their reference geometry; a pytree whose arrays are leaves.
+    """Straight tetrahedra with their reference geometry; a pytree whose arrays are leaves.
 
-    Made by `tet_mesh`; `shape_vectors` and `volumes` follow from points and tetrahedra, also under `jax.grad`.
+    Made by `tet_mesh`; `shape_vectors` and `volumes` follow from points and tetrahedra, also under `jax.grad`. With
+    `order` 2 the nodes are the vertices and then the middles of the edges, in the order of `pattern.edges`.
     """
 
     points: jax.Array = param("m", "reference positions (V, 3)")
-    tetrahedra: jax.Array = param("1", "node numbers (E, 4), positively oriented")
+    tetrahedra: jax.Array = param("1", "vertices of every element (E, 4), positively oriented")
     shape_vectors: jax.Array = param("1/m", "D_a = grad N_a of nodes a = 1, 2, 3, shape (3, 3, E); D_0 = -(sum)")
     volumes: jax.Array = param("m^3", "reference volumes (E,)")
     node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
-    pattern: Pattern = param("1", "which nodes share an element")
+    pattern: Pattern = param("1", "which vertices share an element")
+    faces: Any = param("1", "number of each of an element's faces (4, E), of order 3", default=None)
+    order: int = static(default=1, about="of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property
     def number_of_nodes(self) -> int:
-        """V."""
+        """V, vertices and middles of edges."""
         return self.points.shape[0]
+
+    @property
+    def number_of_vertices(self) -> int:
+        """Corners of elements: the first nodes."""
+        return self.pattern.row_nodes.shape[1]
 
     @property
     def number_of_elements(self) -> int:
         """E."""
         return self.tetrahedra.shape[0]
+
+    @property
+    def weights(self) -> jax.Array:
+        """Reference volume [m^3] of every point of integration: (E,) of linear elements, else (Q, E)."""
+        if self.order == 1:
+            return self.volumes
+        return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
+
+    @property
+    def element_nodes(self) -> list[jax.Array]:
+        """Numbers (E,) of the nodes of every element: 4, or 10 with the middles of `liverjax.mesh.adjacency.PAIRS`."""
+        vertices = [self.tetrahedra[:, a] for a in range(4)]
+        if self.order == 1:
+            return vertices
+        V, N = self.number_of_vertices, self.pattern.edges.shape[1]
+        middles = [V + edge for edge in self.pattern.element_edges]
+        if self.order == 2:
+            return vertices + middles
+        return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in self.faces]
+
+    def corners(self, column: jax.Array) -> list[jax.Array]:
+        """Of a nodal field (V,): y_k of `liverjax.mesh.basis` (E,) or (Q, E) at every point, k = 0 … 3.
+
+        With shape vectors D_k the gradient of the field is the sum of y_k D_k.
+        """
+        values = [column[n] for n in self.element_nodes]
+        if self.order == 1:
+            return values
+        values = self._oriented(values)
+        c = basis(self.order).c
+        return [
+            sum(jnp.asarray(c[a, k], column.dtype)[:, None] * values[a] for a in range(len(c)) if c[a, k].any())
+            for k in range(4)
+        ]
+
+    def spread(self, shares: list[jax.Array]) -> jax.Array:
+        """The transpose of `corners`: a nodal field (V,) from four shares, (E,) or (Q, E)."""
+        if self.order > 1:
+            c, dtype = basis(self.order).c, self.volumes.dtype
+            shares = self._oriented(
+                [
+                    sum(jnp.sum(jnp.asarray(c[a, k], dtype)[:, None] * shares[k], 0) for k in range(4) if c[a, k].any())
+                    for a in range(len(c))
+                ]
+            )
+        total = jnp.zeros(self.number_of_nodes, shares[0].dtype)
+        # Chained scatters: after a concatenate XLA:CPU recomputes the shares for every update (4 times slower).
+        for nodes, share in zip(self.element_nodes, shares, strict=True):
+            total = total.at[nodes].add(share)
+        return total
+
+    def _oriented(self, values: list[jax.Array]) -> list[jax.Array]:
+        """Functions of order 3 on edges change sign with the direction, which goes to the higher vertex."""
+        if self.order < 3:
+            return values
+        t, first = self.tetrahedra, 4 + len(PAIRS)
+        signs = [jnp.where(t[:, i] < t[:, j], 1.0, -1.0).astype(self.volumes.dtype) for i, j in PAIRS]
+        own = [sign * value for sign, value in zip(signs, values[first : first + len(PAIRS)], strict=True)]
+        return [*values[:first], *own, *values[first + len(PAIRS) :]]
 
 
 def tet_mesh(
@@ -78,10 +149,16 @@ def tet_mesh(
 
 
 def with_points(mesh: TetMesh, points: Any) -> TetMesh:
-    """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with."""
+    """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with.
+
+    Edges stay straight: where the mesh is quadratic the positions of their middles follow from those of the vertices.
+    """
     points = jnp.array(points, mesh.points.dtype)
     if points.shape != mesh.points.shape:
         raise InputError(f"mesh.points has shape {points.shape}: give positions of shape {mesh.points.shape}")
+    if mesh.order > 1:
+        vertices, (low, high) = points[: mesh.number_of_vertices], mesh.pattern.edges
+        points = jnp.concatenate([vertices, 0.5 * (vertices[low] + vertices[high])])
     shape_vectors, volumes = _geometry(points, mesh.tetrahedra)
     return dataclasses.replace(mesh, points=points, shape_vectors=shape_vectors, volumes=volumes)
 

@@ -81,7 +81,7 @@ class End(NamedTuple):
     """Where an accepted step ended."""
 
     x: jax.Array  # (V, 3) [m]
-    F: Matrix  # deformation gradients (E,)
+    F: Matrix  # deformation gradients (E,), or (Q, E) where elements have Q points
     pressure: Any  # (V,) [Pa] of the nodes, or None
 
 

@@ -183,7 +183,7 @@ def energy(e: Equations, q: jax.Array) -> jax.Array:
     """The energy [J] that a step minimises: the sum of incremental potentials. Its gradient is the residual."""
     x = positions(e, q, 1.0)
     F = deformation_gradient(e.mesh, x)
-    total = jnp.sum(e.mesh.volumes * sum(solid.energy(F) for solid in e.solids))
+    total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
         total = total + e.volume.energy(e.mesh, determinant(F))
     return sum((a.energy(e.mesh, x) for a in e.nodal), total)
