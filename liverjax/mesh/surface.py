@@ -70,7 +70,7 @@ def pressure_forces(triangles: jax.Array, x: jax.Array, mesh: TetMesh | None = N
 
 
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Six functions (6, Q) at barycentric coordinates l (3, Q), and their slopes towards the second and third vertex."""
+    """Six functions (6, Q) at barycentric coordinates l (3, Q), and their slopes towards the last vertices."""
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]
     zero = np.zeros_like(l[0])
     by = [[4 * l[k] - 1 if m == k else zero for m in range(3)] for k in range(3)]

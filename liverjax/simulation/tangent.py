@@ -23,7 +23,15 @@ from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.krylov import conjugate_gradients, refined, stabilised_biconjugate_gradients, true_residual
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.solvers.preconditioner import Coarse, coarse, corrected, worthwhile
-from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, scale, scale_matrix, stored
+from liverjax.tensors.matrices import (
+    Matrix,
+    add_matrices,
+    deformation_gradient,
+    determinant,
+    scale,
+    scale_matrix,
+    stored,
+)
 
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
@@ -251,6 +259,9 @@ def solve(
 def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
     """The same by a factorisation, of the coupled matrix where pressures depend on motion."""
     free, load, volume = e.free.mask.T, b.reshape(3, -1), _coupled(e)
+    if isinstance(K.matrix, PointMatrix):
+        known = jnp.ones(0) if volume is None or volume.flow is None else volume.flow.mask
+        return direct.solve_points(e.mesh, K.matrix, (free, known), load, e.free.normals).ravel()
     if volume is not None:
         known = jnp.ones_like(free[:1]) if volume.flow is None else volume.flow.mask[None]
         free = jnp.concatenate([free, known])

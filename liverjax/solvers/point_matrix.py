@@ -20,6 +20,7 @@ from liverjax.solvers import block_matrix
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector, dot, stored, transpose
 
+
 class PointMatrix(NamedTuple):
     """Derivative of forces, and of minus the balance of nodal volumes where there are pressures."""
 
@@ -93,9 +94,7 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Any = None) -> Levels:
     if bulk is not None and A.border is not None:
         g = A.border
         blocks = {
-            (a, b): tuple(
-                tuple(K[r][c] + bulk * g[a - 1][r] * g[b - 1][c] for c in range(3)) for r in range(3)
-            )
+            (a, b): tuple(tuple(K[r][c] + bulk * g[a - 1][r] * g[b - 1][c] for c in range(3)) for r in range(3))
             for (a, b), K in blocks.items()
         }
     blocks = stored(blocks)

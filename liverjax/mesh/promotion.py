@@ -48,6 +48,39 @@ def cubic(mesh: TetMesh) -> TetMesh:
     return replace(mesh, points=points, faces=jnp.asarray(number.reshape(4, -1), jnp.int32), order=3)
 
 
+def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
+    """Numbers (m,) of the faces of a mesh of order 3 with vertices (m, 3); host side."""
+    tets, V = np.asarray(mesh.tetrahedra).astype(np.int64), mesh.number_of_vertices
+    of_elements = np.concatenate([tets[:, face] for face in map(list, FACES)])
+    code, wanted = (_code(np.sort(t.astype(np.int64), axis=1), V) for t in (of_elements, triangles))
+    order = np.argsort(code, kind="stable")
+    return np.asarray(mesh.faces).ravel()[order[np.searchsorted(code, wanted, sorter=order)]]
+
+
+def _code(triples: np.ndarray, V: int) -> np.ndarray:
+    """One number a sorted triple: below 2^63 for two million vertices."""
+    return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
+
+
+def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Nodes (n,) of the quadratic elements, then the functions of order 3 on the edges and faces they hold; host."""
+    inside = np.zeros(mesh.number_of_nodes, bool)
+    inside[nodes] = True
+    V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]
+    low, high = np.asarray(mesh.pattern.edges)
+    edges = np.flatnonzero(inside[low] & inside[high] & inside[V : V + N])
+    element = [np.asarray(n) for n in mesh.element_nodes[:10]]
+    faces = [
+        np.asarray(mesh.faces[k])[np.all([inside[element[n]] for n in _nodes_of_face(face)], axis=0)]
+        for k, face in enumerate(FACES)
+    ]
+    return np.concatenate([nodes, V + N + edges, V + 2 * N + np.unique(np.concatenate(faces))])
+
+
+def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
+    return [*face, *(4 + k for k, pair in enumerate(PAIRS) if set(pair) <= set(face))]
+
+
 def on_middles(mesh: TetMesh, values: jax.Array) -> jax.Array:
     """A field of the vertices (..., V), linear along every edge, at all nodes of the mesh."""
     if mesh.order == 1:
