@@ -43,8 +43,7 @@ def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
     forces: Any = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
     if mesh.order > 1:
         forces = stored(forces)
-    forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(3)], *forces]
-    return jnp.stack([mesh.spread([force[i] for force in forces]) for i in range(3)], axis=-1)
+    return jnp.stack(mesh.spread(forces), axis=-1)
 
 
 @jax.jit

@@ -4,6 +4,7 @@ An element has 4 nodes, or 10: vertices and the middles of its edges (`liverjax.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -70,45 +71,53 @@ class TetMesh:
             return vertices + middles
         return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in self.faces]
 
-    def corners(self, column: jax.Array) -> list[jax.Array]:
-        """Of a nodal field (V,): y_k of `liverjax.mesh.basis` (E,) or (Q, E) at every point, k = 0 … 3.
+    def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
+        """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array a column, (E,) or (Q, E).
 
-        With shape vectors D_k the gradient of the field is the sum of y_k D_k.
+        y_k are the corners of `liverjax.mesh.basis`; with shape vectors D_k the field's gradient is the sum of
+        (y_k - y_0) D_k.
         """
-        values = [column[n] for n in self.element_nodes]
         if self.order == 1:
-            return values
-        values = self._oriented(values)
+            values = [[column[n] for column in columns] for n in self.element_nodes]
+            return [tuple(a - b for a, b in zip(corner, values[0], strict=True)) for corner in values[1:]]
+        nodes = jnp.stack(self.element_nodes)
+        values = self._oriented(jnp.stack([column[nodes] for column in columns], axis=1))
+        y = jnp.tensordot(self._slopes(), values, axes=(1, 0)).reshape(3, -1, *values.shape[1:])
+        return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
+
+    def spread(self, forces: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
+        """The transpose of `edges`: nodal columns (V,) from what acts on the corners 1, 2, 3, balanced at corner 0."""
+        count = len(forces[0])
+        if self.order == 1:
+            forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(count)], *forces]
+            shares = [[force[i] for force in forces] for i in range(count)]
+        else:
+            whole = jnp.stack([jnp.stack(force, axis=1) for force in forces])
+            values = jnp.tensordot(self._slopes().T, whole.reshape(-1, *whole.shape[2:]), axes=(1, 0))
+            values = self._oriented(values)
+            shares = [[values[:, i]] for i in range(count)]
+        nodes = self.element_nodes if self.order == 1 else [jnp.stack(self.element_nodes)]
+        columns = []
+        for own in shares:
+            # Chained scatters: after a concatenate XLA:CPU recomputes the shares for every update (4 times slower).
+            total = jnp.zeros(self.number_of_nodes, own[0].dtype)
+            for where, share in zip(nodes, own, strict=True):
+                total = total.at[where].add(share)
+            columns.append(total)
+        return columns
+
+    def _slopes(self) -> jax.Array:
+        """c_ak - c_a0 as the matrix (3 Q, n) of `edges`: a product with it keeps the program small."""
         c = basis(self.order).c
-        return [
-            sum(jnp.asarray(c[a, k], column.dtype)[:, None] * values[a] for a in range(len(c)) if c[a, k].any())
-            for k in range(4)
-        ]
+        return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
-    def spread(self, shares: list[jax.Array]) -> jax.Array:
-        """The transpose of `corners`: a nodal field (V,) from four shares, (E,) or (Q, E)."""
-        if self.order > 1:
-            c, dtype = basis(self.order).c, self.volumes.dtype
-            shares = self._oriented(
-                [
-                    sum(jnp.sum(jnp.asarray(c[a, k], dtype)[:, None] * shares[k], 0) for k in range(4) if c[a, k].any())
-                    for a in range(len(c))
-                ]
-            )
-        total = jnp.zeros(self.number_of_nodes, shares[0].dtype)
-        # Chained scatters: after a concatenate XLA:CPU recomputes the shares for every update (4 times slower).
-        for nodes, share in zip(self.element_nodes, shares, strict=True):
-            total = total.at[nodes].add(share)
-        return total
-
-    def _oriented(self, values: list[jax.Array]) -> list[jax.Array]:
-        """Functions of order 3 on edges change sign with the direction, which goes to the higher vertex."""
+    def _oriented(self, values: jax.Array) -> jax.Array:
+        """Functions of order 3 on edges, among values (n, C, E), point to the higher vertex: they change their sign."""
         if self.order < 3:
             return values
         t, first = self.tetrahedra, 4 + len(PAIRS)
-        signs = [jnp.where(t[:, i] < t[:, j], 1.0, -1.0).astype(self.volumes.dtype) for i, j in PAIRS]
-        own = [sign * value for sign, value in zip(signs, values[first : first + len(PAIRS)], strict=True)]
-        return [*values[:first], *own, *values[first + len(PAIRS) :]]
+        signs = jnp.stack([jnp.where(t[:, i] < t[:, j], 1.0, -1.0) for i, j in PAIRS]).astype(values.dtype)
+        return values.at[first : first + len(PAIRS)].multiply(signs[:, None])
 
 
 def tet_mesh(

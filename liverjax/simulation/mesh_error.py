@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
+from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
@@ -32,9 +33,8 @@ from liverjax.simulation.equations import (
     force_sizes,
     forces,
     initial_state,
-    residual,
+    positions,
 )
-from liverjax.simulation.equations import positions as positions_of
 from liverjax.simulation.run import Result, prepared
 from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
@@ -102,22 +102,18 @@ def _step(scene: Scene, rich: Scene, sizes: Sizes, state: State, given: Any) -> 
     k, x, reactions = given
     e, one = equations(rich, state, k, sizes), jnp.ones((), x.dtype)
     q = flat(e.free.vectors(padded(rich.mesh, x)))
-    r, _, pressure = residual(e, q, one)
-    K = tangent.tangent(e, pressure, positions_of(e, q, one), one)
-    tolerance = _TOLERANCE[scene.mesh.order]
-    dq, iterations, positive = tangent.solve(e, K, -r, tolerance, MOST_LINEAR_ITERATIONS)
-    f, df = jax.jvp(lambda q: forces(e, q, one).total, (q,), (dq,))
-    change = _on_nodes(scene.mesh, (1 - e.free.mask) * (f + df)) - reactions
-    end = forces(e, q + dq, one)
-    new = advanced(e, End(end.x, end.F, end.pressure))
-    finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, change))]).all()
-    # Where du leads to no state, the richer run goes on from the positions of the other.
-    back = forces(e, q, one)
-    otherwise = advanced(e, End(back.x, back.F, back.pressure))
-    new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, otherwise)
-    shown = jnp.where(finite, end.x[: len(x)] - x, jnp.nan)
-    found = finite & positive & (iterations < MOST_LINEAR_ITERATIONS)
-    return new, (shown, jnp.where(finite, change, jnp.nan), found)
+    f, along = jax.linearize(lambda q: forces(e, q, one), q)
+    K = tangent.tangent(e, f.pressure, f.x, one)
+    load, tolerance = -flat(e.free.vectors(f.total)), _TOLERANCE[scene.mesh.order]
+    dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
+    whole = f.total + along(dq).total
+    reaction = whole - e.free.vectors(whole)
+    # Where du turns elements inside out, the richer run goes on from the positions of the other.
+    sound = jnp.all(volume_ratios(rich.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
+    end = forces(e, jnp.where(sound, q + dq, q), one)
+    found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
+    moved = positions(e, q + dq, one)[: len(x)] - x
+    return advanced(e, End(end.x, end.F, end.pressure)), (moved, _on_nodes(scene.mesh, reaction) - reactions, found)
 
 
 def padded(rich: TetMesh, x: jax.Array) -> jax.Array:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
@@ -39,21 +40,15 @@ class Levels(NamedTuple):
 
 def product(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
     """Forces, columns (V,), of a motion given by its columns (V,), at given pressures."""
-    moved = _edges(mesh, columns)
+    moved = stored(mesh.edges(columns))
     forces = [_force(A.blocks, k, moved) for k in (1, 2, 3)]
-    result = _spread(mesh, forces)
+    result = mesh.spread(forces)
     if A.own is None:
-        return result
+        return tuple(result)
     return tuple(
         f + sum(entry * c for entry, c in zip(row, columns, strict=True) if entry is not None)
         for f, row in zip(result, A.own, strict=True)
     )
-
-
-def _edges(mesh: TetMesh, columns: Sequence[jax.Array]) -> list[Vector]:
-    """Motion of the corners 1, 2, 3 of every point, relative to corner 0; written to memory."""
-    corners = [mesh.corners(column) for column in columns]
-    return stored([tuple(c[k] - c[0] for c in corners) for k in (1, 2, 3)])
 
 
 def _force(blocks: dict[tuple[int, int], Matrix], k: int, moved: list[Vector]) -> Vector:
@@ -61,19 +56,10 @@ def _force(blocks: dict[tuple[int, int], Matrix], k: int, moved: list[Vector]) -
     return tuple(sum(dot(row[r], d) for row, d in zip(rows, moved, strict=True)) for r in range(3))
 
 
-def _spread(mesh: TetMesh, forces: list[Vector]) -> tuple[jax.Array, ...]:
-    """Nodal columns (V,) of forces on the corners 1, 2, 3; those on corner 0 balance them."""
-    forces = stored(forces)
-    return tuple(
-        mesh.spread([-(forces[0][r] + forces[1][r] + forces[2][r]), forces[0][r], forces[1][r], forces[2][r]])
-        for r in range(3)
-    )
-
-
 def volume_changes(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> jax.Array:
     """Change (V,) [m^3] of the volumes that belong to the vertices, with a motion given by its columns (V,)."""
     assert A.border is not None
-    moved = _edges(mesh, columns)
+    moved = stored(mesh.edges(columns))
     return gathered(mesh, sum(dot(g, d) for g, d in zip(A.border, moved, strict=True)))
 
 
@@ -81,7 +67,7 @@ def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array
     """Forces, columns (V,), of pressures (V,) [Pa] of the vertices that push outwards: the transpose of the former."""
     assert A.border is not None
     p = interpolated(mesh, pressures)
-    return _spread(mesh, [tuple(p * g for g in border) for border in A.border])
+    return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
 
 
 def levels(mesh: TetMesh, A: PointMatrix, bulk: Any = None) -> Levels:
@@ -107,23 +93,21 @@ def levels(mesh: TetMesh, A: PointMatrix, bulk: Any = None) -> Levels:
 
 
 def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
-    """Blocks 3 x 3 of (V,): sum_q c_ak K_kl c_al of every node a of every element."""
-    K = stored(mjed.all_blocks(blocks))
-    c, dtype = basis(mesh.order).c, mesh.points.dtype
-    six = {}
-    for r in range(3):
-        for s in range(r, 3):
-            total = jnp.zeros(mesh.number_of_nodes, dtype)
-            for a, nodes in enumerate(mesh.element_nodes):
-                total = total.at[nodes].add(_of_node(c[a], K, r, s, dtype))
-            six[r, s] = total
+    """Blocks 3 x 3 of (V,): sum_q c_ak K_kl c_al of every node a of every element, over k, l = 1, 2, 3."""
+    c = basis(mesh.order).c
+    slopes = c[:, 1:] - c[:, :1]
+    weights = np.stack([slopes[:, a - 1] * slopes[:, b - 1] * (1 if a == b else 2) for a, b in sorted(blocks)], axis=1)
+    matrix = jnp.asarray(weights.reshape(len(c), -1), mesh.points.dtype)
+    entries = [(r, s) for r in range(3) for s in range(r, 3)]
+    # K_kl + K_lk of a pair, its symmetric part twice.
+    symmetric = [
+        jnp.stack([0.5 * (blocks[pair][r][s] + blocks[pair][s][r]) for r, s in entries], axis=1)
+        for pair in sorted(blocks)
+    ]
+    values = jnp.tensordot(matrix, jnp.concatenate(symmetric), axes=(1, 0))
+    nodes, zero = jnp.stack(mesh.element_nodes), jnp.zeros(mesh.number_of_nodes, mesh.points.dtype)
+    six = {entry: zero.at[nodes].add(values[:, k]) for k, entry in enumerate(entries)}
     return tuple(tuple(six[min(r, s), max(r, s)] for s in range(3)) for r in range(3))
-
-
-def _of_node(c: Any, K: list[list[Matrix]], r: int, s: int, dtype: Any) -> jax.Array:
-    near = [k for k in range(4) if c[k].any()]
-    terms = [(jnp.asarray(c[k] * c[l], dtype)[:, None] * K[k][l][r][s]).sum(axis=0) for k in near for l in near]
-    return sum(terms[1:], terms[0])
 
 
 def _on_vertices(mesh: TetMesh, own: Block) -> Block:
