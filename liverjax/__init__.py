@@ -23,7 +23,9 @@ from liverjax.core.struct import param, static, struct
 from liverjax.elements import mjed, reference
 from liverjax.laws import Law
 from liverjax.mesh import shapes
-from liverjax.mesh.tetrahedra import TetMesh, check_mesh, read_mesh, tet_mesh, write_mesh
+from liverjax.mesh.files import read_mesh, write_mesh
+from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.tetrahedra import TetMesh, check_mesh, tet_mesh
 from liverjax.physics import boundary, viscosity
 from liverjax.physics.boundary import Displaced, Fixed, Traction
 from liverjax.physics.porosity import Porosity
@@ -61,6 +63,7 @@ __all__ = [
     "load_scene",
     "mjed",
     "param",
+    "quadratic",
     "read_mesh",
     "reference",
     "shapes",

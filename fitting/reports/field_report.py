@@ -14,7 +14,8 @@ from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.status import NAMES
 from liverjax.core.versions import versions
-from liverjax.mesh.tetrahedra import TetMesh, write_mesh
+from liverjax.mesh.files import write_mesh
+from liverjax.mesh.tetrahedra import TetMesh
 
 
 def of_numbers(found: Estimate) -> dict[str, Any]:

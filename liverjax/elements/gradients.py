@@ -1,11 +1,34 @@
-"""How the volume of an element changes with its nodes."""
+"""How the volume of an element changes with its nodes, and where it is least."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.mesh.basis import functions
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.tensors.matrices import Matrix, Vector, cofactor, matvec
+from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_gradient, determinant, matvec
 
 
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
-    """cof(F) D_a = dJ/dx_a of the four nodes."""
+    """cof(F) D_a = dJ/dx_a of the four corners of every point."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.shape_vectors[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
+
+
+def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
+    """J of every element at positions x (V, 3) [m]: (1, E), or (Q + 4, E) at points and vertices of quadratic ones.
+
+    Between its points a quadratic element may be folded although they are not: the vertices show it first.
+    """
+    J = determinant(deformation_gradient(mesh, x))
+    if mesh.order == 1:
+        return J[None]
+    c, D = functions(mesh.order, np.eye(4))[1], mesh.shape_vectors
+    columns = [[x[:, i][n] for n in mesh.element_nodes] for i in range(3)]
+    corners = []
+    for column in columns:
+        y = [sum(c[a, k][:, None] * v for a, v in enumerate(column) if c[a, k].any()) for k in range(4)]
+        corners.append([y[k] - y[0] for k in (1, 2, 3)])
+    F = tuple(tuple(sum(y[a] * D[a, j] for a in range(3)) for j in range(3)) for y in corners)
+    return jnp.concatenate([J, determinant(F)])

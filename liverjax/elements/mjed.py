@@ -1,4 +1,4 @@
-"""MJED: force and stiffness of linear tetrahedra from hand-derived terms, all terms of the energy at once.
+"""MJED: force and stiffness of tetrahedra from hand-derived terms, all terms of the energy at once.
 
 Chapter, section 4.1.2, with J treated as one more invariant and the scalars summed before anything is assembled:
 
@@ -7,6 +7,9 @@ Chapter, section 4.1.2, with J treated as one more invariant and the scalars sum
 
 so the cost does not grow with the number of terms g^k h^k. No matrix is inverted. All functions take the force as the
 gradient of the energy, f = + dW/dx (the chapter's nodal force is its negative).
+
+A linear element has one point. At each point of a quadratic element the same terms hold, for the corners that
+`liverjax.mesh.basis` describes.
 """
 
 from functools import partial
@@ -21,6 +24,7 @@ from liverjax.core.errors import InputError
 from liverjax.laws.base import Law
 from liverjax.laws.terms import chapter_terms
 from liverjax.laws.terms.invariant_terms import blocks, first_piola, state
+from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.matrices import Matrix, deformation_gradient, dot, stored, transpose
 
@@ -30,22 +34,16 @@ _PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     """Total strain energy [J] at positions x (V, 3) [m]."""
-    return jnp.sum(mesh.volumes * law.strain_energy(law.measures(deformation_gradient(mesh, x))))
+    return jnp.sum(mesh.weights * law.strain_energy(law.measures(deformation_gradient(mesh, x))))
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
-    """Sum over elements of V0 P D_a at their nodes: (V, 3) [N] from first Piola-Kirchhoff stresses [Pa]."""
-    D, V0 = mesh.shape_vectors, mesh.volumes
-    forces = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
-    forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(3)], *forces]
-    columns = []
-    for i in range(3):
-        # Chained scatters: after a concatenate XLA:CPU recomputes the stress for every update (4 times slower).
-        column = jnp.zeros(mesh.points.shape[0], dtype=mesh.points.dtype)
-        for a in range(4):
-            column = column.at[mesh.tetrahedra[:, a]].add(forces[a][i])
-        columns.append(column)
-    return jnp.stack(columns, axis=-1)
+    """Sum over points of V0 P D_a at their nodes: (V, 3) [N] from first Piola-Kirchhoff stresses [Pa]."""
+    D, V0 = mesh.shape_vectors, mesh.weights
+    forces: Any = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
+    if mesh.order > 1:
+        forces = stored(forces)
+    return jnp.stack(mesh.spread(forces), axis=-1)
 
 
 @jax.jit
@@ -63,7 +61,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def element_stiffness(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:
-    """Blocks {(a, b): K_ab} [N/m] of nodes 1 <= a <= b <= 3 of every element, 45 different numbers each.
+    """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 of every point, 45 different numbers each.
 
     `terms` is "contracted", or "chapter" for its six terms a product (`liverjax.laws.terms.chapter_terms`).
     The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
@@ -77,7 +75,7 @@ def element_stiffness(
     else:
         per_volume = blocks(state(law, F), D, pairs, regularised)
     return {
-        pair: tuple(tuple(mesh.volumes * entry for entry in row) for row in K)
+        pair: tuple(tuple(mesh.weights * entry for entry in row) for row in K)
         for pair, K in zip(_PAIRS, per_volume, strict=True)
     }
 
@@ -121,17 +119,27 @@ _EXPANSION = _expansion()
 def element_matrices(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> jax.Array:
-    """Element stiffness matrices (E, 144) [N/m], degree of freedom 3 * local node + component."""
+    """Element stiffness matrices (E, 9 n^2) [N/m] of n nodes, degree of freedom 3 * local node + component."""
     K = element_stiffness(mesh, law, x, regularised, terms)
     entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
     # A product with a constant writes the other 99 entries: stacked one by one they triple the time to compile.
-    return jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
+    entries = jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
+    return entries if mesh.order == 1 else of_nodes(mesh.order, entries)
+
+
+def of_nodes(order: int, corners: jax.Array) -> jax.Array:
+    """Element matrices (E, 9 n^2) of n nodes, from those of the corners of every point (Q, E, 144)."""
+    Q, E = corners.shape[:2]
+    c = jnp.asarray(basis(order).c, corners.dtype)
+    K = jnp.einsum("akq,qekilj,blq->eaibj", c, corners.reshape(Q, E, 4, 3, 4, 3), c)
+    return K.reshape(E, -1)
 
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> scipy.sparse.csr_array:
-    """Global matrix (3V, 3V) of element matrices (E, 12, 12), degree of freedom 3 * node + component."""
-    dofs = (3 * np.asarray(mesh.tetrahedra)[:, :, None] + np.arange(3)).reshape(-1, 12)
-    rows, columns = np.repeat(dofs, 12, axis=1), np.tile(dofs, (1, 12))
+    """Global matrix (3V, 3V) of element matrices (E, 9 n^2) of n nodes, degree of freedom 3 * node + component."""
+    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
+    dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
+    rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))
     n = 3 * mesh.number_of_nodes
     return scipy.sparse.coo_array((np.ravel(entries), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
 

@@ -11,6 +11,7 @@ import scipy.sparse
 from liverjax.elements.mjed import sparse
 from liverjax.laws.autodiff import derivative, first_piola, tangent
 from liverjax.laws.base import Law
+from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
 __all__ = [
@@ -28,8 +29,8 @@ _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    """Total strain energy [J] at positions x (V, 3) [m], through (E, 3, 3) deformation gradients."""
-    return jnp.sum(mesh.volumes * law.energy(_gradient(mesh, x)))
+    """Total strain energy [J] at positions x (V, 3) [m], through (..., E, 3, 3) deformation gradients."""
+    return jnp.sum(mesh.weights * law.energy(_gradient(mesh, x)))
 
 
 @jax.jit
@@ -43,9 +44,9 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     D = _all_shape_vectors(mesh)
 
     def total(nodes):
-        return jnp.sum(mesh.volumes * law.energy(jnp.einsum("eai,eaj->eij", nodes, D)))
+        return jnp.sum(mesh.weights * law.energy(jnp.einsum("eai,...eaj->...eij", nodes, D)))
 
-    return derivative(jax.grad(total), x[mesh.tetrahedra])
+    return derivative(jax.grad(total), x[jnp.stack(mesh.element_nodes, axis=1)])
 
 
 def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
@@ -59,23 +60,26 @@ def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     F = _gradient(mesh, x)
     S = _second_piola(law, F)
     B = _strain_displacement(F, _all_shape_vectors(mesh))
-    element = jnp.einsum("e,evad,ev->ead", mesh.volumes, B, _voigt(S))
-    return jnp.zeros_like(x).at[mesh.tetrahedra].add(element)
+    share = jnp.einsum("...e,...evad,...ev->...ead", mesh.weights, B, _voigt(S))
+    element = share.reshape(-1, *share.shape[-3:]).sum(axis=0)
+    return jnp.zeros_like(x).at[jnp.stack(mesh.element_nodes, axis=1)].add(element)
 
 
 @jax.jit
 def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     F, D = _gradient(mesh, x), _all_shape_vectors(mesh)
-    C = jnp.einsum("eki,ekj->eij", F, F)
+    C = jnp.einsum("...ki,...kj->...ij", F, F)
     elasticity = 2 * derivative(lambda C: _second_piola_of(law, C), C)
     elasticity = 0.5 * (elasticity + jnp.swapaxes(elasticity, -1, -2))
     rows = jnp.asarray(_VOIGT).T
-    Dm = elasticity[:, rows[0], rows[1]][:, :, rows[0], rows[1]]
+    Dm = elasticity[..., rows[0], rows[1], :, :][..., rows[0], rows[1]]
     B = _strain_displacement(F, D)
     S = _second_piola(law, F)
-    geometric = jnp.einsum("eai,eij,ebj->eab", D, S, D)
-    material = jnp.einsum("evai,evw,ewbj->eaibj", B, Dm, B)
-    return mesh.volumes[:, None, None, None, None] * (material + jnp.einsum("eab,ij->eaibj", geometric, jnp.eye(3)))
+    geometric = jnp.einsum("...eai,...eij,...ebj->...eab", D, S, D)
+    material = jnp.einsum("...evai,...evw,...ewbj->...eaibj", B, Dm, B)
+    whole = material + jnp.einsum("...eab,ij->...eaibj", geometric, jnp.eye(3))
+    whole = mesh.weights[..., None, None, None, None] * whole
+    return whole.reshape(-1, *whole.shape[-5:]).sum(axis=0)
 
 
 def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
@@ -84,12 +88,15 @@ def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sp
 
 
 def _all_shape_vectors(mesh: TetMesh) -> jax.Array:
+    """Gradients (E, 4, 3) of linear functions, else (Q, E, n, 3)."""
     D = jnp.transpose(mesh.shape_vectors, (2, 0, 1))
-    return jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
+    D = jnp.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
+    return D if mesh.order == 1 else jnp.einsum("akq,ekj->qeaj", jnp.asarray(basis(mesh.order).c, D.dtype), D)
 
 
 def _gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    return jnp.einsum("eai,eaj->eij", x[mesh.tetrahedra], _all_shape_vectors(mesh))
+    nodes = x[jnp.stack(mesh.element_nodes, axis=1)]
+    return jnp.einsum("eai,...eaj->...eij", nodes, _all_shape_vectors(mesh))
 
 
 def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
@@ -98,7 +105,7 @@ def _energy_of_C(law: Law, C: jax.Array) -> jax.Array:
 
 
 def _second_piola(law: Law, F: jax.Array) -> jax.Array:
-    return _second_piola_of(law, jnp.einsum("eki,ekj->eij", F, F))
+    return _second_piola_of(law, jnp.einsum("...ki,...kj->...ij", F, F))
 
 
 def _second_piola_of(law: Law, C: jax.Array) -> jax.Array:
@@ -106,13 +113,13 @@ def _second_piola_of(law: Law, C: jax.Array) -> jax.Array:
 
 
 def _voigt(S: jax.Array) -> jax.Array:
-    return jnp.stack([S[:, i, j] for i, j in _VOIGT], axis=1)
+    return jnp.stack([S[..., i, j] for i, j in _VOIGT], axis=-1)
 
 
 def _strain_displacement(F: jax.Array, D: jax.Array) -> jax.Array:
-    """B (E, 6, 4, 3): variation of Green's strain (shears doubled) with the position of node a."""
+    """B (..., E, 6, n, 3): variation of Green's strain (shears doubled) with the position of node a."""
     rows = []
     for i, j in _VOIGT:
-        term = jnp.einsum("ek,ea->eak", F[:, :, i], D[:, :, j])
-        rows.append(term if i == j else term + jnp.einsum("ek,ea->eak", F[:, :, j], D[:, :, i]))
-    return jnp.stack(rows, axis=1)
+        term = jnp.einsum("...k,...a->...ak", F[..., :, i], D[..., :, j])
+        rows.append(term if i == j else term + jnp.einsum("...k,...a->...ak", F[..., :, j], D[..., :, i]))
+    return jnp.stack(rows, axis=-3)

@@ -9,13 +9,17 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.files import whole
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
+from liverjax.mesh.files import meshio_cells
 from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result
 
 
 def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, Any]) -> None:
-    """times, positions, reactions, reference, tetrahedra; status, iterations and `attributes` as attributes."""
+    """times, positions, reactions, reference, tetrahedra; status, iterations and `attributes` as attributes.
+
+    The nodes of quadratic tetrahedra (E, 10) stand in the order of VTK.
+    """
     import h5py
 
     with whole(file) as new, h5py.File(new, "w") as out:
@@ -28,7 +32,7 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
         out["times"].attrs["unit"] = "s" if scene.solve.dt is not None else "load step"
         out["reference"] = np.asarray(scene.mesh.points)
         out["reference"].attrs["unit"] = "m"
-        out["tetrahedra"] = np.asarray(scene.mesh.tetrahedra)
+        out["tetrahedra"] = meshio_cells(scene.mesh)[1]
         codes = np.asarray(result.status)
         out.attrs["status"] = codes
         out.attrs["advice"] = [status.advice(c) for c in sorted(set(codes.tolist()))]
@@ -43,7 +47,7 @@ def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
     import meshio
 
     folder.mkdir(parents=True, exist_ok=True)
-    reference, cells = np.asarray(scene.mesh.points), [("tetra", np.asarray(scene.mesh.tetrahedra))]
+    reference, cells = np.asarray(scene.mesh.points), [meshio_cells(scene.mesh)]
     entries = []
     for k, (time, x, f) in enumerate(
         zip(*map(np.asarray, (result.times, result.positions, result.reactions)), strict=True)

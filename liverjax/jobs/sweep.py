@@ -25,6 +25,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.versions import versions
 from liverjax.jobs import parts
+from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.scenes.scene_checks import check_numbers
 from liverjax.scenes.scene_file import load_scene
@@ -254,7 +255,9 @@ _HEADERS = 100_000
 
 def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
     mesh = sweep.scene.mesh
-    needed = sum(f.stat().st_size for f in files) + mesh.points.nbytes + mesh.tetrahedra.nbytes + sweep.rows.nbytes
+    needed = (
+        sum(f.stat().st_size for f in files) + mesh.points.nbytes + meshio_cells(mesh)[1].nbytes + sweep.rows.nbytes
+    )
     if shutil.disk_usage(out.parent).free < needed + _HEADERS:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     n = len(sweep.rows)
@@ -271,7 +274,7 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
         joined["reference"] = np.asarray(sweep.scene.mesh.points)
-        joined["tetrahedra"] = np.asarray(sweep.scene.mesh.tetrahedra)
+        joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]
         joined.attrs["sweep"] = json.dumps(sweep.identity)
         codes = joined["status"][:]
     return codes

@@ -1,27 +1,78 @@
-"""Sums at the nodes of what elements share, and means over the nodes of an element."""
-
-from typing import Any
+"""Integrals of fields over nodes, and values of nodal fields at the points of elements."""
 
 import jax
 import jax.numpy as jnp
 
+from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
 
 def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
-    """Sum (V,) at every node of what each of its elements gives to each of its nodes, `share` (E,)."""
-    total = jnp.zeros(mesh.points.shape[0], share.dtype)
+    """Sum (V,) at every vertex of what each of its elements gives to each of its vertices, `share` (E,)."""
+    total = jnp.zeros(mesh.number_of_vertices, share.dtype)
     for a in range(4):
         total = total.at[mesh.tetrahedra[:, a]].add(share)
     return total
 
 
+def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
+    """Integrals over the reference volume of a density times the linear function of every vertex: (V,).
+
+    Args:
+        density: one number a point of integration, (E,) of linear elements, else (Q, E); or (E,) for all of them.
+    """
+    if density.ndim == 1:
+        return to_nodes(mesh, mesh.volumes * density / 4)
+    return gathered(mesh, mesh.weights * density)
+
+
+def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
+    """The transpose of `interpolated`: sums (V,) at the vertices of what every point has, (Q, E)."""
+    if mesh.order == 1:
+        return to_nodes(mesh, shares / 4)
+    total, L = jnp.zeros(mesh.number_of_vertices, shares.dtype), jnp.asarray(basis(mesh.order).L, shares.dtype)
+    for a in range(4):
+        total = total.at[mesh.tetrahedra[:, a]].add(jnp.sum(L[a][:, None] * shares, axis=0))
+    return total
+
+
+def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
+    """Sums over the points of every element: (E,)."""
+    return values if mesh.order == 1 else jnp.sum(values, axis=0)
+
+
+def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
+    """Values of a field, linear in every element, at its points: (E,) or (Q, E) from those of the vertices (V,)."""
+    corner = [values[mesh.tetrahedra[:, a]] for a in range(4)]
+    if mesh.order == 1:
+        return (corner[0] + corner[1] + corner[2] + corner[3]) / 4
+    L = jnp.asarray(basis(mesh.order).L, values.dtype)
+    return sum(L[a][:, None] * corner[a] for a in range(1, 4)) + L[0][:, None] * corner[0]
+
+
+#: Parts of an element's volume at its vertices and at the middles of its edges: of a lumped mass (Hinton, Rock and
+#: Zienkiewicz 1976: positive, in proportion to the integrals of squares), and integrals of the functions themselves.
+_LUMPED = {1: (1 / 4,), 2: (1 / 36, 4 / 27)}
+_INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
+
+
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
-    """A quarter of every element at each of its nodes (V,) [m^3]: lumped mass over density."""
-    return to_nodes(mesh, mesh.volumes / 4)
+    """Lumped mass over density (V,) [m^3]: a quarter of every linear element at each of its nodes."""
+    return _parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
-def element_mean(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Mean (E,) of nodal values (V,) over the nodes of every element."""
-    corners: Any = sum(values[mesh.tetrahedra[:, a]] for a in range(4))
-    return corners / 4
+def load_volumes(mesh: TetMesh) -> jax.Array:
+    """Integrals of the shape functions (V,) [m^3]: the nodal forces of a uniform weight of 1 N/m^3."""
+    total = _parts(mesh, _INTEGRALS[mesh.order])
+    if mesh.order < 3:
+        return total
+    for nodes in mesh.element_nodes[-4:]:
+        total = total.at[nodes].add(9 / 40 * mesh.volumes)
+    return total
+
+
+def _parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
+    total = jnp.zeros(mesh.number_of_nodes, mesh.volumes.dtype)
+    for a, nodes in enumerate(mesh.element_nodes[: 4 if mesh.order == 1 else 10]):
+        total = total.at[nodes].add(mesh.volumes * parts[a >= 4])
+    return total

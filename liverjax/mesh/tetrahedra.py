@@ -1,12 +1,10 @@
-"""Meshes of linear tetrahedra: positions, constant shape vectors, node sets; read and written by meshio."""
+"""Meshes of straight tetrahedra: positions, constant shape vectors, node sets.
 
-import contextlib
+An element has 4 nodes, or 10: vertices and the middles of its edges (`liverjax.mesh.promotion`).
+"""
+
 import dataclasses
-import io
-import os
-import re
-import warnings
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -14,36 +12,112 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
-from liverjax.mesh.adjacency import Pattern, pattern
+from liverjax.core.struct import param, static, struct
+from liverjax.mesh.adjacency import PAIRS, Pattern, pattern
+from liverjax.mesh.basis import basis
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 
 @struct
 class TetMesh:
-    """Linear tetrahedra with their reference geometry; a pytree whose arrays are leaves.
+    """Straight tetrahedra with their reference geometry; a pytree whose arrays are leaves.
 
-    Made by `tet_mesh`; `shape_vectors` and `volumes` follow from points and tetrahedra, also under `jax.grad`.
+    Made by `tet_mesh`; `shape_vectors` and `volumes` follow from points and tetrahedra, also under `jax.grad`. With
+    `order` 2 the nodes are the vertices and then the middles of the edges, in the order of `pattern.edges`.
     """
 
     points: jax.Array = param("m", "reference positions (V, 3)")
-    tetrahedra: jax.Array = param("1", "node numbers (E, 4), positively oriented")
+    tetrahedra: jax.Array = param("1", "vertices of every element (E, 4), positively oriented")
     shape_vectors: jax.Array = param("1/m", "D_a = grad N_a of nodes a = 1, 2, 3, shape (3, 3, E); D_0 = -(sum)")
     volumes: jax.Array = param("m^3", "reference volumes (E,)")
     node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
-    pattern: Pattern = param("1", "which nodes share an element")
+    pattern: Pattern = param("1", "which vertices share an element")
+    faces: Any = param("1", "number of each of an element's faces (4, E), of order 3", default=None)
+    order: int = static(default=1, about="of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property
     def number_of_nodes(self) -> int:
-        """V."""
+        """V, vertices and middles of edges."""
         return self.points.shape[0]
+
+    @property
+    def number_of_vertices(self) -> int:
+        """Corners of elements: the first nodes."""
+        return self.pattern.row_nodes.shape[1]
 
     @property
     def number_of_elements(self) -> int:
         """E."""
         return self.tetrahedra.shape[0]
+
+    @property
+    def weights(self) -> jax.Array:
+        """Reference volume [m^3] of every point of integration: (E,) of linear elements, else (Q, E)."""
+        if self.order == 1:
+            return self.volumes
+        return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
+
+    @property
+    def element_nodes(self) -> list[jax.Array]:
+        """Numbers (E,) of the nodes of every element: 4, or 10 with the middles of `liverjax.mesh.adjacency.PAIRS`."""
+        vertices = [self.tetrahedra[:, a] for a in range(4)]
+        if self.order == 1:
+            return vertices
+        V, N = self.number_of_vertices, self.pattern.edges.shape[1]
+        middles = [V + edge for edge in self.pattern.element_edges]
+        if self.order == 2:
+            return vertices + middles
+        return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in self.faces]
+
+    def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
+        """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array a column, (E,) or (Q, E).
+
+        y_k are the corners of `liverjax.mesh.basis`; with shape vectors D_k the field's gradient is the sum of
+        (y_k - y_0) D_k.
+        """
+        if self.order == 1:
+            values = [[column[n] for column in columns] for n in self.element_nodes]
+            return [tuple(a - b for a, b in zip(corner, values[0], strict=True)) for corner in values[1:]]
+        nodes = jnp.stack(self.element_nodes)
+        values = self._oriented(jnp.stack([column[nodes] for column in columns], axis=1))
+        y = jnp.tensordot(self._slopes(), values, axes=(1, 0)).reshape(3, -1, *values.shape[1:])
+        return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
+
+    def spread(self, forces: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
+        """The transpose of `edges`: nodal columns (V,) from what acts on the corners 1, 2, 3, balanced at corner 0."""
+        count = len(forces[0])
+        if self.order == 1:
+            forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(count)], *forces]
+            shares = [[force[i] for force in forces] for i in range(count)]
+        else:
+            whole = jnp.stack([jnp.stack(force, axis=1) for force in forces])
+            values = jnp.tensordot(self._slopes().T, whole.reshape(-1, *whole.shape[2:]), axes=(1, 0))
+            values = self._oriented(values)
+            shares = [[values[:, i]] for i in range(count)]
+        nodes = self.element_nodes if self.order == 1 else [jnp.stack(self.element_nodes)]
+        columns = []
+        for own in shares:
+            # Chained scatters: after a concatenate XLA:CPU recomputes the shares for every update (4 times slower).
+            total = jnp.zeros(self.number_of_nodes, own[0].dtype)
+            for where, share in zip(nodes, own, strict=True):
+                total = total.at[where].add(share)
+            columns.append(total)
+        return columns
+
+    def _slopes(self) -> jax.Array:
+        """c_ak - c_a0 as the matrix (3 Q, n) of `edges`: a product with it keeps the program small."""
+        c = basis(self.order).c
+        return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
+
+    def _oriented(self, values: jax.Array) -> jax.Array:
+        """Functions of order 3 on edges, among values (n, C, E), point to the higher vertex: they change their sign."""
+        if self.order < 3:
+            return values
+        t, first = self.tetrahedra, 4 + len(PAIRS)
+        signs = jnp.stack([jnp.where(t[:, i] < t[:, j], 1.0, -1.0) for i, j in PAIRS]).astype(values.dtype)
+        return values.at[first : first + len(PAIRS)].multiply(signs[:, None])
 
 
 def tet_mesh(
@@ -78,10 +152,16 @@ def tet_mesh(
 
 
 def with_points(mesh: TetMesh, points: Any) -> TetMesh:
-    """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with."""
+    """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with.
+
+    Edges stay straight: where the mesh is quadratic the positions of their middles follow from those of the vertices.
+    """
     points = jnp.array(points, mesh.points.dtype)
     if points.shape != mesh.points.shape:
         raise InputError(f"mesh.points has shape {points.shape}: give positions of shape {mesh.points.shape}")
+    if mesh.order > 1:
+        vertices, (low, high) = points[: mesh.number_of_vertices], mesh.pattern.edges
+        points = jnp.concatenate([vertices, 0.5 * (vertices[low] + vertices[high])])
     shape_vectors, volumes = _geometry(points, mesh.tetrahedra)
     return dataclasses.replace(mesh, points=points, shape_vectors=shape_vectors, volumes=volumes)
 
@@ -126,151 +206,6 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
             f"{name}: {int((copies - 1).sum())} tetrahedra stand there twice (first: {again}, nodes "
             f"{tets[again].tolist()}); remove the copies"
         )
-    unused = np.setdiff1d(np.arange(len(points)), tets)
+    unused = np.setdiff1d(np.arange(mesh.number_of_vertices), tets)
     if len(unused):
         raise InputError(f"{name}: {len(unused)} nodes belong to no tetrahedron (first: {unused[0]}); remove them")
-
-
-def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
-    """Read any file meshio reads that holds linear tetrahedra; sets of nodes and elements come along.
-
-    Args:
-        path: mesh file.
-        unit: length unit of the file, one of `UNITS`.
-
-    Raises:
-        InputError: unreadable file, no or other-than-linear cells, unit unknown, unusable mesh.
-    """
-    if unit not in UNITS:
-        raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"mesh file {path}: {'is a folder' if path.is_dir() else 'no such file'}; give a mesh file")
-    data = _read_quietly(path)
-    blocks = [block.data for block in data.cells if block.type == "tetra"]
-    if not blocks:
-        kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
-        raise InputError(f"mesh file {path}: it holds {kinds} but no linear tetrahedra; export 4-node tetrahedra")
-    others = sorted({b.type for b in data.cells if b.type != "tetra" and not b.type.startswith(_FLAT_CELLS)})
-    if others:
-        raise InputError(
-            f"mesh file {path}: it holds {', '.join(others)} beside linear tetrahedra; remesh all of the body with "
-            "4-node tetrahedra"
-        )
-    points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(blocks)
-    if points.shape[1] != 3:
-        raise InputError(f"mesh file {path}: its points have {points.shape[1]} coordinates; give three")
-    if tets.min(initial=0) < 0 or tets.max(initial=0) >= len(points):
-        raise InputError(
-            f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
-        )
-    mesh = tet_mesh(points, tets, _node_sets(data), _element_sets(data))
-    check_mesh(mesh, f"mesh file {path}")
-    size = float(np.ptp(points, axis=0).max())
-    if size > _LARGE and unit == "m":
-        warnings.warn(
-            f"mesh file {path} is {size:.4g} m long: if its numbers are millimetres write unit = 'mm'", stacklevel=2
-        )
-    return mesh
-
-
-#: What the beginning of a file says that meshio does not read -> what it is, and the remedy.
-_FOREIGN = {
-    r"\$NOD\b": "it is in Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
-    r"DATASET\s+POLYDATA|type=.PolyData": "it holds VTK polygons, a surface; fill the surface with tetrahedra "
-    "(Gmsh, TetGen) and export an unstructured grid",
-}
-
-
-def _read_quietly(path: Path) -> Any:
-    """What meshio reads, without what meshio prints: one sentence of ours says what was found."""
-    import meshio
-
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(1000).decode("latin-1")
-    except OSError as error:
-        raise InputError(f"mesh file {path} cannot be read ({error.strerror}); give a mesh file") from None
-    for mark, sentence in _FOREIGN.items():
-        if re.search(mark, beginning):
-            raise InputError(f"mesh file {path}: {sentence}")
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
-            return meshio.read(path)
-    except SystemExit:  # meshio's way to say that no reader took the file; their reasons are printed
-        reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
-    except Exception as error:  # meshio's readers raise whatever their parser meets
-        reason = " ".join(str(error).split()) or type(error).__name__
-    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh")
-
-
-#: Cells of surfaces and edges, which a volume mesh may carry beside its own.
-_FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
-#: A body longer than this [m] is likelier a mesh in millimetres.
-_LARGE = 10.0
-
-
-def _node_sets(data: Any) -> dict[str, np.ndarray]:
-    """meshio's point sets, and integer point data named ``set:NAME`` (how `write_mesh` keeps them in VTU)."""
-    sets = {name: np.asarray(nodes, dtype=np.int32) for name, nodes in (data.point_sets or {}).items()}
-    for name, values in data.point_data.items():
-        if name.startswith("set:"):
-            sets[name.removeprefix("set:")] = np.flatnonzero(values).astype(np.int32)
-    return sets
-
-
-#: A cell array of whole numbers with more of them than this numbers the cells, it does not group them.
-_MOST_GROUPS = 100
-
-
-def _element_sets(data: Any) -> dict[str, np.ndarray]:
-    """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups of whole numbers.
-
-    A group is called as the file does (Gmsh's physical names), or after array and number, ``medit:ref=2``.
-    """
-    kinds = [block.type for block in data.cells]
-    first = np.cumsum([0, *(len(block.data) if block.type == "tetra" else 0 for block in data.cells)])
-    sets = {}
-    for name, parts in (data.cell_sets or {}).items():
-        picks = [
-            first[k] + np.asarray(part, int)
-            for k, part in enumerate(parts)
-            if part is not None and kinds[k] == "tetra" and not name.startswith("gmsh:bounding")
-        ]
-        if picks and sum(map(len, picks)):
-            sets[name] = np.concatenate(picks)
-    names = {(int(tag[0]), "gmsh:physical"): name for name, tag in data.field_data.items() if tag[-1] == 3}
-    for name, parts in data.cell_data.items():
-        values = np.concatenate([np.asarray(p) for p, kind in zip(parts, kinds, strict=True) if kind == "tetra"])
-        if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
-            continue
-        if name.startswith("set:"):
-            sets[name.removeprefix("set:")] = np.flatnonzero(values)
-            continue
-        groups = np.unique(values)
-        for group in groups if len(groups) <= _MOST_GROUPS else ():
-            sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
-    return sets
-
-
-def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any] | None = None) -> None:
-    """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that carry data."""
-    import meshio
-
-    data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
-    for name, nodes in mesh.node_sets.items():
-        mask = np.zeros(mesh.number_of_nodes, dtype=np.int32)
-        mask[np.asarray(nodes)] = 1
-        data[f"set:{name}"] = mask
-    cell_data = {}
-    for name, elements in mesh.element_sets.items():
-        mask = np.zeros(mesh.number_of_elements, dtype=np.int32)
-        mask[np.asarray(elements)] = 1
-        cell_data[f"set:{name}"] = [mask]
-    cells = [("tetra", np.asarray(mesh.tetrahedra))]
-    # meshio takes .msh for an ANSYS file; in this field it is Gmsh's.
-    file_format = "gmsh" if Path(path).suffix == ".msh" else None
-    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
-        path, file_format=file_format
-    )

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from liverjax.core.struct import param, struct
 from liverjax.laws.base import Law, Sum, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
-from liverjax.mesh.nodal import element_mean, nodal_volumes, to_nodes
+from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Physics, Step, VolumeStress
 from liverjax.solvers.block_matrix import BlockMatrix
@@ -22,8 +22,8 @@ from liverjax.tensors.matrices import Invariants, Matrix, cofactor, scale_matrix
 
 
 def _mean(mesh: TetMesh, J: jax.Array) -> tuple[jax.Array, jax.Array]:
-    volumes = nodal_volumes(mesh)
-    return to_nodes(mesh, mesh.volumes * J / 4) / volumes, volumes
+    volumes = integrals(mesh, jnp.ones_like(mesh.volumes))
+    return integrals(mesh, J) / volumes, volumes
 
 
 def _invariants(law: Law, J: jax.Array) -> Any:
@@ -75,12 +75,12 @@ class Averaged(VolumeStress):
         return pressure(mesh, self.law, J)
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
-        """p cof F, p the mean over an element's nodes."""
-        return scale_matrix(element_mean(mesh, pressure), cofactor(F))
+        """p cof F, p linear in every element."""
+        return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """The pressure of an element, which has no slope where those of the nodes are given."""
-        p = element_mean(mesh, pressure)
+        p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:

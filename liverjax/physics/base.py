@@ -81,7 +81,7 @@ class End(NamedTuple):
     """Where an accepted step ended."""
 
     x: jax.Array  # (V, 3) [m]
-    F: Matrix  # deformation gradients (E,)
+    F: Matrix  # deformation gradients (E,), or (Q, E) where elements have Q points
     pressure: Any  # (V,) [Pa] of the nodes, or None
 
 
@@ -207,12 +207,16 @@ class Physics:
         """Node numbers (n,) and directions (n, 3) along which the body is held against rigid motion."""
         return np.zeros(0, int), np.zeros((0, 3))
 
+    def enriched(self, more: Callable[[Any], Any]) -> "Physics":
+        """The same on richer elements: `more` adds to node numbers (n,) those of the nodes between them."""
+        return self
+
     def bulk_modulus(self) -> Any:
         """Bulk modulus [Pa] that acts in place of the law's; None: the law's acts."""
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """What the result shows of it beside positions and reactions."""
+        """What the result shows of it beside positions and reactions: fields of the vertices (V,)."""
         return {}
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.nodal import to_nodes
+from liverjax.mesh.nodal import integrals, summed
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers import block_matrix, preconditioner
 from liverjax.solvers.krylov import chebyshev, differentiable_solve
@@ -37,16 +37,17 @@ class Flow(NamedTuple):
 
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, tolerance: Any) -> Flow:
     """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
-    mask = jnp.ones(mesh.points.shape[0], J.dtype)
+    mask = jnp.ones(mesh.number_of_vertices, J.dtype)
     if porosity.drained is not None:
-        mask = mask.at[porosity.drained].set(0.0)
+        # Pressures belong to vertices: the middles of edges among the nodes are left out.
+        mask = mask.at[porosity.drained].set(0.0, mode="drop")
     # Everything times dt: the storage term stays of the size of a volume whatever the step.
     J = jnp.maximum(J, _LEAST_J)
-    store = to_nodes(mesh, mesh.volumes * J / 4) / porosity.limit_bulk
+    store = integrals(mesh, J) / porosity.limit_bulk
     g = volume_gradients(mesh, F)
     # grad N_a = cof(F) D_a / J per current volume J V0.
-    weight = dt * porosity.permeability * mesh.volumes / J
-    rows = block_matrix.off_diagonal(mesh, {(a, b): ((weight * dot(g[a], g[b]),),) for a, b in PAIRS})
+    weight = dt * porosity.permeability * mesh.weights / J
+    rows = block_matrix.off_diagonal(mesh, {(a, b): ((summed(mesh, weight * dot(g[a], g[b])),),) for a, b in PAIRS})
     diagonal = ((store - block_matrix.row_sums(rows)[0][0],),)
     A = block_matrix.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)
     A0, total, rate = jax.lax.stop_gradient((A, jnp.sum(diagonal[0][0]), dt * porosity.permeability))

@@ -1,7 +1,8 @@
 """An elastic support: springs between the body and a wall that does not move, on nodes or on a part of the surface.
 
 Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
-(a Winkler foundation). They begin without tension. A third of every triangle counts at each of its nodes.
+(a Winkler foundation). They begin without tension. A third of every triangle counts at each of its nodes; of quadratic
+elements, at the middles of its edges.
 """
 
 from typing import Any, ClassVar
@@ -12,7 +13,7 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
-from liverjax.mesh import selection
+from liverjax.mesh import selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.solvers.block_matrix import Block
@@ -74,17 +75,16 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
     if support.triangles is None:
         own = zero.at[support.nodes].add(support.stiffness)
         return tuple(tuple(own if r == c else zero for c in range(3)) for r in range(3))
-    corner = mesh.points[support.triangles]
-    twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    double = jnp.sqrt(jnp.sum(twice * twice, axis=1))
-    n, third = twice / double[:, None], double / 6
+    normal = surface.areas(mesh.points, support.triangles)
+    area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
+    n = normal / area[:, None]
 
     def entry(r: int, c: int) -> jax.Array:
         along = support.tangential if r == c else 0.0
-        share = third * ((support.normal - support.tangential) * n[:, r] * n[:, c] + along)
+        whole = area * ((support.normal - support.tangential) * n[:, r] * n[:, c] + along)
         total = zero
-        for a in range(3):
-            total = total.at[support.triangles[:, a]].add(share)
+        for nodes, part in surface.shares(mesh, support.triangles):
+            total = total.at[nodes].add(part * whole)
         return total
 
     upper = {(r, c): entry(r, c) for r in range(3) for c in range(r, 3)}

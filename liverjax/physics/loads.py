@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import param, static, struct
-from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh import surface
+from liverjax.mesh.nodal import load_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 
@@ -21,17 +22,16 @@ class Traction:
 
 
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
-    """Dead nodal forces (V, 3) [N]: a third of reference area times traction at each corner."""
+    """Dead nodal forces (V, 3) [N]: the nodes' shares of reference area times traction."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for load in tractions:
         if load.value is None:
             continue
-        corner = mesh.points[load.triangles]
-        normal = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        area = 0.5 * jnp.sqrt(jnp.sum(normal * normal, axis=1))
-        share = (area / 3)[:, None] * jnp.asarray(load.value, force.dtype)[None]
-        for a in range(3):
-            force = force.at[load.triangles[:, a]].add(share)
+        normal = surface.areas(mesh.points, load.triangles[:, :3])
+        area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
+        whole = area[:, None] * jnp.asarray(load.value, force.dtype)[None]
+        for nodes, part in surface.shares(mesh, load.triangles):
+            force = force.at[nodes].add(part * whole)
     return force
 
 
@@ -40,16 +40,12 @@ def follows(tractions: tuple) -> bool:
     return any(load.pressure is not None for load in tractions)
 
 
-def follower_forces(tractions: tuple, x: jax.Array) -> jax.Array:
-    """Nodal forces (V, 3) [N] of the pressures at positions x (V, 3) [m]: a third of -p n da at each corner."""
+def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
+    """Nodal forces (V, 3) [N] of the pressures at positions x (V, 3) [m] of a mesh, linear by default: of -p n da."""
     force = jnp.zeros_like(x)
     for load in tractions:
-        if load.pressure is None:
-            continue
-        corner = x[load.triangles]
-        twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        for a in range(3):
-            force = force.at[load.triangles[:, a]].add(-load.pressure / 6 * twice)
+        if load.pressure is not None:
+            force = force + load.pressure * surface.pressure_forces(load.triangles, x, mesh)
     return force
 
 
@@ -57,7 +53,8 @@ def dead_loads(mesh: TetMesh, density: Any, gravity: Any, tractions: tuple) -> j
     """Nodal forces (V, 3) [N] that do not follow the body: weight (none where `density` is None) and tractions."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
-        mass = density * nodal_volumes(mesh)
+        # A node's own density weighs its share of a linear element; of a quadratic one that share may be negative.
+        mass = density * load_volumes(mesh)
         force = force + mass[:, None] * jnp.asarray(gravity, force.dtype)[None]
     return force + nodal_tractions(mesh, tractions) if tractions else force
 
@@ -103,7 +100,7 @@ class Loading(NodalForce):
         """Minus the loads."""
         outer = self.fraction(s) * self.dead
         if follows(self.traction):
-            outer = outer + self.fraction(s) * follower_forces(self.traction, x)
+            outer = outer + self.fraction(s) * follower_forces(self.traction, x, mesh)
         return -outer
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
@@ -112,4 +109,4 @@ class Loading(NodalForce):
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
         """Of the pressures alone: dead loads do not change."""
-        return -jax.jvp(lambda x: self.fraction(s) * follower_forces(self.traction, x), (x,), (dx,))[1]
+        return -jax.jvp(lambda x: self.fraction(s) * follower_forces(self.traction, x, mesh), (x,), (dx,))[1]

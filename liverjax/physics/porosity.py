@@ -22,7 +22,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law, isochoric_part
 from liverjax.laws.terms.invariant_terms import Scalars
-from liverjax.mesh.nodal import element_mean, to_nodes
+from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import darcy
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
@@ -78,8 +78,8 @@ class Porosity(Physics):
 class Fluid(NamedTuple):
     """What a step hands to the next."""
 
-    pressure: jax.Array  # P (V,) [Pa]
-    J: jax.Array  # (E,)
+    pressure: jax.Array  # P of the vertices (V,) [Pa]
+    J: jax.Array  # at every point
     J_before: jax.Array | None  # of the step before; the lagged scheme
 
 
@@ -141,27 +141,27 @@ def volumetric_energy(porosity: Porosity, J: Any) -> Any:
 
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     """No pressure, reference volumes."""
-    J = jnp.ones_like(mesh.volumes)
-    return Fluid(jnp.zeros(mesh.points.shape[0], J.dtype), J, J if porosity.scheme == "lagged" else None)
+    J = jnp.ones_like(mesh.weights)
+    return Fluid(jnp.zeros(mesh.number_of_vertices, J.dtype), J, J if porosity.scheme == "lagged" else None)
 
 
 def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
     """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
-    rate = -to_nodes(mesh, mesh.volumes * increment / 4)
+    rate = -integrals(mesh, increment)
     return darcy.solved(mesh, flow, flow.mask * (flow.store * fluid.pressure + rate))
 
 
 def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
     """b . P / 2 [J] with P = A^-1 b the pressure at the end of a step that ends with volumes J_end (E,)."""
-    b = flow.store * fluid.pressure - to_nodes(mesh, mesh.volumes * (J_end - fluid.J) / 4)
+    b = flow.store * fluid.pressure - integrals(mesh, J_end - fluid.J)
     return 0.5 * jnp.vdot(flow.mask * b, pressure(porosity, mesh, fluid, flow, J_end))
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:
-    """(sigma_Heq(J) - P) cof F [Pa], P the mean over an element's nodes."""
-    sigma = volumetric_stress(porosity, determinant(F)) - element_mean(mesh, P)
+    """(sigma_Heq(J) - P) cof F [Pa], P linear in every element."""
+    sigma = volumetric_stress(porosity, determinant(F)) - interpolated(mesh, P)
     return tuple(tuple(sigma * c for c in row) for row in cofactor(F))
 
 
@@ -178,7 +178,7 @@ class Sponge(VolumeStress):
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """sigma_Heq(J) - P and its slope at given pressure."""
         J = determinant(F)
-        stress = volumetric_stress(self.porosity, J) - element_mean(mesh, pressure)
+        stress = volumetric_stress(self.porosity, J) - interpolated(mesh, pressure)
         return Scalars({"J": stress}, {("J", "J"): volumetric_slope(self.porosity, J)})
 
 
@@ -201,7 +201,7 @@ class CoupledSponge(Sponge):
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """Of the sponge and of the fluid that leaves it."""
         density = volumetric_energy(self.porosity, J)
-        return jnp.sum(mesh.volumes * density) + fluid_energy(self.porosity, mesh, self.fluid, self.flow, J)
+        return jnp.sum(mesh.weights * density) + fluid_energy(self.porosity, mesh, self.fluid, self.flow, J)
 
 
 @struct
@@ -220,4 +220,4 @@ class LaggedSponge(Sponge):
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """Of the sponge, and the work of the fluid's pressure."""
         density = volumetric_energy(self.porosity, J)
-        return jnp.sum(mesh.volumes * (density - element_mean(mesh, self.given) * J))
+        return jnp.sum(mesh.weights * (density - interpolated(mesh, self.given) * J))

@@ -1,12 +1,13 @@
 """A sliding support: nodes of a plane part of the body that stay in that plane, and move in it without friction."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import param, replace, static, struct
 from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
@@ -55,6 +56,10 @@ class SlidingSupport(Physics):
         # A node that is held along all axes of the normal has no direction left to take away.
         loose = jnp.max(free.mask[self.nodes] * (jnp.abs(normal) > 1e-12), axis=1, keepdims=True)
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
+
+    def enriched(self, more: Callable[[Any], Any]) -> "SlidingSupport":
+        """With the nodes in between."""
+        return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Along the normal."""

@@ -55,7 +55,7 @@ class Prony:
 
 
 class History(NamedTuple):
-    """Memory of every element at the end of a step."""
+    """Memory of every element at the end of a step; (…, Q, E) where elements have Q points."""
 
     gamma: jax.Array  # (N, 6, E) [Pa]
     stress: jax.Array | None  # S^n (6, E) [Pa]; backward Euler does not need it
@@ -132,11 +132,11 @@ def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array
     return (a + c * back) / (1 - b * back)
 
 
-def initial_history(prony: Prony, number_of_elements: int, dtype: Any = float) -> History:
-    """Memory of a body at rest: zero."""
-    modes = jnp.asarray(prony.ratios).shape[0]
-    gamma = jnp.zeros((modes, 6, number_of_elements), dtype)
-    return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, number_of_elements), dtype))
+def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: Any = float) -> History:
+    """Memory of a body at rest, zero: of E points, or of the shape (Q, E)."""
+    shape = (points,) if isinstance(points, int) else points
+    gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
+    return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))
 
 
 def recall(prony: Prony, history: History, dt: Any) -> Recall:
@@ -152,7 +152,7 @@ def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> His
     """Memory at the end of an accepted step with deformation gradient F."""
     a, b, c = coefficients(prony, dt)
     S = relaxing_stress(prony, law, F)
-    columns = (slice(None), None, None)
+    columns = (slice(None), *(None,) * S.ndim)
     gamma = a[columns] * S[None] + b[columns] * history.gamma
     if history.stress is None:
         return History(gamma, None)
@@ -211,7 +211,7 @@ class Viscoelasticity(Physics):
 
     def begin(self, start: Start) -> History:
         """At rest."""
-        return initial_history(self.prony, start.mesh.number_of_elements, start.x.dtype)
+        return initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
 
     def freeze(self, memory: History, step: Step) -> "Viscoelastic":
         """The law beside what is remembered."""

@@ -15,7 +15,9 @@ from liverjax.core.errors import InputError
 from liverjax.core.names import hint
 from liverjax.laws import Law
 from liverjax.mesh import shapes
-from liverjax.mesh.tetrahedra import UNITS, TetMesh, read_mesh
+from liverjax.mesh.files import read_mesh
+from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.physics import boundary
 from liverjax.physics.base import Physics
 from liverjax.physics.boundary import Displaced, Fixed, Traction
@@ -28,7 +30,7 @@ from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.scene_checks import CHOICES, check_scene
 
 _KEYS = {
-    "mesh": ("file", "unit", "shape", "size", "cells", "radius", "height", "cell_size"),
+    "mesh": ("file", "unit", "shape", "size", "cells", "radius", "height", "cell_size", "order"),
     "region": ("where", "set", "law"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
     "porosity": ("bulk", "limit_bulk", "fluid_fraction", "permeability", "drained", "scheme", "keep_bulk"),
@@ -140,6 +142,15 @@ def _numbers(name: str, value: Any, length: int | None = None) -> np.ndarray:
 
 
 def _mesh(table: dict, folder: Path) -> TetMesh:
+    mesh, order = _linear_mesh(table, folder), table.get("order")
+    if order not in (None, 1, 2) or isinstance(order, bool):
+        raise InputError(f"[mesh] order = {order!r} is not known: use 1 (linear) or 2 (quadratic tetrahedra)")
+    if order == 1 and mesh.order == 2:
+        raise InputError("[mesh] order = 1, but the file holds quadratic tetrahedra: leave order out, or export linear")
+    return quadratic(mesh) if order == 2 else mesh
+
+
+def _linear_mesh(table: dict, folder: Path) -> TetMesh:
     unit = table.get("unit", "m")
     if unit not in UNITS:
         raise InputError(f"[mesh] unit = {unit!r} is not known: use one of {', '.join(UNITS)}")

@@ -1,7 +1,9 @@
 """Cautions about a run that converged: one sentence each, on the host."""
 
+import jax.numpy as jnp
 import numpy as np
 
+from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.automatic import qualities
@@ -61,11 +63,10 @@ def _of_volumes(scene: Scene, result: Result) -> list[str]:
 
 def _extreme(mesh: TetMesh, positions: np.ndarray, beyond: np.ufunc) -> tuple[np.ndarray, np.ndarray]:
     """J (E,) of every element at the step where it is least or greatest, and these steps (E,), from 0."""
-    tets, six_volumes = np.asarray(mesh.tetrahedra), 6 * np.asarray(mesh.volumes)
-    J, step = np.ones(len(tets)), np.zeros(len(tets), int)
+    J, step = np.ones(mesh.number_of_elements), np.zeros(mesh.number_of_elements, int)
     for k, x in enumerate(positions):
-        corner = x[tets].astype(float)
-        now = np.linalg.det(corner[:, 1:] - corner[:, :1]) / six_volumes
+        now = np.asarray(volume_ratios(mesh, jnp.asarray(x)))
+        now = now.min(axis=0) if beyond is np.less else now.max(axis=0)
         further = beyond(now, J)
         J, step = np.where(further, now, J), np.where(further, k, step)
     return J, step

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.elements import mjed
+from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, NodalForce, Physics, Solid, Start, Step, VolumeStress
 from liverjax.physics.prescribed import free_degrees, prescribed
@@ -183,7 +184,7 @@ def energy(e: Equations, q: jax.Array) -> jax.Array:
     """The energy [J] that a step minimises: the sum of incremental potentials. Its gradient is the residual."""
     x = positions(e, q, 1.0)
     F = deformation_gradient(e.mesh, x)
-    total = jnp.sum(e.mesh.volumes * sum(solid.energy(F) for solid in e.solids))
+    total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
         total = total + e.volume.energy(e.mesh, determinant(F))
     return sum((a.energy(e.mesh, x) for a in e.nodal), total)
@@ -199,5 +200,5 @@ def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
     """Results of the physics at a state, beside positions and reactions."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
-        shown |= physics.output(memory)
+        shown |= {name: on_middles(scene.mesh, field) for name, field in physics.output(memory).items()}
     return shown

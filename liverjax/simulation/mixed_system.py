@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.elements.gradients import volume_gradients
+from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import darcy
 from liverjax.physics.darcy import Flow
-from liverjax.solvers import block_matrix
+from liverjax.solvers import block_matrix, point_matrix
+from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.matrices import Matrix, scale
 
 
@@ -53,17 +55,39 @@ def eliminated(
     `exactly` is set, to its tolerance.
     """
     *forces, balance = both
-    if flow is None:
-        dP = -balance / A.diagonal[3][3]
-    else:
-        dP = (
-            flow.mask * darcy.solved(mesh, flow, flow.mask * balance)
-            if exactly
-            else darcy.nearly_solved(mesh, flow, balance)
-        )
+    dP = _pressures(mesh, flow, -A.diagonal[3][3], balance, exactly)
     rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
     pull = block_matrix.product(block_matrix.BlockMatrix(rows, diagonal, A.nodes), (dP,))
     return tuple(f + p for f, p in zip(forces, pull, strict=True))
+
+
+def _pressures(mesh: TetMesh, flow: Flow | None, compliance: jax.Array, balance: jax.Array, exactly: bool) -> jax.Array:
+    """Change of pressures (V,) with a balance of volumes (V,)."""
+    if flow is None:
+        return balance / compliance
+    if exactly:
+        return flow.mask * darcy.solved(mesh, flow, flow.mask * balance)
+    return darcy.nearly_solved(mesh, flow, balance)
+
+
+def eliminated_points(
+    mesh: TetMesh, flow: Flow | None, A: PointMatrix, motion: Any, exactly: bool = False
+) -> tuple[jax.Array, ...]:
+    """The same of quadratic elements: forces, columns (V,), of a motion (V,) that changes pressures too."""
+    assert A.pressures is not None
+    balance = -point_matrix.volume_changes(mesh, A, motion)
+    dP = _pressures(mesh, flow, A.pressures.diagonal[0][0], balance, exactly)
+    forces = point_matrix.product(mesh, A, motion)
+    return tuple(f - p for f, p in zip(forces, point_matrix.pull(mesh, A, dP), strict=True))
+
+
+def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Any) -> jax.Array:
+    """Stiffness [Pa/m^3] of every point against a change of its volume where nothing flows between elements.
+
+    C is the matrix of the pressures: its diagonal shared out by volume, so that the elements' sum is no softer.
+    """
+    share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
+    return interpolated(mesh, share) / mesh.weights
 
 
 def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Any) -> block_matrix.Block:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from liverjax import laws
 from liverjax.core import status
 from liverjax.core.struct import replace
+from liverjax.elements.gradients import volume_ratios
 from liverjax.physics.base import End, NodalForce
 from liverjax.physics.elasticity import Elastic
 from liverjax.simulation import tangent
@@ -82,6 +83,6 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     f = forces(e, q, jnp.ones((), x.dtype))
     reactions = f.total - e.free.vectors(f.total) if e.free.normals is not None else (1 - e.free.mask) * f.total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)
-    inverted = found & jnp.any(determinant(f.F) <= 0)
+    inverted = found & jnp.any(volume_ratios(e.mesh, f.x) <= 0)
     statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))
     return advanced(e, End(f.x, f.F, f.pressure)), reactions, statistics, kept

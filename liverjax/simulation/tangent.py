@@ -12,16 +12,26 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.elements import mjed, projection
+from liverjax.elements.gradients import volume_gradients
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.physics.base import VolumeStress
+from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
-from liverjax.solvers import block_matrix, direct
+from liverjax.solvers import block_matrix, direct, point_matrix
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.krylov import conjugate_gradients, refined, stabilised_biconjugate_gradients, true_residual
+from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.solvers.preconditioner import Coarse, coarse, corrected, worthwhile
-from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, scale_matrix, stored
+from liverjax.tensors.matrices import (
+    Matrix,
+    add_matrices,
+    deformation_gradient,
+    determinant,
+    scale,
+    scale_matrix,
+    stored,
+)
 
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
@@ -30,8 +40,8 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 KINDS = ("true", "projected", "regularised")
 
 
-def element_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> dict[tuple[int, int], Matrix]:
-    """K_ab [N/m] of `PAIRS` of every element, at given nodal pressures (V,) [Pa] or None."""
+def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> dict[tuple[int, int], Matrix]:
+    """K_ab [N/m] of corners 1 <= a <= b <= 3 of every point, at given nodal pressures (V,) [Pa] or None."""
     mesh, F = e.mesh, stored(F)
     D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
     volume = None if e.volume is None else e.volume.scalars(mesh, pressure, F)
@@ -48,8 +58,12 @@ def element_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -
     K = summands[0]
     for more in summands[1:]:
         K = [add_matrices(a, b) for a, b in zip(K, more, strict=True)]
-    own = {(a + 1, b + 1): scale_matrix(mesh.volumes, block) for (a, b), block in zip(_OWN, K, strict=True)}
-    full = mjed.all_blocks(own)
+    return {(a + 1, b + 1): scale_matrix(mesh.weights, block) for (a, b), block in zip(_OWN, K, strict=True)}
+
+
+def element_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> dict[tuple[int, int], Matrix]:
+    """K_ab [N/m] of `PAIRS` of every linear element, at given nodal pressures (V,) [Pa] or None."""
+    full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
@@ -83,8 +97,9 @@ def _coupled(e: Equations) -> VolumeStress | None:
 class Tangent(NamedTuple):
     """A tangent ready to be solved with: assembled at one point, good for some iterations near it."""
 
-    matrix: BlockMatrix
+    matrix: BlockMatrix | PointMatrix
     inverse: Block  # of its diagonal blocks
+    vertices: Block | None  # of quadratic elements: of the diagonal blocks of the vertices' linear elements
     slow: Coarse
     x: jax.Array | None  # (V, 3) where it was made, for loads that follow
     s: Any  # part of the step there
@@ -105,6 +120,8 @@ def tangent(
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
     mesh, volume = e.mesh, _coupled(e)
+    if mesh.order > 1:
+        return _of_points(e, pressure, x, s, near, kind)
     if volume is None:
         A = stiffness(e, pressure, x, kind)
         diagonal = A.diagonal
@@ -118,15 +135,55 @@ def tangent(
 
     def new() -> Coarse:
         used = False if e.scene.solve.linear_solver == "direct" else worthwhile(A, _shift(e))
-        return coarse(mesh, A, _coarse_mask(e), used)
+        return coarse(mesh, A, _coarse_mask(e.free), used)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    return Tangent(A, inverse, slow, None if e.conservative else x, None if e.conservative else s)
+    return Tangent(A, inverse, None, slow, *_followed(e, x, s))
 
 
-def _coarse_mask(e: Equations) -> jax.Array:
+def _followed(e: Equations, x: jax.Array, s: Any) -> tuple[Any, Any]:
+    """Where the tangent is made, for loads that follow the body."""
+    return (None, None) if e.conservative else (x, s)
+
+
+def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, near: Any, kind: str) -> Tangent:
+    """The tangent of quadratic elements: moduli at their points, and two levels of a preconditioner."""
+    mesh, volume = e.mesh, _coupled(e)
+    F = deformation_gradient(mesh, x)
+    A = PointMatrix(stored(own_blocks(e, pressure, F, kind)), node_blocks(e), None, None)
+    bulk = None
+    if volume is not None:
+        C = volume.matrix(mesh, determinant(F), kind != "true")
+        border = [scale(mesh.weights, g) for g in volume_gradients(mesh, F)[1:]]
+        A = A._replace(border=stored(border), pressures=C)
+        bulk = mixed_system.undrained_bulk(mesh, C, 1.0 if volume.flow is None else volume.flow.mask)
+    own = point_matrix.levels(mesh, A, bulk)
+    inverse = block_matrix.inverse_blocks(own.diagonal, e.free.mask, e.free.normals)
+    free = _of_vertices(e)
+    vertices = block_matrix.inverse_blocks(own.vertices.diagonal, free.mask, free.normals)
+
+    def new() -> Coarse:
+        used = False if e.scene.solve.linear_solver == "direct" else worthwhile(own.vertices, _vertex_shift(e))
+        return coarse(mesh, own.vertices, _coarse_mask(free), used)
+
+    slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
+    return Tangent(A, inverse, vertices, slow, *_followed(e, x, s))
+
+
+def _of_vertices(e: Equations) -> Free:
+    """Where the vertices can move."""
+    V, (mask, normals) = e.mesh.number_of_vertices, e.free
+    return Free(mask[:V], None if normals is None else normals[:V])
+
+
+def _vertex_shift(e: Equations) -> jax.Array | None:
+    own = _shift(e)
+    return None if own is None else point_matrix.restricted(e.mesh, own)
+
+
+def _coarse_mask(free: Free) -> jax.Array:
     """(V, 3) 1 where coarse motions act: not at nodes that slide along no axis."""
-    mask, normals = e.free.mask, e.free.normals
+    mask, normals = free
     return mask if normals is None else mask * jnp.all(normals == 0, axis=1, keepdims=True)
 
 
@@ -136,8 +193,23 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
     def fine(columns: Any) -> tuple[jax.Array, ...]:
         return block_matrix.applied(K.inverse, e.free.columns(columns))
 
-    both = corrected(e.mesh, K.slow, _coarse_mask(e), fine)
-    return lambda r: _flat(e, both(block_matrix.columns(r)))
+    if K.vertices is None:
+        both = corrected(e.mesh, K.slow, _coarse_mask(e.free), fine)
+        return lambda r: _flat(e, both(block_matrix.columns(r)))
+    inverse, free = K.vertices, _of_vertices(e)
+
+    def linear(columns: Any) -> tuple[jax.Array, ...]:
+        return block_matrix.applied(inverse, free.columns(columns))
+
+    level = corrected(e.mesh, K.slow, _coarse_mask(free), linear)
+
+    def levels(columns: Any) -> tuple[jax.Array, ...]:
+        columns = e.free.columns(columns)
+        below = level([point_matrix.restricted(e.mesh, c) for c in columns])
+        added = [point_matrix.prolonged(e.mesh, c) for c in below]
+        return tuple(a + b for a, b in zip(fine(columns), added, strict=True))
+
+    return lambda r: _flat(e, levels(block_matrix.columns(r)))
 
 
 def _flat(e: Equations, columns: Any) -> jax.Array:
@@ -154,9 +226,14 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 
     def apply(v: jax.Array) -> jax.Array:
         motion = e.free.columns(block_matrix.columns(v))
-        force = block_matrix.product(A, motion)
-        if volume is not None:
-            force = mixed_system.eliminated(e.mesh, volume.flow, A, force, exactly)
+        if isinstance(A, BlockMatrix):
+            force = block_matrix.product(A, motion)
+            if volume is not None:
+                force = mixed_system.eliminated(e.mesh, volume.flow, A, force, exactly)
+        elif volume is None:
+            force = point_matrix.product(e.mesh, A, motion)
+        else:
+            force = mixed_system.eliminated_points(e.mesh, volume.flow, A, motion, exactly)
         if following and K.x is not None:
             dx = jnp.stack(motion, axis=-1)
             for a in following:
@@ -182,6 +259,9 @@ def solve(
 def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
     """The same by a factorisation, of the coupled matrix where pressures depend on motion."""
     free, load, volume = e.free.mask.T, b.reshape(3, -1), _coupled(e)
+    if isinstance(K.matrix, PointMatrix):
+        known = jnp.ones(0) if volume is None or volume.flow is None else volume.flow.mask
+        return direct.solve_points(e.mesh, K.matrix, (free, known), load, e.free.normals).ravel()
     if volume is not None:
         known = jnp.ones_like(free[:1]) if volume.flow is None else volume.flow.mask[None]
         free = jnp.concatenate([free, known])

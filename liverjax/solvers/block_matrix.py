@@ -49,7 +49,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
                 total = total.at[pattern.element_edges[k]].add(value)
             edge[r][c] = total
     gathered: list[list[Any]] = [[None if e is None else e[pattern.row_edges] for e in row] for row in edge]
-    upward = jnp.arange(mesh.number_of_nodes, dtype=jnp.int32)[None] < pattern.row_nodes
+    upward = jnp.arange(mesh.number_of_vertices, dtype=jnp.int32)[None] < pattern.row_nodes
     return tuple(
         tuple(gathered[r][c] if r == c else jnp.where(upward, gathered[r][c], gathered[c][r]) for c in range(m))
         for r in range(m)

@@ -3,6 +3,7 @@
 SciPy's SuperLU: time and memory grow faster than the mesh (n^1.5 to n^2), so this is for bodies of some thousand nodes.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,7 +12,10 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from liverjax.solvers.block_matrix import BlockMatrix
+from liverjax.mesh.basis import basis
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers.block_matrix import Block, BlockMatrix
+from liverjax.solvers.point_matrix import PointMatrix
 
 
 def solve(A: BlockMatrix, free: jax.Array, b: jax.Array, normals: jax.Array | None = None) -> jax.Array:
@@ -23,6 +27,28 @@ def solve(A: BlockMatrix, free: jax.Array, b: jax.Array, normals: jax.Array | No
     shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
     given = (rows, diagonal, A.nodes, free, b, normals)
     return jax.pure_callback(_solve, shape, *given, vmap_method="sequential")
+
+
+def solve_points(mesh: TetMesh, A: PointMatrix, free: Any, b: jax.Array, normals: Any = None) -> jax.Array:
+    """The same of quadratic elements, positions alone: b and the solution are (3, V).
+
+    Pressures of the vertices, where A has them, are unknowns beside the positions; their row of the balance is 0.
+    `free` are two masks, of positions (3, V) and of pressures.
+    """
+    blocks = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in sorted(A.blocks)])
+    own = None if A.own is None else _filled(A.own, b[0])
+    coupled = None
+    if A.border is not None and A.pressures is not None:
+        C = A.pressures
+        coupled = (jnp.stack([jnp.stack(g) for g in A.border]), C.rows[0][0], C.diagonal[0][0], C.nodes)
+    nodes = jnp.stack(mesh.element_nodes)
+    shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
+    host = partial(_solve_points, mesh.order)
+    return jax.pure_callback(host, shape, blocks, nodes, own, coupled, free, b, normals, vmap_method="sequential")
+
+
+def _filled(blocks: Block, like: jax.Array) -> jax.Array:
+    return jnp.stack([jnp.stack([jnp.zeros_like(like) if e is None else e for e in row]) for row in blocks])
 
 
 def _across(normals: np.ndarray, size: int) -> scipy.sparse.csr_array:
@@ -46,17 +72,56 @@ def _solve(rows: Any, diagonal: Any, nodes: Any, free: Any, b: Any, normals: Any
             columns += [(c * n + nodes).ravel(), c * n + own]
             values += [rows[r, c].ravel(), diagonal[r, c]]
     A = scipy.sparse.coo_array((np.concatenate(values), (np.concatenate(lines), np.concatenate(columns))))
+    return _factorised(A.tocsr(), free.ravel(), b.ravel(), normals, abs(diagonal[0, 0]).mean()).reshape(m, n)
+
+
+def _solve_points(order: int, *given: Any) -> np.ndarray:
+    blocks, nodes, own, coupled, free, b, normals = jax.tree.map(np.asarray, given)
+    n, c = b.shape[1], basis(order).c
+    pairs = [(a, b) for a in (1, 2, 3) for b in (1, 2, 3) if a <= b]
+    K = np.zeros((4, 4, 3, 3, *blocks.shape[-2:]))
+    for (a, k), block in zip(pairs, blocks, strict=True):
+        K[a, k], K[k, a] = block, np.swapaxes(block, 0, 1)
+    K[0, 1:] = -K[1:, 1:].sum(axis=0)
+    K[:, 0] = -K[:, 1:].sum(axis=1)
+    element = np.einsum("akq,klrsqe,blq->arbse", c, K, c, optimize=True).reshape(3 * len(nodes), 3 * len(nodes), -1)
+    at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(3 * len(nodes), -1)
+    entries = [(element, at[:, None], at[None])]
+    if own is not None:
+        every = np.arange(n)
+        entries += [(own[r, s], r * n + every, s * n + every) for r in range(3) for s in range(3)]
+    known, load = free[0].ravel(), b.ravel()
+    if coupled is not None:
+        border, rows, diagonal, near = coupled
+        g = np.concatenate([-border.sum(axis=0)[None], border])
+        G = -np.einsum("akq,krqe,vq->arve", c, g, basis(order).L, optimize=True).reshape(len(at), 4, -1)
+        balance = 3 * n + nodes[:4]
+        every = 3 * n + np.arange(len(diagonal))
+        entries += [(G, at[:, None], balance[None]), (G, balance[None], at[:, None])]
+        entries += [(-rows, every[None], 3 * n + near), (-diagonal, every, every)]
+        pressures = free[1] if len(free[1]) else np.ones(len(diagonal))
+        known = np.concatenate([known, pressures])
+        load = np.concatenate([load, np.zeros(len(diagonal))])
+    parts = [[a.ravel() for a in np.broadcast_arrays(*entry)] for entry in entries]
+    values, lines, columns = (np.concatenate(a) for a in zip(*parts, strict=True))
+    A = scipy.sparse.coo_array((values, (lines, columns)), shape=(len(known), len(known))).tocsr()
+    x = _factorised(A, known, load, normals, abs(element[0, 0]).mean())
+    return x[: 3 * n].reshape(3, n).astype(b.dtype)
+
+
+def _factorised(A: Any, free: np.ndarray, b: np.ndarray, normals: Any, mean: float) -> np.ndarray:
+    """Solution (n,) of A x = b where `free` (n,) is not 0; `mean` stands for A along the normals."""
     if normals is not None:
-        N = _across(np.asarray(normals), m * n)
-        inside = scipy.sparse.eye_array(m * n) - N
-        A = inside @ A.tocsr() @ inside + abs(diagonal[0, 0]).mean() * N
-    keep = np.flatnonzero(free.ravel())
-    A = A.tocsr()[keep][:, keep].tocsc()
-    x = np.zeros(m * n, dtype=b.dtype)
+        N = _across(np.asarray(normals), len(b))
+        inside = scipy.sparse.eye_array(len(b)) - N
+        A = inside @ A @ inside + mean * N
+    keep = np.flatnonzero(free)
+    A = A[keep][:, keep].tocsc()
+    x = np.zeros_like(b)
     try:
         # The pattern is symmetric and so, nearly, is the best order of the unknowns.
         factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        x[keep] = factor.solve(b.ravel()[keep])
+        x[keep] = factor.solve(b[keep])
     except (RuntimeError, ValueError):  # singular, or not finite
         x[keep] = np.nan
-    return x.reshape(m, n)
+    return x

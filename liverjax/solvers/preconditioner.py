@@ -99,7 +99,7 @@ def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, numb
         return jnp.zeros((number * number, 16 * m * m), f.dtype).at[patch[i] * number + patch[j]].add(entries)
 
     once = pairs([[entry.ravel()[slot] for entry in row[:m]] for row in A.rows[:m]], low, high)
-    every = jnp.arange(mesh.number_of_nodes)
+    every = jnp.arange(mesh.number_of_vertices)
     once, own = (
         jnp.transpose(E.reshape(number, number, 4, 4, m, m), (0, 2, 4, 1, 3, 5)).reshape(size, size)
         for E in (once, pairs(A.diagonal, every, every))

@@ -143,13 +143,10 @@ def stored(values: Any) -> Any:
     return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
-def node_values(x: jax.Array, tetrahedra: jax.Array) -> Matrix:
-    """Values (V, 3) at the four nodes of every element."""
-    return tuple(tuple(x[:, c][tetrahedra[:, a]] for c in range(3)) for a in range(4))
-
-
 def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     """F = sum_a (x_a - x_0) (x) D_a over a = 1, 2, 3, since the shape vectors of an element add up to zero.
+
+    Entries are (E,), or (Q, E) where elements have Q points (`TetMesh.edges`).
 
     Args:
         mesh: `TetMesh`.
@@ -160,7 +157,6 @@ def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     """
     if jnp.shape(x) != mesh.points.shape:
         raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 a node, {mesh.points.shape}")
-    x0, *others = node_values(x, mesh.tetrahedra)
-    edges = [tuple(a - b for a, b in zip(node, x0, strict=True)) for node in others]
+    edges = mesh.edges([x[:, c] for c in range(3)])
     D = mesh.shape_vectors
     return tuple(tuple(sum(edges[a][i] * D[a, j] for a in range(3)) for j in range(3)) for i in range(3))

@@ -1,0 +1,83 @@
+"""Shape functions of straight tetrahedra, and the points they are integrated at.
+
+With barycentric coordinates L_k and their constant gradients D_k, the shape vectors of the linear element,
+
+    grad N_a = sum_k c_ak D_k,    c_ak = dN_a/dL_k,    so    F = sum_a x_a (x) grad N_a = sum_k y_k (x) D_k
+
+with y_k = sum_a c_ak x_a: at each point an element of any order is a linear element with corners y_k. So the terms of
+MJED hold at every point, and no matrix is inverted there either.
+
+Functions of order 2: L_k (2 L_k - 1) of the vertices and 4 L_i L_j of the edges (10 nodes). Order 3 adds to these
+L_i L_j (L_i - L_j) of the edges and 27 L_i L_j L_k of the faces; their unknowns are no positions. It serves the
+estimate of the mesh's error (`liverjax.simulation.mesh_error`).
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from liverjax.mesh.adjacency import PAIRS
+
+#: Corners of an element's faces, each opposite the corner of the same number.
+FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
+
+
+class Basis(NamedTuple):
+    """Functions at the points of an element; NumPy arrays, the same for all elements."""
+
+    weights: np.ndarray  # (Q,), they add up to 1
+    L: np.ndarray  # (4, Q) linear functions
+    N: np.ndarray  # (n, Q) all functions
+    c: np.ndarray  # (n, 4, Q) their derivatives by the linear functions
+
+
+@cache
+def basis(order: int) -> Basis:
+    """The functions of `order` 2 or 3: products of two gradients are integrated exactly."""
+    weights, L = _four_points() if order == 2 else _fourteen_points()
+    return Basis(weights, L, *functions(order, L))
+
+
+def functions(order: int, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """N (n, Q) and c (n, 4, Q) at barycentric coordinates L (4, Q)."""
+    values = [L[k] * (2 * L[k] - 1) for k in range(4)] + [4 * L[i] * L[j] for i, j in PAIRS]
+    slopes = [{k: 4 * L[k] - 1} for k in range(4)] + [{i: 4 * L[j], j: 4 * L[i]} for i, j in PAIRS]
+    if order == 3:
+        values += [L[i] * L[j] * (L[i] - L[j]) for i, j in PAIRS]
+        slopes += [{i: (2 * L[i] - L[j]) * L[j], j: (L[i] - 2 * L[j]) * L[i]} for i, j in PAIRS]
+        values += [27 * L[i] * L[j] * L[k] for i, j, k in FACES]
+        slopes += [{i: 27 * L[j] * L[k], j: 27 * L[i] * L[k], k: 27 * L[i] * L[j]} for i, j, k in FACES]
+    c = np.zeros((len(values), *L.shape))
+    for a, slope in enumerate(slopes):
+        for k, value in slope.items():
+            c[a, k] = value
+    return np.stack(values), c
+
+
+def _four_points() -> tuple[np.ndarray, np.ndarray]:
+    """Exact to degree 2 (Hammer and Stroud 1956)."""
+    near, far = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
+    return np.full(4, 0.25), far + (near - far) * np.eye(4)
+
+
+def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
+    """Exact to degree 5, all weights positive (Walkington 2000)."""
+    columns, weights = [], []
+    for a, w in ((0.31088591926330060980, 0.11268792571801585080), (0.092735250310891226402, 0.073493043116361949544)):
+        columns += [np.where(np.arange(4) == k, 1 - 3 * a, a) for k in range(4)]
+        weights += 4 * [w]
+    a = 0.045503704125649649492
+    columns += [np.where(np.isin(np.arange(4), pair), 0.5 - a, a) for pair in PAIRS]
+    weights += 6 * [0.042546020777081466438]
+    return np.array(weights) / np.sum(weights), np.stack(columns, axis=1)
+
+
+@cache
+def triangle_rule() -> tuple[np.ndarray, np.ndarray]:
+    """Weights (Q,) and barycentric coordinates (3, Q) on a triangle, exact to degree 4 (Dunavant 1985)."""
+    columns, weights = [], []
+    for a, w in ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)):
+        columns += [np.where(np.arange(3) == k, 1 - 2 * a, a) for k in range(3)]
+        weights += 3 * [w]
+    return np.array(weights) / np.sum(weights), np.stack(columns, axis=1)

@@ -1,0 +1,219 @@
+"""Mesh files: what meshio reads and writes, of linear and of quadratic tetrahedra; sets come along."""
+
+import contextlib
+import io
+import os
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.tetrahedra import UNITS, TetMesh, check_mesh, tet_mesh
+
+#: Cells of files that become elements.
+CELLS = {1: "tetra", 2: "tetra10"}
+_NAMES = {1: "linear", 2: "quadratic"}
+#: Edges of a quadratic element in the order of VTK and meshio.
+_VTK = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+#: Middles of edges that are further off the straight edge than this part of its length are moved onto it.
+_STRAIGHT = 1e-6
+
+
+def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
+    """Read any file meshio reads that holds tetrahedra of 4 or 10 nodes; sets of nodes and elements come along.
+
+    Of 10-node elements the vertices come first, in the file's order, then the middles of the edges; curved edges are
+    made straight, with a warning.
+
+    Args:
+        path: mesh file.
+        unit: length unit of the file, one of `UNITS`.
+
+    Raises:
+        InputError: unreadable file, no or other cells, unit unknown, unusable mesh.
+    """
+    if unit not in UNITS:
+        raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"mesh file {path}: {'is a folder' if path.is_dir() else 'no such file'}; give a mesh file")
+    data = _read_quietly(path)
+    order = next((k for k, kind in CELLS.items() if any(block.type == kind for block in data.cells)), None)
+    if order is None:
+        kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
+        raise InputError(
+            f"mesh file {path}: it holds {kinds} but no linear tetrahedra, nor quadratic; export those of 4 or 10 nodes"
+        )
+    cell = CELLS[order]
+    blocks = [block.data for block in data.cells if block.type == cell]
+    others = sorted({b.type for b in data.cells if b.type != cell and not b.type.startswith(_FLAT_CELLS)})
+    if others:
+        raise InputError(
+            f"mesh file {path}: it holds {', '.join(others)} beside {_NAMES[order]} tetrahedra; remesh all of the body "
+            f"with {4 if order == 1 else 10}-node tetrahedra"
+        )
+    points, tets = np.asarray(data.points, dtype=float)[:, :3] * UNITS[unit], np.vstack(blocks)
+    if points.shape[1] != 3:
+        raise InputError(f"mesh file {path}: its points have {points.shape[1]} coordinates; give three")
+    if tets.min(initial=0) < 0 or tets.max(initial=0) >= len(points):
+        raise InputError(
+            f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
+        )
+    sets = _node_sets(data), _element_sets(data, cell)
+    if order == 1:
+        mesh = tet_mesh(points, tets, *sets)
+        check_mesh(mesh, f"mesh file {path}")
+    else:
+        mesh = _with_middles(points, tets, *sets, f"mesh file {path}")
+    size = float(np.ptp(points, axis=0).max())
+    if size > _LARGE and unit == "m":
+        warnings.warn(
+            f"mesh file {path} is {size:.4g} m long: if its numbers are millimetres write unit = 'mm'", stacklevel=2
+        )
+    return mesh
+
+
+def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element_sets: dict, name: str) -> TetMesh:
+    """A quadratic mesh of elements (E, 10) in the order of VTK, whose edges become straight."""
+    used = np.unique(tets[:, :4])
+    new = np.full(len(points), -1)
+    new[used] = np.arange(len(used))
+    linear = tet_mesh(points[used], new[tets[:, :4]], {}, element_sets)
+    check_mesh(linear, name)
+    mesh = quadratic(linear)
+    middles = np.stack([np.asarray(n) for n in mesh.element_nodes[4:]], axis=1)
+    of_file = tets[:, [4 + _VTK.index(pair) for pair in PAIRS]]
+    if np.any(np.isin(of_file, used)):
+        raise InputError(f"{name}: a node is a vertex here and the middle of an edge there; export the mesh anew")
+    new[of_file] = middles
+    straight = np.asarray(mesh.points)
+    low, high = np.asarray(mesh.pattern.edges)
+    length = np.linalg.norm(straight[high] - straight[low], axis=1)[middles - len(used)]
+    off = np.linalg.norm(points[of_file] - straight[middles], axis=2)
+    curved = of_file[off > _STRAIGHT * length]
+    if len(curved):
+        warnings.warn(
+            f"{name}: {len(np.unique(curved))} middles of edges stand up to {off.max():.3g} m off the straight edge: "
+            "they are moved onto it, for elements are straight here; refine curved parts",
+            stacklevel=3,
+        )
+    sets = {k: new[nodes][new[nodes] >= 0] for k, nodes in node_sets.items()}
+    return replace(mesh, node_sets={k: jnp.asarray(np.unique(v), jnp.int32) for k, v in sets.items()})
+
+
+#: What the beginning of a file says that meshio does not read -> what it is, and the remedy.
+_FOREIGN = {
+    r"\$NOD\b": "it is in Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
+    r"DATASET\s+POLYDATA|type=.PolyData": "it holds VTK polygons, a surface; fill the surface with tetrahedra "
+    "(Gmsh, TetGen) and export an unstructured grid",
+}
+
+
+def _read_quietly(path: Path) -> Any:
+    """What meshio reads, without what meshio prints: one sentence of ours says what was found."""
+    import meshio
+
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(1000).decode("latin-1")
+    except OSError as error:
+        raise InputError(f"mesh file {path} cannot be read ({error.strerror}); give a mesh file") from None
+    for mark, sentence in _FOREIGN.items():
+        if re.search(mark, beginning):
+            raise InputError(f"mesh file {path}: {sentence}")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+            return meshio.read(path)
+    except SystemExit:  # meshio's way to say that no reader took the file; their reasons are printed
+        reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
+    except Exception as error:  # meshio's readers raise whatever their parser meets
+        reason = " ".join(str(error).split()) or type(error).__name__
+    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh")
+
+
+#: Cells of surfaces and edges, which a volume mesh may carry beside its own.
+_FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
+#: A body longer than this [m] is likelier a mesh in millimetres.
+_LARGE = 10.0
+
+
+def _node_sets(data: Any) -> dict[str, np.ndarray]:
+    """meshio's point sets, and integer point data named ``set:NAME`` (how `write_mesh` keeps them in VTU)."""
+    sets = {name: np.asarray(nodes, dtype=np.int32) for name, nodes in (data.point_sets or {}).items()}
+    for name, values in data.point_data.items():
+        if name.startswith("set:"):
+            sets[name.removeprefix("set:")] = np.flatnonzero(values).astype(np.int32)
+    return sets
+
+
+#: A cell array of whole numbers with more of them than this numbers the cells, it does not group them.
+_MOST_GROUPS = 100
+
+
+def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
+    """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups of whole numbers.
+
+    A group is called as the file does (Gmsh's physical names), or after array and number, ``medit:ref=2``.
+    """
+    kinds = [block.type for block in data.cells]
+    first = np.cumsum([0, *(len(block.data) if block.type == cell else 0 for block in data.cells)])
+    sets = {}
+    for name, parts in (data.cell_sets or {}).items():
+        picks = [
+            first[k] + np.asarray(part, int)
+            for k, part in enumerate(parts)
+            if part is not None and kinds[k] == cell and not name.startswith("gmsh:bounding")
+        ]
+        if picks and sum(map(len, picks)):
+            sets[name] = np.concatenate(picks)
+    names = {(int(tag[0]), "gmsh:physical"): name for name, tag in data.field_data.items() if tag[-1] == 3}
+    for name, parts in data.cell_data.items():
+        values = np.concatenate([np.asarray(p) for p, kind in zip(parts, kinds, strict=True) if kind == cell])
+        if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
+            continue
+        if name.startswith("set:"):
+            sets[name.removeprefix("set:")] = np.flatnonzero(values)
+            continue
+        groups = np.unique(values)
+        for group in groups if len(groups) <= _MOST_GROUPS else ():
+            sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
+    return sets
+
+
+def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any] | None = None) -> None:
+    """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that carry data."""
+    import meshio
+
+    data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
+    for name, nodes in mesh.node_sets.items():
+        mask = np.zeros(mesh.number_of_nodes, dtype=np.int32)
+        mask[np.asarray(nodes)] = 1
+        data[f"set:{name}"] = mask
+    cell_data = {}
+    for name, elements in mesh.element_sets.items():
+        mask = np.zeros(mesh.number_of_elements, dtype=np.int32)
+        mask[np.asarray(elements)] = 1
+        cell_data[f"set:{name}"] = [mask]
+    cells = [meshio_cells(mesh, gmsh=Path(path).suffix == ".msh")]
+    # meshio takes .msh for an ANSYS file; in this field it is Gmsh's.
+    file_format = "gmsh" if Path(path).suffix == ".msh" else None
+    meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
+        path, file_format=file_format
+    )
+
+
+def meshio_cells(mesh: TetMesh, gmsh: bool = False) -> tuple[str, np.ndarray]:
+    """Cells (E, 4) or (E, 10) as meshio has them; `gmsh`: for its writer, which swaps the last two middles."""
+    if mesh.order == 1:
+        return "tetra", np.asarray(mesh.tetrahedra)
+    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
+    nodes = nodes[:, [*range(4), *(4 + PAIRS.index(pair) for pair in _VTK)]]
+    return "tetra10", nodes[:, [*range(8), 9, 8]] if gmsh else nodes

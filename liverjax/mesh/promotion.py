@@ -1,0 +1,89 @@
+"""Quadratic tetrahedra from linear ones: a node in the middle of every edge; and the functions beyond them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import replace
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.basis import FACES
+from liverjax.mesh.tetrahedra import TetMesh
+
+
+def quadratic(mesh: TetMesh) -> TetMesh:
+    """The mesh with 10 nodes an element; of a quadratic mesh, the mesh itself.
+
+    The vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`. A node set takes
+    in the middles of the edges of all faces that it holds, so that a held face stays held.
+    """
+    if mesh.order > 1:
+        return mesh
+    low, high = mesh.pattern.edges
+    points = jnp.concatenate([mesh.points, 0.5 * (mesh.points[low] + mesh.points[high])])
+    sets = {name: jnp.asarray(of_faces(mesh, np.asarray(nodes)), jnp.int32) for name, nodes in mesh.node_sets.items()}
+    return replace(mesh, points=points, node_sets=sets, order=2)
+
+
+def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Vertices `nodes` (n,) of a linear mesh, and the middles of the edges of the faces between them; host side."""
+    inside = np.zeros(mesh.number_of_vertices, bool)
+    inside[nodes] = True
+    held = inside[np.asarray(mesh.tetrahedra)]
+    middles = [
+        np.asarray(mesh.pattern.element_edges[k])[held[:, face].all(axis=1)]
+        for face in map(list, FACES)
+        for k, pair in enumerate(PAIRS)
+        if set(pair) <= set(face)
+    ]
+    return np.concatenate([nodes, mesh.number_of_vertices + np.unique(np.concatenate(middles))])
+
+
+def cubic(mesh: TetMesh) -> TetMesh:
+    """A quadratic mesh with the functions of order 3 beside its own: unknowns, which are 0 in the reference shape."""
+    tets = np.asarray(mesh.tetrahedra)
+    triples = np.concatenate([np.sort(tets[:, face], axis=1) for face in map(list, FACES)])
+    _, number = np.unique(triples, axis=0, return_inverse=True)
+    more = mesh.pattern.edges.shape[1] + int(number.max()) + 1
+    points = jnp.concatenate([mesh.points, jnp.zeros((more, 3), mesh.points.dtype)])
+    return replace(mesh, points=points, faces=jnp.asarray(number.reshape(4, -1), jnp.int32), order=3)
+
+
+def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
+    """Numbers (m,) of the faces of a mesh of order 3 with vertices (m, 3); host side."""
+    tets, V = np.asarray(mesh.tetrahedra).astype(np.int64), mesh.number_of_vertices
+    of_elements = np.concatenate([tets[:, face] for face in map(list, FACES)])
+    code, wanted = (_code(np.sort(t.astype(np.int64), axis=1), V) for t in (of_elements, triangles))
+    order = np.argsort(code, kind="stable")
+    return np.asarray(mesh.faces).ravel()[order[np.searchsorted(code, wanted, sorter=order)]]
+
+
+def _code(triples: np.ndarray, V: int) -> np.ndarray:
+    """One number a sorted triple: below 2^63 for two million vertices."""
+    return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
+
+
+def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Nodes (n,) of the quadratic elements, then the functions of order 3 on the edges and faces they hold; host."""
+    inside = np.zeros(mesh.number_of_nodes, bool)
+    inside[nodes] = True
+    V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]
+    low, high = np.asarray(mesh.pattern.edges)
+    edges = np.flatnonzero(inside[low] & inside[high] & inside[V : V + N])
+    element = [np.asarray(n) for n in mesh.element_nodes[:10]]
+    faces = [
+        np.asarray(mesh.faces[k])[np.all([inside[element[n]] for n in _nodes_of_face(face)], axis=0)]
+        for k, face in enumerate(FACES)
+    ]
+    return np.concatenate([nodes, V + N + edges, V + 2 * N + np.unique(np.concatenate(faces))])
+
+
+def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
+    return [*face, *(4 + k for k, pair in enumerate(PAIRS) if set(pair) <= set(face))]
+
+
+def on_middles(mesh: TetMesh, values: jax.Array) -> jax.Array:
+    """A field of the vertices (..., V), linear along every edge, at all nodes of the mesh."""
+    if mesh.order == 1:
+        return values
+    low, high = mesh.pattern.edges
+    return jnp.concatenate([values, 0.5 * (values[..., low] + values[..., high])], axis=-1)

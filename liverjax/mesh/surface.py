@@ -1,0 +1,79 @@
+"""Integrals over triangles of the surface: nodal shares of tractions, pressures and springs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.mesh.basis import triangle_rule
+from liverjax.mesh.tetrahedra import TetMesh
+
+#: Edges of a triangle, in the order of its middles.
+_EDGES = ((0, 1), (1, 2), (2, 0))
+
+
+def triangle_nodes(mesh: TetMesh, triangles: jax.Array) -> list[jax.Array]:
+    """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, of quadratic meshes, middles of edges."""
+    vertices = [triangles[:, a] for a in range(3)]
+    if mesh.order == 1:
+        return vertices
+    return vertices + [_middle(mesh, triangles[:, a], triangles[:, b]) for a, b in _EDGES]
+
+
+def _middle(mesh: TetMesh, a: jax.Array, b: jax.Array) -> jax.Array:
+    """Numbers (m,) of the nodes between neighbouring vertices a and b (m,)."""
+    pattern = mesh.pattern
+    edge = jnp.where(pattern.row_nodes[:, a] == b[None], pattern.row_edges[:, a], 0)
+    return mesh.number_of_vertices + jnp.sum(edge, axis=0)
+
+
+def areas(points: jax.Array, triangles: jax.Array) -> jax.Array:
+    """Areas times normals (m, 3) [m^2] of flat triangles."""
+    corner = points[triangles]
+    return 0.5 * jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+
+
+def shares(mesh: TetMesh, triangles: jax.Array) -> list[tuple[jax.Array, float]]:
+    """Nodes (m,) of flat triangles that take part of something uniform on them, and the part of each.
+
+    A third at each vertex of a linear element. The functions of the vertices of a quadratic one have no integral: a
+    third at the middle of each edge. Triangles (m, 4) of a mesh of order 3 name their face in the last column.
+    """
+    nodes = triangle_nodes(mesh, triangles)
+    if mesh.order == 1:
+        return [(n, 1 / 3) for n in nodes]
+    found = [(n, 1 / 3) for n in nodes[3:]]
+    if triangles.shape[1] == 4:
+        bubbles = mesh.number_of_vertices + 2 * mesh.pattern.edges.shape[1]
+        found.append((bubbles + triangles[:, 3], 9 / 20))
+    return found
+
+
+def pressure_forces(triangles: jax.Array, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
+    """Nodal forces (V, 3) [N] of a unit pressure on the triangles at positions x (V, 3) [m]: integrals of -N n da."""
+    force = jnp.zeros_like(x)
+    if mesh is None or mesh.order == 1:
+        corner = x[triangles]
+        twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        for a in range(3):
+            force = force.at[triangles[:, a]].add(-1 / 6 * twice)
+        return force
+    nodes = triangle_nodes(mesh, triangles)
+    weights, l = triangle_rule()
+    N, along = _quadratic(l)
+    moved = [x[n] for n in nodes]
+    for q, weight in enumerate(weights):
+        first, second = (sum(slope[a, q] * moved[a] for a in range(6)) for slope in along)
+        normal = jnp.cross(first, second)
+        for a, n in enumerate(nodes):
+            force = force.at[n].add(-0.5 * weight * N[a, q] * normal)
+    return force
+
+
+def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Six functions (6, Q) at barycentric coordinates l (3, Q), and their slopes towards the last vertices."""
+    N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]
+    zero = np.zeros_like(l[0])
+    by = [[4 * l[k] - 1 if m == k else zero for m in range(3)] for k in range(3)]
+    by += [[4 * l[b] if m == a else 4 * l[a] if m == b else zero for m in range(3)] for a, b in _EDGES]
+    slopes = np.array(by)
+    return np.stack(N), [slopes[:, m] - slopes[:, 0] for m in (1, 2)]

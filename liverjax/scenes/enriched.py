@@ -1,0 +1,78 @@
+"""The same scene in the next richer space of functions: quadratic elements for linear ones, cubic for quadratic ones.
+
+What holds, moves and loads the body is the same. Positions and numbers of a node between others follow from theirs.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import replace
+from liverjax.mesh import promotion
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.loads import Traction
+from liverjax.physics.prescribed import Displaced, Fixed
+from liverjax.scenes.scene import Scene
+
+
+def enriched(scene: Scene) -> Scene:
+    """The scene of quadratic elements, or of cubic ones (`liverjax.mesh.promotion.cubic`); numbers may be traced."""
+    return _quadratic(scene) if scene.mesh.order == 1 else _cubic(scene)
+
+
+def _quadratic(scene: Scene) -> Scene:
+    mesh = promotion.quadratic(scene.mesh)
+
+    def more(nodes: Any) -> Any:
+        return jnp.asarray(promotion.of_faces(scene.mesh, np.asarray(nodes)), jnp.int32)
+
+    body = scene.body
+    if body is not None and jnp.ndim(body.density):
+        body = replace(body, density=promotion.on_middles(mesh, jnp.asarray(body.density)))
+    return replace(
+        scene,
+        mesh=mesh,
+        body=body,
+        fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
+        displaced=tuple(_between(mesh, d, more(d.nodes)) for d in scene.displaced),
+        physics=tuple(p.enriched(more) for p in scene.physics),
+    )
+
+
+def _between(mesh: TetMesh, moved: Displaced, nodes: Any) -> Displaced:
+    """With the middles of edges moved by the mean of their ends."""
+    if moved.by is None or jnp.ndim(moved.by) == 1:
+        return replace(moved, nodes=nodes)
+    by = jnp.zeros((mesh.number_of_vertices, 3), mesh.points.dtype).at[moved.nodes].set(moved.by)
+    return replace(moved, nodes=nodes, by=promotion.on_middles(mesh, by.T).T[nodes])
+
+
+def _cubic(scene: Scene) -> Scene:
+    mesh = promotion.cubic(scene.mesh)
+
+    def more(nodes: Any) -> Any:
+        return jnp.asarray(promotion.with_functions(mesh, np.asarray(nodes)), jnp.int32)
+
+    # The unknowns of the new functions are no positions: where their nodes are moved, they stay 0.
+    still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
+    body = scene.body
+    if body is not None and jnp.ndim(body.density):
+        density = jnp.asarray(body.density)
+        new = mesh.number_of_nodes - len(density)
+        body = replace(body, density=jnp.concatenate([density, jnp.full(new, jnp.mean(density))]))
+    return replace(
+        scene,
+        mesh=mesh,
+        body=body,
+        fixed=(*(replace(f, nodes=more(f.nodes)) for f in scene.fixed), *still),
+        traction=tuple(_with_faces(mesh, load) for load in scene.traction),
+        physics=tuple(p.enriched(more) for p in scene.physics),
+    )
+
+
+def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
+    """Triangles with the number of their face, whose function takes a part of the load."""
+    triangles = np.asarray(load.triangles)
+    faces = promotion.face_numbers(mesh, triangles)
+    return replace(load, triangles=jnp.asarray(np.column_stack([triangles, faces]), jnp.int32))

@@ -1,0 +1,130 @@
+"""Symmetric matrices of quadratic elements, kept as moduli at their points: multiplied without assembly.
+
+At every point an element is a linear one with corners of its own (`liverjax.mesh.basis`), so 45 numbers a point are its
+stiffness. A product takes motions to the corners, multiplies, and takes forces back. The vertices alone, as linear
+elements, have an assembled matrix: the second level of the preconditioner.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.elements import mjed
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.basis import basis
+from liverjax.mesh.nodal import gathered, interpolated, summed
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers import block_matrix
+from liverjax.solvers.block_matrix import Block, BlockMatrix
+from liverjax.tensors.matrices import Matrix, Vector, dot, stored, transpose
+
+
+class PointMatrix(NamedTuple):
+    """Derivative of forces, and of minus the balance of nodal volumes where there are pressures."""
+
+    blocks: dict[tuple[int, int], Matrix]  # of corners 1 <= a <= b <= 3, of (Q, E) [N/m]
+    own: Block | None  # 3 x 3 of (V,) that nodes add, entries None where 0
+    border: list[Vector] | None  # change of a point's volume with its corners 1, 2, 3, of (Q, E) [m^2]
+    pressures: BlockMatrix | None  # of the pressures of the vertices [m^3/Pa]
+
+
+class Levels(NamedTuple):
+    """What the preconditioner is made of."""
+
+    diagonal: Block  # 3 x 3 of (V,)
+    vertices: BlockMatrix  # the matrix for motions that are linear in every element
+
+
+def product(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of a motion given by its columns (V,), at given pressures."""
+    moved = stored(mesh.edges(columns))
+    forces = [_force(A.blocks, k, moved) for k in (1, 2, 3)]
+    result = mesh.spread(forces)
+    if A.own is None:
+        return tuple(result)
+    return tuple(
+        f + sum(entry * c for entry, c in zip(row, columns, strict=True) if entry is not None)
+        for f, row in zip(result, A.own, strict=True)
+    )
+
+
+def _force(blocks: dict[tuple[int, int], Matrix], k: int, moved: list[Vector]) -> Vector:
+    rows = [blocks[k, b] if k <= b else transpose(blocks[b, k]) for b in (1, 2, 3)]
+    return tuple(sum(dot(row[r], d) for row, d in zip(rows, moved, strict=True)) for r in range(3))
+
+
+def volume_changes(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) -> jax.Array:
+    """Change (V,) [m^3] of the volumes that belong to the vertices, with a motion given by its columns (V,)."""
+    assert A.border is not None
+    moved = stored(mesh.edges(columns))
+    return gathered(mesh, sum(dot(g, d) for g, d in zip(A.border, moved, strict=True)))
+
+
+def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of pressures (V,) [Pa] of the vertices that push outwards: the transpose of the former."""
+    assert A.border is not None
+    p = interpolated(mesh, pressures)
+    return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
+
+
+def levels(mesh: TetMesh, A: PointMatrix, bulk: Any = None) -> Levels:
+    """Blocks of the diagonal, and the matrix of the vertices' linear elements.
+
+    Args:
+        bulk: (Q, E) [Pa/m^3] that counts as stiffness against a change of a point's volume; None: there is none.
+    """
+    blocks = A.blocks
+    if bulk is not None and A.border is not None:
+        g = A.border
+        blocks = {
+            (a, b): tuple(tuple(K[r][c] + bulk * g[a - 1][r] * g[b - 1][c] for c in range(3)) for r in range(3))
+            for (a, b), K in blocks.items()
+        }
+    blocks = stored(blocks)
+    diagonal = _diagonal(mesh, blocks)
+    whole = {pair: tuple(tuple(summed(mesh, e) for e in row) for row in K) for pair, K in blocks.items()}
+    corners = mjed.all_blocks(whole)
+    own = None if A.own is None else _on_vertices(mesh, A.own)
+    vertices = block_matrix.force_matrix(mesh, {pair: corners[pair[0]][pair[1]] for pair in PAIRS}, own)
+    return Levels(diagonal if A.own is None else block_matrix.added(diagonal, A.own), vertices)
+
+
+def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
+    """Blocks 3 x 3 of (V,): sum_q c_ak K_kl c_al of every node a of every element, over k, l = 1, 2, 3."""
+    c = basis(mesh.order).c
+    slopes = c[:, 1:] - c[:, :1]
+    weights = np.stack([slopes[:, a - 1] * slopes[:, b - 1] * (1 if a == b else 2) for a, b in sorted(blocks)], axis=1)
+    matrix = jnp.asarray(weights.reshape(len(c), -1), mesh.points.dtype)
+    entries = [(r, s) for r in range(3) for s in range(r, 3)]
+    # K_kl + K_lk of a pair, its symmetric part twice.
+    symmetric = [
+        jnp.stack([0.5 * (blocks[pair][r][s] + blocks[pair][s][r]) for r, s in entries], axis=1)
+        for pair in sorted(blocks)
+    ]
+    values = jnp.tensordot(matrix, jnp.concatenate(symmetric), axes=(1, 0))
+    nodes, zero = jnp.stack(mesh.element_nodes), jnp.zeros(mesh.number_of_nodes, mesh.points.dtype)
+    six = {entry: zero.at[nodes].add(values[:, k]) for k, entry in enumerate(entries)}
+    return tuple(tuple(six[min(r, s), max(r, s)] for s in range(3)) for r in range(3))
+
+
+def _on_vertices(mesh: TetMesh, own: Block) -> Block:
+    """What nodes add, lumped to the vertices: half of a middle's at either end."""
+    return tuple(tuple(None if e is None else restricted(mesh, e) for e in row) for row in own)
+
+
+def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
+    """The transpose of `prolonged`: (V,) of all nodes to the vertices."""
+    V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
+    half = 0.5 * column[V : V + low.shape[0]]
+    return column[:V].at[low].add(half).at[high].add(half)
+
+
+def prolonged(mesh: TetMesh, column: jax.Array) -> jax.Array:
+    """A field that is linear in every element: (V,) of the vertices to all nodes."""
+    low, high = mesh.pattern.edges
+    parts = [column, 0.5 * (column[low] + column[high])]
+    more = mesh.number_of_nodes - sum(len(p) for p in parts)
+    return jnp.concatenate(parts if more == 0 else [*parts, jnp.zeros(more, column.dtype)])
