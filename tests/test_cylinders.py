@@ -98,6 +98,34 @@ def test_default_numbers_are_those_of_always():
     assert np.sum(tets * np.arange(2304).reshape(576, 4) % 97) == 108199
 
 
+SCENE = """
+[mesh]
+shape = "cylinder"
+radius = 10.0
+height = 5.0
+cell_size = 4.0
+unit = "mm"
+{more}
+[law]
+name = "neo_hookean"
+mu = 1.0
+bulk = 3.0
+[[fixed]]
+where = {{z_max = 0.0}}
+"""
+
+
+def test_scene_files_make_the_same_cylinders(tmp_path):
+    file = tmp_path / "scene.toml"
+    file.write_text(SCENE.format(more="rim_cell = 1.0\nrings = [4.0]\nmatch_area = true"))
+    mesh, same = lj.load_scene(file).mesh, cylinder(0.01, 0.005, 0.004, 0.001, (0.004,), True)
+    assert np.array_equal(mesh.tetrahedra, same.tetrahedra) and np.allclose(mesh.points, same.points, rtol=1e-14)
+    for more, words in (("rings = [40.0]", "rings"), ("match_area = 3", "match_area"), ("rim_cell = 0", "rim_cell")):
+        file.write_text(SCENE.format(more=more))
+        with pytest.raises(lj.InputError, match=words):
+            lj.load_scene(file)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

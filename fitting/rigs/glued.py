@@ -12,17 +12,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from liverjax.mesh.promotion import quadratic
 
 import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
 from liverjax.laws import Law
 from liverjax.mesh import cylinders
+from liverjax.mesh.promotion import quadratic
 from liverjax.physics import boundary
 from liverjax.physics.loads import nodal_tractions
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
+from liverjax.simulation import mesh_error as estimate
 
 READINGS = ("force", "displacement")
 #: A punch narrower than this part of the sample, or a gap beside it, is below what the mesh is made for.
@@ -70,16 +71,38 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
     Raises:
         InputError: a law with directions of its own in a sector, where only what is alike all around the axis fits.
     """
+    result = lj.simulate(_with(rig, law, prony))
+    return _reading(rig, result.positions, result.reactions), result.status
+
+
+def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
+    """Estimate of what a mesh without end would add to each reading (T,) [N] or [m]; not for tracing.
+
+    It takes a run, and one linear solve in a richer space a step (`liverjax.simulation.mesh_error`). NaN where a
+    step shows none.
+    """
+    scene = _with(rig, law, prony)
+    result = lj.simulate(scene)
+    _, change = estimate.mesh_error(scene, result).change(lambda x, force: _reading(rig, x, force), result)
+    return change
+
+
+def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
+    """The rig's scene with its law and viscosity."""
     if not rig.whole and any(part.fibre is not None or part.green_energy is not None for part in law.summands()):
         raise InputError(
             f"law {type(law).__name__} has directions, and the rig's mesh is a sector of the cylinder: give the rig a "
             "cell_size, then it is whole"
         )
-    result = lj.simulate(replace(rig.scene, law=law, viscosity=prony))
+    return replace(rig.scene, law=law, viscosity=prony)
+
+
+def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
+    """What is read of positions [m] and reactions [N] of all steps (T, V, 3)."""
     if rig.reading == "force":
-        return result.reactions[:, rig.nodes, 2] @ rig.weights, result.status
+        return reactions[:, rig.nodes, 2] @ rig.weights
     rest = rig.scene.mesh.points[rig.nodes, 2]
-    return (result.positions[:, rig.nodes, 2] - rest[None]) @ rig.weights, result.status
+    return (positions[:, rig.nodes, 2] - rest[None]) @ rig.weights
 
 
 def tension(radius: float, height: float, dt: float, strains: Any, cell_size: float | Cells | None = None) -> Rig:

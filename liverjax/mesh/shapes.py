@@ -67,7 +67,7 @@ def cylinder(
     _positive("height", [height])
     _positive("cell_size", [cell_size])
     if rim_cell is not None or len(rings) or match_area:
-        return _graded(radius, height, (cell_size, rim_cell or cell_size), rings, match_area)
+        return _graded(radius, height, (cell_size, cell_size if rim_cell is None else rim_cell), rings, match_area)
     count = max(2, math.ceil(radius / cell_size - 1e-9))
     layers = max(1, math.ceil(height / cell_size - 1e-9))
     disc, triangles = _disc(count)
