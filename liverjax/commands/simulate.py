@@ -11,6 +11,7 @@ from liverjax.core.files import writable
 if TYPE_CHECKING:
     from liverjax.jobs.long_run import Ran
     from liverjax.scenes.scene import Scene
+    from liverjax.simulation.run import Result
 
 
 def add(parsers: argparse._SubParsersAction) -> None:
@@ -21,6 +22,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("--png", action="store_true", help="draw the last state as well")
     command.add_argument("--every", type=int, default=50, metavar="N", help="steps between two writes (50)")
     command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
+    command.add_argument("--mesh-error", action="store_true", help="estimate what the mesh leaves out of the result")
     add_out(command)
     command.set_defaults(run=run)
 
@@ -46,6 +48,8 @@ def run(options: argparse.Namespace) -> int:
         return 1
     finally:
         bar.close()
+    if options.mesh_error:
+        ran = ran._replace(result=_with_mesh_error(scene, ran.result))
     _write_and_tell(scene, text, ran, target)
     written = [str(target)]
     if options.vtu:
@@ -60,6 +64,17 @@ def run(options: argparse.Namespace) -> int:
     return 1 if np.any(codes != status.CONVERGED) else 0
 
 
+def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
+    import jax.numpy as jnp
+
+    from liverjax.core.struct import replace
+    from liverjax.simulation.mesh_error import estimate
+    from liverjax.simulation.run import prepared
+
+    whole = estimate(prepared(scene), jnp.asarray(result.positions), jnp.asarray(result.reactions))
+    return replace(result, mesh_error=whole)
+
+
 def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path) -> None:
     """Write the results in place of the parts of the run; print what it took and what to be cautious of."""
     import numpy as np
@@ -67,7 +82,7 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path) -> None
     from liverjax.core.versions import versions
     from liverjax.jobs import output, parts
     from liverjax.physics import porosity
-    from liverjax.simulation.cautions import cautions
+    from liverjax.simulation.cautions import cautions, mesh_sentence
 
     attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
     if scene.porosity is not None:
@@ -88,3 +103,5 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path) -> None
     )
     for sentence in said:
         print(f"caution: {sentence}")
+    if ran.result.mesh_error is not None:
+        print(mesh_sentence(scene, ran.result))

@@ -12,7 +12,7 @@ from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_grad
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
     """cof(F) D_a = dJ/dx_a of the four corners of every point."""
     cof = cofactor(F)
-    g = [matvec(cof, tuple(mesh.shape_vectors[a])) for a in range(3)]
+    g = [matvec(cof, tuple(mesh.gradients[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
 
 
@@ -24,11 +24,11 @@ def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
     J = determinant(deformation_gradient(mesh, x))
     if mesh.order == 1:
         return J[None]
-    c, D = functions(mesh.order, np.eye(4))[1], mesh.shape_vectors
+    c, D = functions(mesh.order, np.eye(4))[1], mesh.gradients
     columns = [[x[:, i][n] for n in mesh.element_nodes] for i in range(3)]
     corners = []
     for column in columns:
-        y = [sum(c[a, k][:, None] * v for a, v in enumerate(column) if c[a, k].any()) for k in range(4)]
+        y = [sum(c[a, k][:, None] * v[None] for a, v in enumerate(column) if c[a, k].any()) for k in range(4)]
         corners.append([y[k] - y[0] for k in (1, 2, 3)])
     F = tuple(tuple(sum(y[a] * D[a, j] for a in range(3)) for j in range(3)) for y in corners)
     return jnp.concatenate([J, determinant(F)])

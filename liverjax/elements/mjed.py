@@ -34,12 +34,13 @@ _PAIRS = ((1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     """Total strain energy [J] at positions x (V, 3) [m]."""
+    law = mesh.at_points(law)
     return jnp.sum(mesh.weights * law.strain_energy(law.measures(deformation_gradient(mesh, x))))
 
 
 def nodal_force(mesh: TetMesh, P: Matrix) -> jax.Array:
     """Sum over points of V0 P D_a at their nodes: (V, 3) [N] from first Piola-Kirchhoff stresses [Pa]."""
-    D, V0 = mesh.shape_vectors, mesh.weights
+    D, V0 = mesh.gradients, mesh.weights
     forces: Any = [[V0 * dot(P[i], tuple(D[a])) for i in range(3)] for a in range(3)]
     if mesh.order > 1:
         forces = stored(forces)
@@ -55,7 +56,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
         law: any law; parameters may be traced.
         x: positions (V, 3) [m].
     """
-    return nodal_force(mesh, first_piola(law, deformation_gradient(mesh, x)))
+    return nodal_force(mesh, first_piola(mesh.at_points(law), deformation_gradient(mesh, x)))
 
 
 def element_stiffness(
@@ -67,7 +68,8 @@ def element_stiffness(
     The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
     F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
-    D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
+    D = [tuple(mesh.gradients[a]) for a in range(3)]
+    law = mesh.at_points(law)
     if terms not in ("contracted", "chapter"):
         raise InputError(f"terms = {terms!r} is not known: use contracted or chapter")
     if terms == "chapter":

@@ -30,7 +30,7 @@ _VOIGT = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 def energy(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     """Total strain energy [J] at positions x (V, 3) [m], through (..., E, 3, 3) deformation gradients."""
-    return jnp.sum(mesh.weights * law.energy(_gradient(mesh, x)))
+    return jnp.sum(mesh.weights * mesh.at_points(law).energy(_gradient(mesh, x)))
 
 
 @jax.jit
@@ -44,7 +44,7 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     D = _all_shape_vectors(mesh)
 
     def total(nodes):
-        return jnp.sum(mesh.weights * law.energy(jnp.einsum("eai,...eaj->...eij", nodes, D)))
+        return jnp.sum(mesh.weights * mesh.at_points(law).energy(jnp.einsum("eai,...eaj->...eij", nodes, D)))
 
     return derivative(jax.grad(total), x[jnp.stack(mesh.element_nodes, axis=1)])
 
@@ -57,7 +57,7 @@ def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_
 @jax.jit
 def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     """Standard finite elements: B^T S with S = 2 dW/dC, (V, 3) [N]."""
-    F = _gradient(mesh, x)
+    F, law = _gradient(mesh, x), mesh.at_points(law)
     S = _second_piola(law, F)
     B = _strain_displacement(F, _all_shape_vectors(mesh))
     share = jnp.einsum("...e,...evad,...ev->...ead", mesh.weights, B, _voigt(S))
@@ -67,7 +67,7 @@ def standard_internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 
 @jax.jit
 def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
-    F, D = _gradient(mesh, x), _all_shape_vectors(mesh)
+    F, D, law = _gradient(mesh, x), _all_shape_vectors(mesh), mesh.at_points(law)
     C = jnp.einsum("...ki,...kj->...ij", F, F)
     elasticity = 2 * derivative(lambda C: _second_piola_of(law, C), C)
     elasticity = 0.5 * (elasticity + jnp.swapaxes(elasticity, -1, -2))

@@ -16,7 +16,7 @@ from liverjax.simulation.run import Result
 
 
 def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, Any]) -> None:
-    """times, positions, reactions, reference, tetrahedra; status, iterations and `attributes` as attributes.
+    """Rows and mesh as datasets; status, iterations and `attributes` as attributes.
 
     The nodes of quadratic tetrahedra (E, 10) stand in the order of VTK.
     """
@@ -29,6 +29,10 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
         if result.pressure is not None:
             out["pressure"] = np.asarray(result.pressure)
             out["pressure"].attrs["unit"] = "Pa"
+        if result.mesh_error is not None:
+            for name, unit in (("positions", "m"), ("reactions", "N"), ("found", "1")):
+                out[f"mesh_error/{name}"] = np.asarray(getattr(result.mesh_error, name))
+                out[f"mesh_error/{name}"].attrs["unit"] = unit
         out["times"].attrs["unit"] = "s" if scene.solve.dt is not None else "load step"
         out["reference"] = np.asarray(scene.mesh.points)
         out["reference"].attrs["unit"] = "m"

@@ -202,7 +202,7 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any
         mask = np.zeros(mesh.number_of_elements, dtype=np.int32)
         mask[np.asarray(elements)] = 1
         cell_data[f"set:{name}"] = [mask]
-    cells = [meshio_cells(mesh, gmsh=Path(path).suffix == ".msh")]
+    cells = [meshio_cells(mesh)]
     # meshio takes .msh for an ANSYS file; in this field it is Gmsh's.
     file_format = "gmsh" if Path(path).suffix == ".msh" else None
     meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
@@ -210,10 +210,9 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any
     )
 
 
-def meshio_cells(mesh: TetMesh, gmsh: bool = False) -> tuple[str, np.ndarray]:
-    """Cells (E, 4) or (E, 10) as meshio has them; `gmsh`: for its writer, which swaps the last two middles."""
+def meshio_cells(mesh: TetMesh) -> tuple[str, np.ndarray]:
+    """Cells (E, 4) or (E, 10) as meshio has them, in the order of VTK."""
     if mesh.order == 1:
         return "tetra", np.asarray(mesh.tetrahedra)
     nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
-    nodes = nodes[:, [*range(4), *(4 + PAIRS.index(pair) for pair in _VTK)]]
-    return "tetra10", nodes[:, [*range(8), 9, 8]] if gmsh else nodes
+    return "tetra10", nodes[:, [*range(4), *(4 + PAIRS.index(pair) for pair in _VTK)]]

@@ -47,7 +47,7 @@ def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
     if mesh.order == 1:
         return (corner[0] + corner[1] + corner[2] + corner[3]) / 4
     L = jnp.asarray(basis(mesh.order).L, values.dtype)
-    return sum(L[a][:, None] * corner[a] for a in range(1, 4)) + L[0][:, None] * corner[0]
+    return sum((L[a][:, None] * corner[a][None] for a in range(1, 4)), L[0][:, None] * corner[0][None])
 
 
 #: Parts of an element's volume at its vertices and at the middles of its edges: of a lumped mass (Hinton, Rock and

@@ -5,7 +5,7 @@ An element has 4 nodes, or 10: vertices and the middles of its edges (`liverjax.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.mesh.adjacency import PAIRS, Pattern, pattern
 from liverjax.mesh.basis import basis
+
+T = TypeVar("T")
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
@@ -58,6 +60,18 @@ class TetMesh:
         if self.order == 1:
             return self.volumes
         return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
+
+    @property
+    def gradients(self) -> jax.Array:
+        """`shape_vectors` as they go with arrays over the points: (3, 3, E), or (3, 3, 1, E)."""
+        return self.shape_vectors if self.order == 1 else self.shape_vectors[:, :, None]
+
+    def at_points(self, numbers: T) -> T:
+        """A pytree, such as a law, whose numbers by element (E,) or (E, 3) go with arrays over the points."""
+        if self.order == 1:
+            return numbers
+        by_element = ((self.number_of_elements,), (self.number_of_elements, 3))
+        return jax.tree.map(lambda a: a[None] if jnp.shape(a) in by_element else a, numbers)
 
     @property
     def element_nodes(self) -> list[jax.Array]:

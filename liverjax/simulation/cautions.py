@@ -27,6 +27,27 @@ def cautions(scene: Scene, result: Result) -> list[str]:
     return [*_of_mesh(scene.mesh), *_of_volumes(scene, result)]
 
 
+#: A mesh error below this part of the largest displacement is not worth another mesh.
+_SMALL = 0.02
+
+
+def mesh_sentence(scene: Scene, result: Result) -> str:
+    """One line: the largest displacement of the last step, what the mesh leaves out of it, and the remedy."""
+    assert result.mesh_error is not None
+    x, error = np.asarray(result.positions[-1]), np.asarray(result.mesh_error.positions[-1])
+    u = x - np.asarray(scene.mesh.points)
+    size = np.linalg.norm(u, axis=1)
+    worst = int(np.argmax(size))
+    change = float(u[worst] @ error[worst] / max(size[worst], 1e-300))
+    said = f"mesh error (estimate, last step): largest displacement {size[worst]:.4g} m, {change:+.2g} m without a mesh"
+    if not np.all(np.asarray(result.mesh_error.found)):
+        return f"{said}; at some steps the estimate leads to no state: the mesh is too coarse to say"
+    if abs(change) <= _SMALL * size[worst]:
+        return said
+    remedy = "order = 2 in [mesh], or a finer mesh" if scene.mesh.order == 1 else "a finer mesh"
+    return f"{said} ({100 * change / size[worst]:+.0f} %): take {remedy}"
+
+
 def _of_mesh(mesh: TetMesh) -> list[str]:
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     size, quality = float(np.ptp(points, axis=0).max()), qualities(points, tets, np.asarray(mesh.volumes))

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import param, replace, struct
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
@@ -35,7 +35,6 @@ from liverjax.simulation.equations import (
     initial_state,
     positions,
 )
-from liverjax.simulation.run import Result, prepared
 from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
@@ -54,15 +53,14 @@ class MeshError:
     reactions: jax.Array = param("N", "(T, V, 3)")
     found: jax.Array = param("1", "(T,) whether the linear solve of the step ended, with finite numbers")
 
-    def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Result) -> tuple[Any, Any]:
+    def change(self, of: Callable[[jax.Array, jax.Array], Any], result: Any) -> tuple[Any, Any]:
         """A number of interest and its estimated change: add it to correct, `BAR` times its size is the error bar.
 
         Args:
             of: (positions (T, V, 3), reactions (T, V, 3)) -> numbers, any pytree; its derivative along the error.
-            result: of the run.
+            result: `Result` of the run.
         """
-        at, along = (result.positions, result.reactions), (self.positions, self.reactions)
-        return jax.jvp(of, at, along)
+        return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
 
     @property
     def largest(self) -> jax.Array:
@@ -70,22 +68,25 @@ class MeshError:
         return jnp.max(jnp.linalg.norm(self.positions, axis=-1), axis=-1)
 
 
-def mesh_error(scene: Scene, result: Result) -> MeshError:
-    """The estimate for a run that began in the reference positions; its node numbers may not be traced.
+def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshError:
+    """The estimate for a run from the reference positions; its node numbers may not be traced.
+
+    Args:
+        scene: as it was run (`liverjax.simulation.run.prepared`).
+        positions, reactions: of the run (T, V, 3).
 
     Raises:
-        InputError: a scene of another mesh than the result's; a scheme of one linear solve a step, whose error is not
-            that of the mesh alone.
+        InputError: a scene of another mesh; a scheme of one linear solve a step, whose error is not the mesh's alone.
     """
-    scene = prepared(scene)
-    if result.positions.shape[1] != scene.mesh.number_of_nodes:
+    if positions.shape[1] != scene.mesh.number_of_nodes:
         raise InputError(
-            f"result.positions has {result.positions.shape[1]} nodes, the scene {scene.mesh.number_of_nodes}: give the "
-            "scene of the run"
+            f"result.positions has {positions.shape[1]} nodes, the scene {scene.mesh.number_of_nodes}: give the scene "
+            "of the run"
         )
     if scene.solve.newton == "one_step":
         raise InputError("solve.newton = 'one_step' leaves an error of its own: estimate that of a converged run")
-    return _estimate(scene, enriched(scene), result.positions, result.reactions)
+    rich = enriched(scene)
+    return _estimate(scene, replace(rich, law=rich.mesh.at_points(rich.law)), positions, reactions)
 
 
 @jax.jit

@@ -16,6 +16,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
 from liverjax.simulation import automatic, checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs
+from liverjax.simulation.mesh_error import MeshError, estimate
 from liverjax.simulation.step import problem_of, step
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
@@ -32,6 +33,7 @@ class Result:
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     pressure: jax.Array | None = param("Pa", "(T, V), of a porous scene", default=None)
     statistics: StepStatistics = param("1", "per step: Newton and CG iterations, cuts, residual")
+    mesh_error: MeshError | None = param("1", "estimate of what the mesh leaves out, where asked for", default=None)
 
     def check(self) -> "Result":
         """The result itself, or `RuntimeError` with advice where a step failed; host side."""
@@ -107,6 +109,7 @@ def simulate(
     report: Callable[[int], None] | None = None,
     start: jax.Array | None = None,
     store: str | int = "all",
+    mesh_error: bool = False,
 ) -> Result:
     """Run a scene; may be differentiated, vmapped and jitted. See `Result` and `Result.check`.
 
@@ -119,6 +122,8 @@ def simulate(
         store: of a derivative in reverse mode: "all" keeps what every step ended with; "sqrt", or a number, keeps as
             many states (the root of the number of steps) and runs what lies between a second time. Without a
             derivative it does nothing. See `liverjax.simulation.gradients`.
+        mesh_error: whether to estimate what the mesh leaves out (`liverjax.simulation.mesh_error`), for a run that
+            begins in the reference positions.
 
     Raises:
         InputError: choices that mean nothing; numbers out of bounds, unless traced; precision "float64" where JAX's
@@ -129,7 +134,12 @@ def simulate(
         start = jnp.array(start, scene.mesh.points.dtype)
         if start.shape != scene.mesh.points.shape:
             raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
-    return _run(scene, start, report, checkpoints.number_kept(store, scene.solve.steps))
+    result = _run(scene, start, report, checkpoints.number_kept(store, scene.solve.steps))
+    if not mesh_error:
+        return result
+    if start is not None:
+        raise InputError("mesh_error = True is for runs from the reference positions: leave start out")
+    return replace(result, mesh_error=estimate(scene, result.positions, result.reactions))
 
 
 def simulate_part(
@@ -173,6 +183,7 @@ def prepared(scene: Scene) -> Scene:
     if scene.region:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
         scene = replace(scene, law=per_element, region=())
+    scene = replace(scene, law=scene.mesh.at_points(scene.law))
     if scene.solve.linear_solver == "auto":
         scene = replace(scene, solve=replace(scene.solve, linear_solver=automatic.linear_solver(scene)))
     if scene.solve.precision == "float32":

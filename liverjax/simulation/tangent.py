@@ -43,7 +43,7 @@ KINDS = ("true", "projected", "regularised")
 def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> dict[tuple[int, int], Matrix]:
     """K_ab [N/m] of corners 1 <= a <= b <= 3 of every point, at given nodal pressures (V,) [Pa] or None."""
     mesh, F = e.mesh, stored(F)
-    D = [tuple(mesh.shape_vectors[a]) for a in range(3)]
+    D = [tuple(mesh.gradients[a]) for a in range(3)]
     volume = None if e.volume is None else e.volume.scalars(mesh, pressure, F)
     if kind == "true":
         summands = [solid.blocks(F, D, _OWN) for solid in e.solids]

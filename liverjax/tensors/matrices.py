@@ -158,5 +158,5 @@ def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
     if jnp.shape(x) != mesh.points.shape:
         raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 a node, {mesh.points.shape}")
     edges = mesh.edges([x[:, c] for c in range(3)])
-    D = mesh.shape_vectors
+    D = mesh.gradients
     return tuple(tuple(sum(edges[a][i] * D[a, j] for a in range(3)) for j in range(3)) for i in range(3))

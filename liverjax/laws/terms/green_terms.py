@@ -47,7 +47,7 @@ def components(direction: Any, like: Any) -> Vector:
     """A direction (3,), or one an element (E, 3), as a unit vector of components in the precision of `like`."""
     direction = jnp.asarray(direction, jnp.result_type(like))
     shape, elements = direction.shape, jnp.shape(like)
-    if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[:-1] != elements[-1:]):
+    if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[-2] != elements[-1]):
         raise InputError(f"a direction has shape {shape}: give (3,) or one row of 3 an element, {(*elements, 3)}")
     return unit(tuple(direction[..., i] for i in range(3)))
 
