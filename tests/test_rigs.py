@@ -13,12 +13,14 @@ from fitting.fits import joint
 from fitting.methods import generalised_maxwell
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
+from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
 
 LAW = lj.laws.NeoHookean(mu=jnp.asarray(800.0), bulk=jnp.asarray(2400.0))
 PRONY = lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.5]))
 R, H = 0.01, 0.01
+COARSE, FINE = glued.Cells(rim=0.3, edge=0.3, growth=2.0), glued.Cells(rim=0.02, edge=0.01, growth=0.5, corners=32)
 
 
 @pytest.mark.parametrize("times", [(0.1,), pytest.param((0.1, 0.05), marks=pytest.mark.slow)], ids=["one", "two"])
@@ -27,7 +29,8 @@ def test_creep_is_that_of_the_standard_linear_solid(times, verified):
     first step, in which the load comes up; at second order."""
     errors = []
     for dt in times:
-        rig = glued.creep(R, H, dt, round(1 / dt), 0.01, cell_size=0.005)
+        # Two cells and linear elements: the mesh is in both, and compiles quickly.
+        rig = glued.creep(R, H, dt, round(1 / dt), 0.01, glued.Cells(size=0.005, order=1))
         u, codes = glued.read(rig, LAW, PRONY)
         # Nothing relaxes within 1e-9 of the time: the elastic sample, by the same program.
         lasting = lj.Prony(ratios=PRONY.ratios, relaxation_times=jnp.array([1e9]))
@@ -47,8 +50,8 @@ def test_creep_is_that_of_the_standard_linear_solid(times, verified):
 def test_tension_relaxes_as_the_law_says(verified):
     """Held at a small strain, the force falls to 1 - g (1 - q exp(...)): after many relaxation times to 1 - g."""
     strains = np.full(40, 1e-4)
-    force, codes = glued.read(glued.tension(R, H, 0.25, strains, cell_size=0.005), LAW, PRONY)
-    elastic = glued.read(glued.tension(R, H, 0.25, strains[:1], cell_size=0.005), LAW, None)[0][0]
+    force, codes = glued.read(glued.tension(R, H, 0.25, strains, COARSE), LAW, PRONY)
+    elastic = glued.read(glued.tension(R, H, 0.25, strains[:1], COARSE), LAW, None)[0][0]
     assert not np.any(codes)
     off = abs(float(force[-1] / elastic) - 0.6)
     verified("relaxed over elastic force of a cylinder", "1 - sum of ratios", off, 1e-6)
@@ -102,9 +105,9 @@ def test_the_table_of_converged_numbers_is_that_of_another_program(verified):
 
 
 def test_the_default_mesh_is_within_one_percent(verified):
-    errors = _errors("tension", 1.0, (3.0, 20.0, 1e4))
-    verified("tension of a glued cylinder, K/mu 3 to 1e4", "axisymmetric solver", abs(errors).max(), 0.01)
-    assert abs(errors).max() < 0.01
+    errors = _errors("tension", 1.0, (3.0, 20.0))
+    verified("tension of a glued cylinder, K/mu 3 and 20", "axisymmetric solver", abs(errors).max(), 0.01)
+    assert abs(errors).max() < 0.01, errors
 
 
 @pytest.mark.slow
@@ -120,10 +123,9 @@ def test_the_default_mesh_is_within_one_percent_for_any_shape(test, aspect, veri
 @pytest.mark.slow
 @pytest.mark.parametrize("test", ["tension", "punch", "creep"])
 def test_the_estimate_is_near_the_error(test):
-    """Of a mesh with cells twice and four times as long, whose error is some percent."""
-    coarse = glued.Cells(rim=0.16, edge=0.08, growth=1.4)
-    errors = _errors(test, 1.0, (3.0, 20.0), cells=coarse)
-    estimates = _errors(test, 1.0, (3.0, 20.0), cells=coarse, read=_corrected) - errors
+    """Of a coarse mesh, whose error is some percent."""
+    errors = _errors(test, 1.0, (3.0, 20.0), cells=COARSE)
+    estimates = _errors(test, 1.0, (3.0, 20.0), cells=COARSE, read=_corrected) - errors
     # What the estimate adds, over what is missing.
     ratio = -estimates / errors
     assert np.all(abs(errors) > 2e-3) and np.all((ratio > 0.5) & (ratio < 2)), (errors, ratio)
@@ -187,10 +189,11 @@ def test_derivatives_by_the_parameters(kind):
     """Of the last reading by mu, g and tau: forward and reverse mode, and central differences."""
     strains = 0.1 * np.arange(1, 4) / 3
     rig = {
-        "tension": lambda: glued.tension(R, H, 0.2, strains, cell_size=0.005),
-        "indentation": lambda: glued.indentation(R, H, 0.006, 0.2, 0.01 * strains, cell_size=0.005),
-        "creep": lambda: glued.creep(R, H, 0.2, 3, 50.0, cell_size=0.005),
+        "tension": lambda: glued.tension(R, H, 0.2, strains, COARSE),
+        "indentation": lambda: glued.indentation(R, H, 0.006, 0.2, 0.01 * strains, COARSE),
+        "creep": lambda: glued.creep(R, H, 0.2, 3, 50.0, COARSE),
     }[kind]()
+    rig = replace(rig, scene=replace(rig.scene, solve=replace(rig.scene.solve, tolerance=1e-9)))
 
     @jax.jit
     def last(p):
@@ -217,24 +220,40 @@ def _sweep(model, noise, seed):
 
 @pytest.mark.slow
 def test_two_tests_know_more_than_one():
-    """A slow mode outside a sweep's band: creep adds it; every interval of the joint fit is narrower than alone."""
+    """A slow mode outside a sweep's band: creep, of a finer mesh, adds it; every interval of the joint fit is narrower
+    than alone; the stated bias is a small part of it."""
     model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.3, 0.3]), jnp.array([8.0, 0.1]))
-    rig = glued.creep(R, H, 1.0, 20, 20.0, cell_size=0.005)
+    rig, fine = glued.creep(R, H, 1.0, 20, 20.0), glued.creep(R, H, 1.0, 20, 20.0, FINE)
     law = lj.laws.NeoHookean(mu=1.0, bulk=3.0)
     viscosity = lj.Prony(ratios=model.ratios, relaxation_times=model.relaxation_times)
-    readings = np.asarray(glued.read(rig, lj.laws.scaled(law, 800.0), viscosity)[0])
+    readings = np.asarray(glued.read(fine, lj.laws.scaled(law, 800.0), viscosity)[0])
     sd = 0.01 * readings[-1]
     noisy = readings + sd * np.random.default_rng(1).normal(size=readings.shape)
     of_sweep, of_creep = joint.sweep(_sweep(model, 0.02, 0)), joint.through("creep", rig, noisy, sd)
     start = generalised_maxwell.Maxwell(jnp.asarray(700.0), jnp.array([0.25, 0.25]), jnp.array([5.0, 0.2]))
     alone, both = joint.fit([of_sweep], start, law), joint.fit([of_sweep, of_creep], start, law)
-    assert both.converged and both.names == alone.names
+    assert both.converged and both.names == alone.names and alone.mesh_bias is None
     true = np.array([800.0, 0.3, 0.3, 8.0, 0.1])
     assert np.all(np.abs(both.values - true) < 4 * both.standard_errors)
     assert np.all(both.standard_errors < alone.standard_errors)
     assert both.standard_errors[3] < 0.5 * alone.standard_errors[3]
+    assert np.all(abs(both.mesh_bias) < both.standard_errors)
     with pytest.raises(lj.InputError, match="readings for 20 steps"):
         joint.through("creep", rig, noisy[:5], sd)
+
+
+@pytest.mark.slow
+def test_a_coarse_mesh_says_what_it_does_to_a_modulus():
+    """Creep of a fine mesh fitted on a coarse one: G0 is off by some percent, as stated, and corrected to a third."""
+    model = generalised_maxwell.Maxwell(jnp.asarray(800.0), jnp.array([0.3]), jnp.array([2.0]))
+    law = lj.laws.NeoHookean(mu=1.0, bulk=20.0)
+    viscosity = lj.Prony(ratios=model.ratios, relaxation_times=model.relaxation_times)
+    rig, fine = glued.creep(R, H, 1.0, 6, 20.0, COARSE), glued.creep(R, H, 1.0, 6, 20.0, FINE)
+    readings = np.asarray(glued.read(fine, lj.laws.scaled(law, 800.0), viscosity)[0])
+    with pytest.warns(UserWarning, match="the mesh moves shear_modulus"):
+        found = joint.fit([joint.through("creep", rig, readings, 1e-4 * readings[-1])], model, law)
+    off = found.values[0] - 800.0
+    assert abs(off) > 8 and abs(off - found.mesh_bias[0]) < abs(off) / 2, (off, found.mesh_bias)
 
 
 @pytest.mark.slow

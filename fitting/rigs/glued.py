@@ -246,6 +246,6 @@ def _scene(sample: _Sample, dt: float, steps: int, **loads: Any) -> lj.Scene:
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
         fixed=sample.fixed,
         physics=sample.physics,
-        solve=lj.Solve(dt=dt, steps=steps, tolerance=1e-9, volumetric=sample.volumetric),
+        solve=lj.Solve(dt=dt, steps=steps, tolerance=1e-8, volumetric=sample.volumetric),
         **loads,
     )
