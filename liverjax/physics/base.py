@@ -110,6 +110,8 @@ class VolumeStress:
 
     #: Whether pressures depend on where the step ends: then they are unknowns of the mixed system.
     coupled: ClassVar[bool] = True
+    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.mixed_volume`), not solved for on the way.
+    unknown: ClassVar[bool] = False
 
     def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,)."""

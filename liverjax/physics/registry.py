@@ -10,6 +10,7 @@ from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.inertia import Inertia
 from liverjax.physics.loads import Loads
+from liverjax.physics.mixed_volume import MixedVolume
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Viscoelasticity
 
@@ -27,8 +28,8 @@ def law_at_rest(scene: Any) -> Law:
 
 def physics_of(scene: Any) -> tuple[Physics, ...]:
     """What acts in a `liverjax.scenes.scene.Scene`: what it lacks is not there."""
-    law, averaged = law_at_rest(scene), scene.solve.volumetric == "nodal"
-    if averaged:
+    law, averaged, mixed = law_at_rest(scene), scene.solve.volumetric == "nodal", scene.solve.volumetric == "mixed"
+    if averaged or mixed:
         law = isochoric_part(scene.law)
     solid: Physics = Elasticity(law=law)
     if scene.viscosity is not None:
@@ -38,6 +39,8 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
         found.append(scene.porosity)
     elif averaged:
         found.append(AveragedVolume(law=scene.law))
+    elif mixed:
+        found.append(MixedVolume(law=scene.law))
     body = scene.body
     if body is not None and scene.solve.kind == "dynamic":
         found.append(Inertia(density=body.density, integrator=scene.solve.integrator))

@@ -49,7 +49,9 @@ class Solve:
         default="auto", about="cg; direct: factorised on the host; auto: by size and stiffness (`choice`)"
     )
     volumetric: str = static(
-        default="element", about="element, or nodal: volume changes averaged at nodes, against locking"
+        default="element",
+        about="element; against locking nodal: averaged at nodes, or mixed: pressures of their own (quadratic "
+        "elements); auto: mixed where it can be",
     )
     robust: str = static(
         default="off", about="projected or regularised: make the energy least where a step cannot be followed"

@@ -10,6 +10,7 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import boundary, porosity, viscosity
 from liverjax.physics.base import Physics
+from liverjax.physics.mixed_volume import check as check_mixed_law
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Body, Scene
@@ -21,7 +22,7 @@ CHOICES = {
     "integrator": ("euler", "newmark"),
     "precision": ("float64", "float32"),
     "linear_solver": ("auto", "cg", "direct"),
-    "volumetric": ("element", "nodal"),
+    "volumetric": ("element", "nodal", "mixed", "auto"),
     "robust": ("off", "projected", "regularised"),
 }
 
@@ -38,8 +39,10 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
-    if scene.solve.volumetric == "nodal":
-        _nodal(scene)
+    if scene.solve.volumetric in ("nodal", "mixed"):
+        _own_volumes(scene)
+    if scene.solve.volumetric == "mixed":
+        _mixed(scene)
     if scene.solve.robust != "off" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] robust needs forces with an energy: leave it out where a pressure follows the body")
     for k, load in enumerate(scene.traction):
@@ -63,10 +66,21 @@ def _body(body: Body, nodes: int) -> None:
         raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")
 
 
-def _nodal(scene: Scene) -> None:
-    name = "[solve] volumetric = 'nodal'"
+def _mixed(scene: Scene) -> None:
+    name = "[solve] volumetric = 'mixed'"
+    if scene.mesh.order != 2:
+        raise InputError(f"{name} needs quadratic elements: write order = 2 in [mesh], or take 'nodal'")
+    if scene.solve.linear_solver == "direct":
+        raise InputError(f"{name} iterates with a solver of its own: leave linear_solver = 'direct' out")
+    if scene.solve.robust != "off":
+        raise InputError(f"{name} has no energy that a solution makes least, which robust needs: leave one of them out")
+    check_mixed_law(scene.law, name)
+
+
+def _own_volumes(scene: Scene) -> None:
+    name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
-        raise InputError(f"{name} averages a law's own volumetric energy, a sponge has another: use 'element'")
+        raise InputError(f"{name} holds a law's own volumetric energy, a sponge has another: use 'element'")
     if laws.isochoric_part(scene.law) is None or laws.volumetric_part(scene.law) is None:
         raise InputError(f"{name} needs a law with bulk apart from its shear, {type(scene.law).__name__} is none")
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":

@@ -8,7 +8,9 @@ import jax
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
 from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene_checks import check_choices
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
 
@@ -17,6 +19,8 @@ def linear_solver(scene: Scene) -> str:
     """The solver for a scene: cg or direct. If its numbers are traced, they are not known: cg."""
     mesh, solve = scene.mesh, scene.solve
     small = mesh.number_of_elements <= LARGEST
+    if solve.volumetric == "mixed":
+        return "cg"
     if solve.kind != "static" or not small or any(load.pressure is not None for load in scene.traction):
         return "cg"
     try:
@@ -30,6 +34,21 @@ def linear_solver(scene: Scene) -> str:
     shear, bulk, points, volumes = (np.asarray(a, float) for a in numbers)
     stiff = bool(np.any(bulk > STIFFEST * shear))
     return "direct" if stiff or thinnest(points, np.asarray(mesh.tetrahedra), volumes) < THINNEST else "cg"
+
+
+def volumetric(scene: Scene) -> str:
+    """The form for volume changes: mixed for quadratic elements where it can be, else element.
+
+    Looks at no numbers: a run and its derivatives must be of one form.
+    """
+    name = scene.solve.volumetric
+    if name != "auto":
+        return name
+    try:
+        check_choices(replace(scene, solve=replace(scene.solve, volumetric="mixed")))
+    except InputError:
+        return "element"
+    return "mixed"
 
 
 def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> float:

@@ -59,6 +59,11 @@ class Equations(NamedTuple):
         return next((a for a in self.acting if isinstance(a, VolumeStress)), None)
 
     @property
+    def mixed(self) -> Any:
+        """Physics whose pressures are unknowns beside the positions, or None."""
+        return self.volume if self.volume is not None and self.volume.unknown else None
+
+    @property
     def nodal(self) -> list[NodalForce]:
         """Physics that act at nodes."""
         return [a for a in self.acting if isinstance(a, NodalForce)]
@@ -144,6 +149,7 @@ def equations(scene: Scene, state: State, k: Any, sizes: Sizes | None = None) ->
 def positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
     """Positions (V, 3) of unknowns q (3 V,) and of what is held at part s of the step."""
     held, solve, free = e.mesh.points, e.scene.solve, e.free
+    q = q[: 3 * e.mesh.number_of_nodes]
     if e.scene.displaced:
         # Straight from beginning to end: a history may bend within the step, and only its end counts.
         before, after = (
@@ -157,6 +163,19 @@ def positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
     return x - jnp.sum(free.normals * (x - e.mesh.points), axis=1, keepdims=True) * free.normals
 
 
+def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
+    """Unknowns q of a step at positions x (V, 3): the free ones (3 V,), then pressures that are unknown, in their unit.
+
+    Args:
+        pressure: of the vertices (V,) [Pa], where they are unknown; default: those at the beginning of the step.
+    """
+    q = flat(e.free.vectors(x))
+    if e.mixed is None:
+        return q
+    pressure = e.mixed.before if pressure is None else pressure
+    return jnp.concatenate([q, pressure / e.mixed.unit])
+
+
 def forces(e: Equations, q: jax.Array, s: Any) -> Forces:
     """Forces of all physics at unknowns q (3 V,), at part s of the step."""
     x = positions(e, q, s)
@@ -166,9 +185,14 @@ def forces(e: Equations, q: jax.Array, s: Any) -> Forces:
     for other in rest:
         P = add_matrices(P, other)
     if e.volume is not None:
-        pressure = e.volume.pressure(e.mesh, determinant(F))
+        pressure = e.volume.pressure(e.mesh, determinant(F)) if e.mixed is None else _unknown_pressure(e, q)
         P = add_matrices(P, e.volume.stress(e.mesh, pressure, F))
     return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F)
+
+
+def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
+    """(V,) [Pa] of the vertices."""
+    return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
 def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, Any]:
@@ -177,7 +201,10 @@ def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, 
     at_work = e.noise + jnp.linalg.norm(f.internal)
     for force in f.nodal:
         at_work = at_work + jnp.linalg.norm(force)
-    return flat(e.free.vectors(f.total)), jax.lax.stop_gradient(at_work), f.pressure
+    r, at_work = flat(e.free.vectors(f.total)), jax.lax.stop_gradient(at_work)
+    if e.mixed is not None:
+        r = jnp.concatenate([r, e.mixed.unit * e.mixed.balance(e.mesh, f.pressure, determinant(f.F))])
+    return r, at_work, f.pressure
 
 
 def energy(e: Equations, q: jax.Array) -> jax.Array:

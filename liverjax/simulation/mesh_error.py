@@ -24,7 +24,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.scene import Scene
-from liverjax.simulation import tangent
+from liverjax.simulation import automatic, tangent
 from liverjax.simulation.equations import (
     Sizes,
     State,
@@ -34,8 +34,9 @@ from liverjax.simulation.equations import (
     forces,
     initial_state,
     positions,
+    residual,
+    unknowns,
 )
-from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
 #: Of linear elements and of quadratic ones: tolerance of the linear solve, part of the error that du counts for, and
@@ -86,7 +87,12 @@ def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshEr
     if scene.solve.newton == "one_step":
         raise InputError("solve.newton = 'one_step' leaves an error of its own: estimate that of a converged run")
     rich = enriched(scene)
-    return _estimate(scene, replace(rich, law=rich.mesh.at_points(rich.law)), positions, reactions)
+    # Linear elements lock: their error is that against elements which do not.
+    volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
+    solve = replace(rich.solve, linear_solver="cg", robust="off", volumetric=volumetric)
+    rich = replace(rich, law=rich.mesh.at_points(rich.law), solve=solve)
+    rich = replace(rich, solve=replace(solve, volumetric=automatic.volumetric(rich)))
+    return _estimate(scene, rich, positions, reactions)
 
 
 @jax.jit
@@ -102,10 +108,10 @@ def _estimate(scene: Scene, rich: Scene, x: jax.Array, reactions: jax.Array) -> 
 def _step(scene: Scene, rich: Scene, sizes: Sizes, state: State, given: Any) -> tuple[State, Any]:
     k, x, reactions = given
     e, one = equations(rich, state, k, sizes), jnp.ones((), x.dtype)
-    q = flat(e.free.vectors(padded(rich.mesh, x)))
+    q = unknowns(e, padded(rich.mesh, x))
     f, along = jax.linearize(lambda q: forces(e, q, one), q)
     K = tangent.tangent(e, f.pressure, f.x, one)
-    load, tolerance = -flat(e.free.vectors(f.total)), _TOLERANCE[scene.mesh.order]
+    load, tolerance = -residual(e, q, one)[0], _TOLERANCE[scene.mesh.order]
     dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
     whole = f.total + along(dq).total
     reaction = whole - e.free.vectors(whole)

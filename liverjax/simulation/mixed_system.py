@@ -81,6 +81,15 @@ def eliminated_points(
     return tuple(f - p for f, p in zip(forces, point_matrix.pull(mesh, A, dP), strict=True))
 
 
+def with_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, both: Any) -> tuple[tuple[jax.Array, ...], jax.Array]:
+    """Forces, columns (V,), and balance of unknown pressures (V,) in their unit, of a change (motion, pressures)."""
+    motion, dp = both
+    forces = point_matrix.product(mesh, A, motion)
+    pulled = point_matrix.pull(mesh, A, volume.unit * dp)
+    balance = point_matrix.volume_changes(mesh, A, motion) - volume.compliance(mesh, volume.unit * dp)
+    return tuple(f + p for f, p in zip(forces, pulled, strict=True)), volume.unit * balance
+
+
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Any) -> jax.Array:
     """Stiffness [Pa/m^3] of every point against a change of its volume where nothing flows between elements.
 

@@ -15,11 +15,10 @@ from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
 from liverjax.simulation import automatic, checkpoints
-from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs
+from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs, unknowns
 from liverjax.simulation.mesh_error import MeshError, estimate
 from liverjax.simulation.step import problem_of, step
 from liverjax.solvers import continuation
-from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.problem import StepStatistics
 
 
@@ -80,7 +79,8 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     sizes = force_sizes(scene)
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
-    method, q = problem_of(equations(scene, start, numbers[0], sizes)), flat(start.x)
+    first = equations(scene, start, numbers[0], sizes)
+    method, q = problem_of(first), unknowns(first, start.x)
     kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
     # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
     near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
@@ -93,7 +93,8 @@ def _run_part(
     scene: Scene, state: State, numbers: jax.Array, report: Callable[[int], None] | None
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
-    kept = continuation.nothing_kept(problem_of(equations(scene, state, numbers[0], sizes)), flat(state.x))
+    first = equations(scene, state, numbers[0], sizes)
+    kept = continuation.nothing_kept(problem_of(first), unknowns(first, state.x))
     advance = _step_by_step(scene, sizes, report, None)
 
     def unless_over(carry, k):
@@ -184,6 +185,7 @@ def prepared(scene: Scene) -> Scene:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
         scene = replace(scene, law=per_element, region=())
     scene = replace(scene, law=scene.mesh.at_points(scene.law))
+    scene = replace(scene, solve=replace(scene.solve, volumetric=automatic.volumetric(scene)))
     if scene.solve.linear_solver == "auto":
         scene = replace(scene, solve=replace(scene.solve, linear_solver=automatic.linear_solver(scene)))
     if scene.solve.precision == "float32":

@@ -13,7 +13,7 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.physics.base import End, NodalForce
 from liverjax.physics.elasticity import Elastic
 from liverjax.simulation import tangent
-from liverjax.simulation.equations import Equations, State, advanced, energy, forces, positions, residual
+from liverjax.simulation.equations import Equations, State, advanced, energy, forces, positions, residual, unknowns
 from liverjax.solvers import continuation
 from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.problem import Kept, Potential, Problem, StepOptions, StepStatistics
@@ -78,8 +78,8 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     )
     # Straight on where there is inertia; one step of Newton starts at x, as printed.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
-    guess = flat(e.free.vectors(ahead[0])) if ahead and not scene.displaced and not options.one_step else None
-    q, statistics, kept = continuation.solve(problem_of(e), flat(e.free.vectors(x)), options, guess, kept, near)
+    guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
+    q, statistics, kept = continuation.solve(problem_of(e), unknowns(e, x), options, guess, kept, near)
     f = forces(e, q, jnp.ones((), x.dtype))
     reactions = f.total - e.free.vectors(f.total) if e.free.normals is not None else (1 - e.free.mask) * f.total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)

@@ -157,6 +157,9 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, near: Any, kin
         border = [scale(mesh.weights, g) for g in volume_gradients(mesh, F)[1:]]
         A = A._replace(border=stored(border), pressures=C)
         bulk = mixed_system.undrained_bulk(mesh, C, 1.0 if volume.flow is None else volume.flow.mask)
+    elif e.mixed is not None:
+        g = mesh.weights * e.mixed.border(determinant(F))
+        A = A._replace(border=stored([scale(g, v) for v in volume_gradients(mesh, F)[1:]]))
     own = point_matrix.levels(mesh, A, bulk)
     inverse = block_matrix.inverse_blocks(own.diagonal, e.free.mask, e.free.normals)
     free = _of_vertices(e)
@@ -209,7 +212,19 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
         added = [point_matrix.prolonged(e.mesh, c) for c in below]
         return tuple(a + b for a, b in zip(fine(columns), added, strict=True))
 
-    return lambda r: _flat(e, levels(block_matrix.columns(r)))
+    if e.mixed is None:
+        return lambda r: _flat(e, levels(block_matrix.columns(r)))
+    volume, A, n = e.mixed, K.matrix, 3 * e.mesh.number_of_nodes
+    schur = volume.unit**2 * volume.schur(e.mesh)
+
+    def triangular(r: jax.Array) -> jax.Array:
+        """Pressures first, then the motions that they leave to the forces."""
+        dp = -r[n:] / schur
+        pulled = point_matrix.pull(e.mesh, A, volume.unit * dp)
+        left = [f - p for f, p in zip(block_matrix.columns(r[:n]), pulled, strict=True)]
+        return jnp.concatenate([_flat(e, levels(left)), dp])
+
+    return triangular
 
 
 def _flat(e: Equations, columns: Any) -> jax.Array:
@@ -221,12 +236,14 @@ def _flat(e: Equations, columns: Any) -> jax.Array:
 
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
     """K as a function of flat vectors (3 V,); pressures that depend on motion are nearly solved for, or `exactly`."""
-    A, volume = K.matrix, _coupled(e)
+    A, volume, n = K.matrix, _coupled(e), 3 * e.mesh.number_of_nodes
     following = [a for a in e.nodal if not a.conservative]
 
     def apply(v: jax.Array) -> jax.Array:
-        motion = e.free.columns(block_matrix.columns(v))
-        if isinstance(A, BlockMatrix):
+        motion, balance = e.free.columns(block_matrix.columns(v[:n])), None
+        if e.mixed is not None:
+            force, balance = mixed_system.with_pressures(e.mesh, e.mixed, A, (motion, v[n:]))
+        elif isinstance(A, BlockMatrix):
             force = block_matrix.product(A, motion)
             if volume is not None:
                 force = mixed_system.eliminated(e.mesh, volume.flow, A, force, exactly)
@@ -239,7 +256,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
             for a in following:
                 change = a.product(e.mesh, K.x, K.s, dx)
                 force = tuple(f + c for f, c in zip(force, change.T, strict=True))
-        return _flat(e, force)
+        return _flat(e, force) if balance is None else jnp.concatenate([_flat(e, force), balance])
 
     return apply
 
@@ -251,7 +268,8 @@ def solve(
     if e.scene.solve.linear_solver == "direct":
         dq = _factorised(e, K, b)
         return dq, jnp.zeros((), jnp.int32), jnp.vdot(dq, b) >= 0
-    method = conjugate_gradients if K.x is None else stabilised_biconjugate_gradients
+    # A block-triangular preconditioner is not symmetric either.
+    method = conjugate_gradients if K.x is None and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
     return dq, s.iterations, s.positive
 
@@ -275,6 +293,9 @@ def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iteratio
         x = _factorised(e, K, b)
         return x, true_residual(product(e, K, exactly=True), b, x)
     volume = _coupled(e)
+    if e.mixed is not None:
+        x, s = stabilised_biconjugate_gradients(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
+        return x, s.residual
     if volume is None or volume.flow is None:
         x, s = conjugate_gradients(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
         return x, s.residual

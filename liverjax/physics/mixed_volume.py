@@ -1,0 +1,132 @@
+"""Pressures of their own against volumetric locking, for quadratic elements: Taylor-Hood, P2/P1.
+
+With U(J) = K g(J)^2 / 2 the energy per volume is
+
+    W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
+
+p linear in every element and continuous. Where p has its best value, this is U with g averaged by p's functions: so
+volume changes are held on average, not at every point. The part gamma = min(mu, K/2) of the bulk modulus stays with the
+displacements, which keeps their matrix positive; the solution does not depend on it as the mesh is refined. Pressures
+are unknowns beside the positions: eliminated, Newton's method would not converge where K is large.
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
+from liverjax.laws.terms.invariant_terms import Scalars
+from liverjax.mesh.nodal import gathered, integrals, interpolated
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
+from liverjax.tensors.matrices import Matrix, cofactor, determinant, scale_matrix
+
+
+def check(law: Law, name: str = "[solve] volumetric = 'mixed'") -> None:
+    """Refuse a law whose pressure cannot be an unknown of its own.
+
+    Raises:
+        InputError: no isochoric split, or volumetric energies of several kinds.
+    """
+    U = volumetric_part(law)
+    if isochoric_part(law) is None or U is None:
+        raise InputError(f"{name} needs a law with an isochoric part and bulk, which {type(law).__name__} has not")
+    kinds = {(part.volumetric, part.below) for part in U.summands() if isinstance(part, Volumetric)}
+    if len(kinds) != 1 or next(iter(kinds))[1] is not None:
+        raise InputError(f"{name} needs one kind of volumetric energy in all laws: give each the same volumetric = …")
+
+
+def strain(kind: str, J: jax.Array) -> jax.Array:
+    """g(J) of U = K g^2 / 2, about J - 1: J - 1 ("quadratic"), ln J ("log"), or what "simo" has for it."""
+    if kind == "log":
+        return jnp.log(J)
+    d = J - 1
+    if kind == "quadratic":
+        return d
+    # g^2 = (J^2 - 1 - 2 ln J) / 2 = d^2 (1 + sum_n (-d)^(n-2) / n, n = 3 …), whose closed form cancels near 1.
+    near = jnp.clip(d, -0.1, 0.1)
+    series = 1 + sum((-1) ** n * near ** (n - 2) / n for n in range(3, 18))
+    safe = jnp.where(jnp.abs(d) < 0.1, 1.0, d)
+    whole = (safe**2 + 2 * safe - 2 * jnp.log1p(safe)) / (2 * safe**2)
+    return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
+
+
+@struct
+class MixedVolume(Physics):
+    """The volumetric energy of a law, with pressures as unknowns."""
+
+    law: Law = param("1", "of which the volumetric part counts")
+
+    def begin(self, start: Start) -> jax.Array:
+        """No pressure."""
+        return jnp.zeros(start.mesh.number_of_vertices, start.x.dtype)
+
+    def freeze(self, memory: jax.Array, step: Step) -> "Mixed":
+        """The moduli, and the pressure at the beginning of the step."""
+        U = volumetric_part(self.law)
+        mu, bulk = self.law.shear_modulus(), self.law.bulk_modulus()
+        part = jnp.minimum(mu, bulk / 2)
+        kind = next(law.volumetric for law in U.summands())
+        mean = jax.lax.stop_gradient(jnp.sum(jnp.broadcast_to(mu, step.mesh.weights.shape) * step.mesh.weights))
+        volume = jax.lax.stop_gradient(jnp.sum(step.mesh.volumes))
+        width = (volume / step.mesh.number_of_vertices) ** (1 / 3)
+        return Mixed(part=part, rest=bulk - part, shear=mu, before=memory, unit=mean / volume / width, kind=kind)
+
+    def advance(self, memory: jax.Array, acting: "Mixed", end: End) -> jax.Array:
+        """The pressure at the end of the step."""
+        return end.pressure
+
+
+@struct
+class Mixed(VolumeStress):
+    """Pressures as unknowns during a step."""
+
+    part: Any = param("Pa", "gamma, which stays with the displacements")
+    rest: Any = param("Pa", "K - gamma, carried by the pressures")
+    shear: Any = param("Pa", "shear modulus")
+    before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
+    unit: Any = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
+    kind: str = static(about="of the volumetric energy")
+
+    coupled: ClassVar[bool] = False
+    unknown: ClassVar[bool] = True
+
+    def _slopes(self, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """g, g' and g''."""
+
+        def first(J: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.jvp(lambda J: strain(self.kind, J), (J,), (jnp.ones_like(J),))
+
+        (g, g1), (_, g2) = jax.jvp(first, (J,), (jnp.ones_like(J),))
+        return g, g1, g2
+
+    def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
+        """(gamma g + p) g' cof F."""
+        g, g1, _ = self._slopes(determinant(F))
+        return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
+
+    def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
+        """Its stress and slope at given pressures."""
+        g, g1, g2 = self._slopes(determinant(F))
+        whole = self.part * g + interpolated(mesh, pressure)
+        return Scalars({"J": whole * g1}, {("J", "J"): self.part * g1 * g1 + whole * g2})
+
+    def border(self, J: jax.Array) -> jax.Array:
+        """g': how g of a point changes with its volume ratio."""
+        return self._slopes(J)[1]
+
+    def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
+        """Integrals (V,) [m^3] of p's functions times g - p/(K - gamma): 0 at a solution."""
+        return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
+
+    def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
+        """Integrals (V,) [m^3] of p's functions times p/(K - gamma)."""
+        return gathered(mesh, mesh.weights * interpolated(mesh, pressure) / self.rest)
+
+    def schur(self, mesh: TetMesh) -> jax.Array:
+        """Near the matrix of the pressures alone (V,) [m^3/Pa], displacements eliminated: lumped."""
+        soft = 1 / (1.5 * self.shear + self.part) + 1 / self.rest
+        return integrals(mesh, jnp.broadcast_to(soft, mesh.weights.shape))
