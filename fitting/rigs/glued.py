@@ -7,6 +7,7 @@ By default the mesh is a narrow sector of the cylinder between two planes of sym
 and at the punch's edge, where stresses are infinite. Its error is in experiments/TABLES.md.
 """
 
+import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -23,11 +24,14 @@ from liverjax.physics import boundary
 from liverjax.physics.loads import nodal_tractions
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
-from liverjax.simulation import mesh_error as estimate
+from liverjax.simulation import automatic
 
 READINGS = ("force", "displacement")
 #: A punch narrower than this part of the sample, or a gap beside it, is below what the mesh is made for.
 NARROWEST = 0.01
+#: Where a default mesh is known to be within 1 %: height over radius, and largest K/mu by the form for volume changes.
+#: Mixed needs a law with bulk apart from shear, and a viscosity of `part = "isochoric"` or none.
+SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
 
 
 class Cells(NamedTuple):
@@ -40,7 +44,7 @@ class Cells(NamedTuple):
     growth: float = cylinders.GROWTH  # of cells away from rims and edge
     corners: int = 24  # of the polygon that stands for the circle, of which a sector has one edge
     order: int = 2  # of the elements
-    volumetric: str = "element"  # how volume changes are treated, as of `lj.Solve`
+    volumetric: str = "auto"  # how volume changes are treated, as of `lj.Solve`
 
 
 @struct
@@ -81,10 +85,9 @@ def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
     It takes a run, and one linear solve in a richer space a step (`liverjax.simulation.mesh_error`). NaN where a
     step shows none.
     """
-    scene = _with(rig, law, prony)
-    result = lj.simulate(scene)
-    _, change = estimate.mesh_error(scene, result).change(lambda x, force: _reading(rig, x, force), result)
-    return change
+    result = lj.simulate(_with(rig, law, prony), mesh_error=True)
+    assert result.mesh_error is not None
+    return result.mesh_error.change(lambda x, force: _reading(rig, x, force), result)[1]
 
 
 def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
@@ -94,7 +97,27 @@ def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
             f"law {type(law).__name__} has directions, and the rig's mesh is a sector of the cylinder: give the rig a "
             "cell_size, then it is whole"
         )
-    return replace(rig.scene, law=law, viscosity=prony)
+    scene = replace(rig.scene, law=law, viscosity=prony)
+    most = STIFFEST.get(automatic.volumetric(scene))
+    ratio = _ratio(law)
+    if not rig.whole and most is not None and ratio is not None and ratio > most * (1 + 1e-9):
+        warnings.warn(
+            f"K/mu = {ratio:.3g} is above {most:g}, up to which the mesh is known to be within 1 %: see "
+            "rigs.mesh_error",
+            stacklevel=3,
+        )
+    return scene
+
+
+def _ratio(law: Law) -> float | None:
+    """Bulk over shear modulus; None where a law does not state them, or while they are traced."""
+    try:
+        moduli = law.bulk_modulus(), law.shear_modulus()
+    except InputError:
+        return None
+    if any(isinstance(m, jax.core.Tracer) for m in moduli):
+        return None
+    return float(np.max(np.asarray(moduli[0]) / np.asarray(moduli[1])))
 
 
 def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
@@ -186,6 +209,13 @@ def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | N
     for name, value in (("radius", radius), ("height", height), ("cell_size", cells.size)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"{name} = {value} must be positive and finite: give a length in metres")
+    shape = height / radius
+    if cells.size is None and not SHAPES[0] * (1 - 1e-9) <= shape <= SHAPES[1] * (1 + 1e-9):
+        warnings.warn(
+            f"height = {height:g} m is {shape:.3g} radii, and the mesh is known to be within 1 % from {SHAPES[0]:g} to "
+            f"{SHAPES[1]:g}: see rigs.mesh_error",
+            stacklevel=3,
+        )
     return cells
 
 
