@@ -131,8 +131,9 @@ def fit(
     converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
     estimate = estimated(names, parameter_vector, found, len(found.residuals))
     if any(test.mesh_error for test in tests):
-        estimate = estimate._replace(mesh_bias=_mesh_bias(tests, material(found.u)[:2], found))
-        _compare(estimate)
+        bias = _mesh_bias(tests, material(found.u)[:2], found)
+        _compare(estimate, bias)
+        estimate = estimate._replace(mesh_bias=bias)
     return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)
 
 
@@ -151,11 +152,11 @@ def _mesh_bias(tests: Sequence[Test], material: tuple[Law, Prony], found: Soluti
     return to_natural @ (np.linalg.pinv(J) @ np.concatenate(missing))
 
 
-def _compare(estimate: Estimate) -> None:
+def _compare(estimate: Estimate, bias: np.ndarray) -> None:
     """Warn where the mesh moves a parameter by more than its standard error."""
-    more = np.flatnonzero(~(np.abs(estimate.mesh_bias) <= estimate.standard_errors))
+    more = np.flatnonzero(~(np.abs(bias) <= estimate.standard_errors))
     if len(more):
-        each = (f"{estimate.names[k]} by {estimate.mesh_bias[k]:.2g}" for k in more)
+        each = (f"{estimate.names[k]} by {bias[k]:.2g}" for k in more)
         warnings.warn(
             f"the mesh moves {', '.join(each)}, more than the standard error: subtract mesh_bias, or give the rigs "
             "finer Cells",
