@@ -13,6 +13,7 @@ from liverjax.core.files import writable
 
 if TYPE_CHECKING:
     from fitting.fits.viscoelastic import Fit
+    from fitting.methods.generalised_maxwell import Spectrum
     from fitting.readers.rheometer import Sweep
 
 
@@ -20,7 +21,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     """Options of the command, which --help calls `prog`."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Identify a generalised Maxwell (Prony) model from a rheometer's frequency sweep.",
+        description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
         epilog=f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
         + EXIT_CODES,
     )
@@ -29,6 +30,12 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
+    command.add_argument(
+        "--model",
+        choices=("prony", "fractional", "spectrum", "auto"),
+        default="prony",
+        help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
+    )
     command.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
@@ -95,7 +102,27 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
+    if options.model in ("fractional", "spectrum") and options.modes != "auto":
+        raise InputError(f"--modes {options.modes} is of --model prony: leave it out for --model {options.model}")
+    if options.profile and options.model != "prony":
+        raise InputError(f"--profile is of --model prony; leave it out for --model {options.model}")
     laws.find(options.law)
+
+
+def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
+    """The fit in closed form of the model asked for."""
+    from fitting.fits import models, viscoelastic
+
+    prony = None
+    if options.model in ("prony", "auto"):
+        if options.modes == "auto":
+            prony = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
+        else:
+            prony = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
+    if options.model == "prony":
+        assert prony is not None
+        return prony
+    return models.choose(sweep, options.model, prony, dense)
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
@@ -107,10 +134,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
         viscoelastic.check_modes(sweep, options.modes)
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    if options.modes == "auto":
-        closed = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
-    else:
-        closed = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
+    closed = _closed(options, sweep, dense)
     if options.method == "closed-form":
         return [closed]
     simulation = viscoelastic.Simulation(

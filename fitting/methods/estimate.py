@@ -43,6 +43,7 @@ def estimated(
     found: Solution,
     components: int,
     deviations_given: bool = True,
+    effective: float | None = None,
 ) -> Estimate:
     """The estimate at a minimum: covariance of u, carried to the reported numbers by the delta method.
 
@@ -52,9 +53,13 @@ def estimated(
         found: minimum over u.
         components: how many of the residuals are measured; those that are not are 0 and count for nothing.
         deviations_given: as of `noise_factor`.
+        effective: where a prior holds u: the number of parameters that the data determine. The rows of the prior
+            then stand below the `components` rows of the data.
     """
     u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
-    noise = noise_factor(r, components - len(u), deviations_given)
+    if effective is not None:
+        r = r[:components]
+    noise = noise_factor(r, components - (len(u) if effective is None else effective), deviations_given)
     values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
@@ -74,7 +79,7 @@ def estimated(
     )
 
 
-def noise_factor(residuals: np.ndarray, freedom: int, deviations_given: bool) -> float:
+def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) -> float:
     """Noise over the residual scales.
 
     Without deviations the residuals estimate it. Given deviations are believed, except where the residuals are larger

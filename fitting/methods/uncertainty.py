@@ -1,5 +1,6 @@
 """How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.rheometer import Sweep
 
@@ -24,10 +26,28 @@ def parameter_names(modes: int) -> tuple[str, ...]:
     return ("shear_modulus", *ratios, *times)
 
 
-def estimate(found: Solution, deviations_given: bool) -> Estimate:
-    """Values, errors and correlation of G0, ratios and relaxation times at the minimum."""
-    names = parameter_names((len(found.u) - 1) // 2)
-    return estimated(names, parameter_vector, found, len(found.residuals), deviations_given)
+def estimate(
+    found: Solution,
+    deviations_given: bool,
+    maxwell: Callable[[jax.Array], Maxwell] = generalised_maxwell.natural,
+    components: tuple[int, float | None] | None = None,
+) -> Estimate:
+    """Values, errors and correlation of G0, ratios and relaxation times at the minimum.
+
+    Args:
+        found: minimum over u.
+        deviations_given: as of `noise_factor`.
+        maxwell: u -> Prony modes; the default is of their own parametrisation.
+        components: number of measured residuals (default all), and of effective parameters (default those of u).
+    """
+    count, effective = components or (len(found.residuals), None)
+
+    def vector(u):
+        model = maxwell(u)
+        return jnp.concatenate([model.shear_modulus[None], model.ratios, model.relaxation_times])
+
+    modes = jax.eval_shape(maxwell, jnp.asarray(found.u)).ratios.shape[0]
+    return estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
 
 
 def equilibrium_error(u: Estimate) -> float:
@@ -142,7 +162,7 @@ def superfluous(sweep: Sweep, u: Estimate) -> list[str]:
     return out
 
 
-def cautions(sweep: Sweep, u: Estimate, found: Solution) -> list[str]:
+def cautions(sweep: Sweep, u: Estimate, found: Solution, model: str = "prony") -> list[str]:
     """Sentences on what the data do not tell, each with the number it rests on and what to do."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
@@ -157,7 +177,7 @@ def cautions(sweep: Sweep, u: Estimate, found: Solution) -> list[str]:
             )
     ratios = u.values[1 : modes + 1].sum()
     equilibrium = u.values[0] * (1 - ratios)
-    if not equilibrium > 2 * equilibrium_error(u):
+    if model == "prony" and not equilibrium > 2 * equilibrium_error(u):
         out.append(
             f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
             "from zero (a fluid); measure at lower frequencies"

@@ -2,12 +2,14 @@
 
 import json
 import math
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.fits import models
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
@@ -34,6 +36,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     e = u.standard_errors
     return {
         "method": fit.method,
+        "model": fit.kind.name,
         "converged": fit.converged,
         "modes": n,
         "shear_modulus": float(fit.model.shear_modulus),
@@ -46,6 +49,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },
+        **_own(fit),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
         "correlation_names": list(u.names),
@@ -57,6 +61,15 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
         "compile_time_s": fit.compile_time,
         "details": fit.details,
     }
+
+
+def _own(fit: Fit) -> dict[str, Any]:
+    """Parameters of a model that is not made of modes."""
+    p = fit.parameters
+    if p is None:
+        return {}
+    rows = zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True)
+    return {"parameters": {n: {"value": v, "standard_error": e, "unit": unit} for n, v, e, unit in rows}}
 
 
 def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | None) -> dict[str, Any]:
@@ -116,7 +129,8 @@ def figure(sweep: Sweep, fits: list[Fit]) -> Any:
     seconds = f"{fit.run_time:.2g} s run, {fit.compile_time:.2g} s compile"
     plural = "s" if fit.modes > 1 else ""
     mean = 100 * fit.relative_errors(sweep).mean()
-    fig.suptitle(f"{fit.method}, {fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}", fontsize=10)
+    model = "" if fit.parameters is None else f"{fit.kind.name}, "
+    fig.suptitle(f"{fit.method}, {model}{fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}", fontsize=10)
     return fig
 
 
@@ -170,8 +184,10 @@ def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """The moduli, and one line a mode."""
+    """The moduli and one line a mode, or the numbers of another model."""
     u, n = fit.uncertainty, fit.modes
+    if fit.parameters is not None:
+        return _own_lines(fit)
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
     rows = [
         f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa",
@@ -185,8 +201,29 @@ def _parameter_rows(fit: Fit) -> list[str]:
     return rows
 
 
+def _own_lines(fit: Fit) -> list[str]:
+    """Numbers of a model that is not made of modes; of a spectrum a summary, its strengths are in fit.json."""
+    p = fit.parameters
+    assert p is not None
+    rows = []
+    for name, value, error, unit in zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True):
+        if not name.startswith("strengths["):
+            rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}".rstrip())
+    found = fit.details.get("spectrum")
+    if found:
+        times = found["relaxation_times"]
+        rows.append(f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,")
+        rows.append(f"on a grid of {found['times_per_decade']} times a decade;")
+        rows.append(f"the data carry {found['decades_carried']:.2g} decades of them,")
+        rows.append(f"{found['effective_parameters']:.2g} parameters in effect")
+    apart = fit.details["conversion"]["largest_relative_error"]
+    return [*rows, f"as {fit.modes} Prony modes (largest", f"difference {100 * apart:.2g} %): see fit.json"]
+
+
 def _lines(fit: Fit) -> list[str]:
     u, n = fit.uncertainty, fit.modes
+    if fit.parameters is not None:
+        return _own_lines(fit)
 
     def row(name, value, error, unit):
         return f"{name:5s} {value:11.5g} ± {error:<9.2g} {unit}".rstrip()
@@ -216,4 +253,5 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
         ]
         columns.append(rows)
     width = max(len(r) for r in columns[0]) + 3
-    return "\n".join("".join(f"{c:{width}s}" for c in row).rstrip() for row in zip(*columns, strict=True))
+    rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
+    return "\n".join([*rows, *models.table(fits[0])])
