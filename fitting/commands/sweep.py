@@ -29,6 +29,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text"
     )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
+    command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
+    command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
     command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
     command.add_argument(
         "--model",
@@ -72,6 +74,7 @@ def run(options: argparse.Namespace) -> int:
 
     _check(options)
     sweep = rheometer.read_sweep(options.sweep, options.table)
+    sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     fits = _fits(options, sweep)
@@ -127,14 +130,14 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
     """The closed form, and after it the fit through the simulation if asked for."""
-    from fitting.fits import viscoelastic
+    from fitting.fits import edges, viscoelastic
     from fitting.methods import generalised_maxwell
 
     if options.modes != "auto":
         viscoelastic.check_modes(sweep, options.modes)
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    closed = _closed(options, sweep, dense)
+    closed = edges.honest(_closed(options, sweep, dense), sweep, dense)
     if options.method == "closed-form":
         return [closed]
     simulation = viscoelastic.Simulation(

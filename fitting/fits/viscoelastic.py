@@ -122,10 +122,14 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 def from_starts(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = "levenberg-marquardt") -> Fit:
     """The best minimum over `starts` (S, P) of Prony modes, of a solid or (by `kind`) of a fluid."""
     minimise = levenberg_marquardt if optimizer == OPTIMIZERS[0] else bfgs
-    residuals = generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
-    found, compiling, running = timed(best_of(minimise, residuals), starts, *data)
+    found, compiling, running = timed(best_of(minimise, residuals_of(kind)), starts, *data)
     return fitted(sweep, found, kind, running, compiling, {"optimizer": optimizer})
+
+
+def residuals_of(kind: Kind) -> Callable[..., jax.Array]:
+    """Residuals of Prony modes, of a solid or a fluid."""
+    return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
 def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: dict[str, Any]) -> Fit:
@@ -153,7 +157,7 @@ def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], 
     if kind.values is not None:
         rows = (2 * len(storage), sweep.storage_sd is not None, kind.effective)
         own = uncertainty.estimated(kind.names, kind.values, found, *rows)
-    sentences = _misfit(sweep, storage, loss)
+    sentences = _misfit(sweep, storage, loss, kind)
     sentences += tuple(uncertainty.cautions(sweep, spread, found, kind.name) if own is None else ())
     converged = bool(found.converged)
     advice = at.advice or (("try fewer modes",) if own is None else ("try another model",))
@@ -170,7 +174,7 @@ def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], 
 FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 
-def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, ...]:
+def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
     """A sentence where the model does not follow the data, naming the worst point."""
     e = np.abs(np.concatenate([storage / sweep.storage, loss / sweep.loss]) - 1)
     if e.mean() < 0.05 and e.max() < 0.3:
@@ -179,7 +183,7 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, .
     where = f"{'storage' if worst < n else 'loss'}_modulus at {sweep.angular_frequency[worst % n] / (2 * np.pi):.3g} Hz"
     return (
         f"the fit misses the data by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
-        "try more modes, or look at the data",
+        f"try {'another --model' if kind.values else 'more modes or another --model'}, or look at the data",
     )
 
 
@@ -298,6 +302,20 @@ def simulated_moduli(
     return torsion.moduli(rig, scaled, viscosity, omega, torque, torsion.Drive(steps=simulation.steps))
 
 
+#: What the closed form says of data and model, which the simulation leaves as it is: words of warnings, and details.
+OF_THE_DATA = (
+    "modes would follow",
+    "about as well as",
+    "would follow the data more closely",
+    "no finite instantaneous",
+    "that relaxes",
+    "Kramers-Kronig",
+    "half decade",
+    "structured misfit",
+)
+KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency")
+
+
 def through_torsion(
     sweep: Sweep,
     start: Fit,
@@ -365,9 +383,8 @@ def through_torsion(
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = Simulated("torsion", found, storage, loss, advice)
     fit = _fit(sweep, at, kind, (running, compiling), details)
-    kept = ("modes would follow", "explains the data about as well", "no finite instantaneous", "to simulate it")
-    more = tuple(w for w in start.warnings if any(words in w for words in kept))
-    of_the_model = {k: v for k, v in start.details.items() if k in ("conversion", "spectrum")}
+    more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
+    of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = fit._replace(details=fit.details | of_the_model)
     return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
 

@@ -92,6 +92,40 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     return _sweep(str(path), tables[chosen], notes)
 
 
+def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
+    """The points from `low` to `high` [Hz]; a note names how many are left out.
+
+    Raises:
+        InputError: fewer than `FEWEST` frequencies are left.
+    """
+    hertz = sweep.angular_frequency / (2 * np.pi)
+    kept = np.ones(len(hertz), bool)
+    for limit, side, name in ((low, -1, "min"), (high, 1, "max")):
+        if limit is None:
+            continue
+        if not (np.isfinite(limit) and limit > 0):
+            raise InputError(f"--{name}-frequency {limit:g} is no frequency in Hz: give a positive number")
+        kept &= side * hertz <= side * limit * (1 + side * 1e-9)
+    if len(np.unique(hertz[kept])) < FEWEST:
+        raise InputError(
+            f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency leave {kept.sum()} of {len(kept)} points "
+            f"(the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): leave {FEWEST} or more"
+        )
+    notes = sweep.notes
+    if not kept.all():
+        ends = " and ".join(
+            f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
+        )
+        notes = (*notes, f"{(~kept).sum()} of {len(kept)} points {ends} are left out as asked for")
+    return some(sweep, kept)._replace(notes=notes)
+
+
+def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
+    """The points where `kept` (n,) is true."""
+    columns = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
+    return sweep._replace(**{q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in columns})
+
+
 def _choose(path: str, tables: list[_Table], wanted: str | None) -> tuple[int, list[str]]:
     """Place of the table to read, and a note where there are several."""
     names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]

@@ -9,13 +9,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.fits import models
+from fitting.fits import edges, models
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
+
+MARK = "* moves by more than its error without the first or the last half decade"
 
 
 def numbers(values: Any) -> Any:
@@ -63,6 +65,20 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     }
 
 
+def _band_sensitivity(fit: Fit) -> dict[str, Any]:
+    """Changes by the names of `standard_errors`, lists for ratios and times; null where too few points were left."""
+    out: dict[str, Any] = {}
+    for part, changes in fit.details.get("band_sensitivity", {}).items():
+        out[part] = None if changes is None else {}
+        for name, change in (changes or {}).items():
+            stem = name.split("[")[0]
+            if stem == name:
+                out[part][name] = change
+            else:
+                out[part].setdefault(stem, []).append(change)
+    return out
+
+
 def _own(fit: Fit) -> dict[str, Any]:
     """Parameters of a model that is not made of modes."""
     p = fit.parameters
@@ -77,6 +93,7 @@ def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | No
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
+    content["band_sensitivity"] = _band_sensitivity(fits[0])
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
     if profile is not None:  # of the closed form, whichever method leads
@@ -156,6 +173,11 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
         rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
     top.set(xscale="log", yscale="log", ylabel="modulus [Pa]")
     _legend_above(top, 2)
+    doubtful = fits[0].details.get("consistency", {}).get("instrument_above_Hz")
+    if doubtful is not None:
+        for axes in (top, rest):
+            axes.axvspan(1.02 * doubtful, 1.05 * f[-1], color=GREY, alpha=0.15, lw=0)
+        rest.text(1.03 * doubtful, 0.02, "instrument", fontsize=7, va="bottom", transform=rest.get_xaxis_transform())
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
 
@@ -189,16 +211,22 @@ def _parameter_rows(fit: Fit) -> list[str]:
     if fit.parameters is not None:
         return _own_lines(fit)
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
+    decided = edges.moved(fit)
+
+    def mark(name):
+        return "*" if name in decided else " "
+
     rows = [
-        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa",
-        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa",
+        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa {mark('shear_modulus')}".rstrip(),
+        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa {mark('equilibrium_modulus')}".rstrip(),
         "",
         f"{'mode':4s} {'ratio [1]':>20s} {'relaxation time [s]':>22s}",
     ]
     for k in range(n):
-        ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}" for j in (1 + k, 1 + n + k))
-        rows.append(f"{k + 1:4d} {ratio:>20s} {time:>22s}")
-    return rows
+        places = ((1 + k, f"ratios[{k}]"), (1 + n + k, f"relaxation_times[{k}]"))
+        ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}{mark(name)}" for j, name in places)
+        rows.append(f"{k + 1:4d} {ratio:>20s} {time:>22s}".rstrip())
+    return [*rows, "* ends of the band decide it"] if decided else rows
 
 
 def _own_lines(fit: Fit) -> list[str]:
@@ -208,7 +236,8 @@ def _own_lines(fit: Fit) -> list[str]:
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True):
         if not name.startswith("strengths["):
-            rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}".rstrip())
+            mark = " *" if name in edges.moved(fit) else ""
+            rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}{mark}".rstrip())
     found = fit.details.get("spectrum")
     if found:
         times = found["relaxation_times"]
@@ -225,17 +254,21 @@ def _lines(fit: Fit) -> list[str]:
     if fit.parameters is not None:
         return _own_lines(fit)
 
-    def row(name, value, error, unit):
-        return f"{name:5s} {value:11.5g} ± {error:<9.2g} {unit}".rstrip()
+    decided = edges.moved(fit)
+
+    def row(name, value, error, unit, key):
+        mark = " *" if key in decided else ""
+        return f"{name:5s} {value:11.5g} ± {error:<9.2g} {unit:2s}{mark}".rstrip()
 
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
     rows = [
-        row("G0", u.values[0], u.standard_errors[0], "Pa"),
-        row("G_inf", equilibrium, equilibrium_error(u), "Pa"),
+        row("G0", u.values[0], u.standard_errors[0], "Pa", "shear_modulus"),
+        row("G_inf", equilibrium, equilibrium_error(u), "Pa", "equilibrium_modulus"),
     ]
     for i in range(n):
-        rows.append(row(f"g{i + 1}", u.values[1 + i], u.standard_errors[1 + i], ""))
-        rows.append(row(f"tau{i + 1}", u.values[1 + n + i], u.standard_errors[1 + n + i], "s"))
+        rows.append(row(f"g{i + 1}", u.values[1 + i], u.standard_errors[1 + i], "", f"ratios[{i}]"))
+        time = f"relaxation_times[{i}]"
+        rows.append(row(f"tau{i + 1}", u.values[1 + n + i], u.standard_errors[1 + n + i], "s", time))
     return rows
 
 
@@ -254,4 +287,5 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
         columns.append(rows)
     width = max(len(r) for r in columns[0]) + 3
     rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
-    return "\n".join([*rows, *models.table(fits[0])])
+    decided = [MARK] if any(edges.moved(fit) for fit in fits) else []
+    return "\n".join([*rows, *decided, *models.table(fits[0])])
