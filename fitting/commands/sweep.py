@@ -26,7 +26,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
         + EXIT_CODES,
     )
     command.add_argument(
-        "sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text"
+        "sweep",
+        type=Path,
+        nargs="+",
+        metavar="SWEEP.csv",
+        help="frequency sweep: CSV, TRIOS or RheoCompass text; several files are samples of one material",
     )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
@@ -38,7 +42,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
         default="prony",
         help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
     )
-    command.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
+    command.add_argument(
+        "--method", choices=("torsion", "closed-form"), help="default torsion; of several samples closed-form"
+    )
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
@@ -73,6 +79,11 @@ def run(options: argparse.Namespace) -> int:
     from fitting.reports import sweep_report
 
     _check(options)
+    if len(options.sweep) > 1:
+        from fitting.commands import samples
+
+        return samples.run(options)
+    options.sweep, options.method = options.sweep[0], options.method or "torsion"
     sweep = rheometer.read_sweep(options.sweep, options.table)
     sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
     for note in sweep.notes:
@@ -103,6 +114,8 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form":
         raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
+    if len(options.sweep) > 1:
+        _check_samples(options)
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
     if options.model in ("fractional", "spectrum") and options.modes != "auto":
@@ -110,6 +123,17 @@ def _check(options: argparse.Namespace) -> None:
     if options.profile and options.model != "prony":
         raise InputError(f"--profile is of --model prony; leave it out for --model {options.model}")
     laws.find(options.law)
+
+
+def _check_samples(options: argparse.Namespace) -> None:
+    """Refuse what only one sweep can have."""
+    for name, asked, instead in (
+        ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
+        ("--profile", options.profile, "leave it out, or give one file"),
+        ("--model spectrum", options.model == "spectrum", "give --model prony, fractional or auto"),
+    ):
+        if asked:
+            raise InputError(f"{name} is of one sample, {len(options.sweep)} files are given: {instead}")
 
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":

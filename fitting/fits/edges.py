@@ -81,8 +81,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     old = {name: value for name, (value, _) in values(fit).items()}
     if fit.kind.effective is not None:
         found = fit.details["spectrum"]
-        new = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
-        return {name: new.equilibrium - value for name, value in old.items()}
+        grid = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
+        return {name: grid.equilibrium - value for name, value in old.items()}
     scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)

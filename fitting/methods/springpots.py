@@ -30,6 +30,7 @@ class Fractional(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Callable[[jax.Array, float], jax.Array]  # full u, reference [rad/s] -> (P,)
+    formula: Callable[..., np.ndarray]  # i omega and the values -> G* [Pa], as the literature writes it
 
     @property
     def solid(self) -> bool:
@@ -98,27 +99,37 @@ _POT, _SLOW, _FAST = (
 _REST = (("equilibrium_modulus",), ("Pa",))
 
 
-def _case(name, free, parts, values) -> Fractional:
+def _case(name, free, parts, values, formula) -> Fractional:
     names, units = (sum((part[k] for part in parts), ()) for k in (0, 1))
-    return Fractional(name, free, names, units, values)
+    return Fractional(name, free, names, units, values, formula)
 
 
 FRACTIONAL = (
-    # V (i omega)^alpha
-    _case("springpot", (2, 3), (_POT,), _springpot),
-    # Ge + V (i omega)^alpha
-    _case("fractional_kelvin_voigt", (0, 2, 3), (_REST, _POT), _kelvin_voigt),
-    # Ge + Gm (i omega tau)^alpha / (1 + (i omega tau)^alpha)
+    _case("springpot", (2, 3), (_POT,), _springpot, lambda s, v, a: v * s**a),
+    _case("fractional_kelvin_voigt", (0, 2, 3), (_REST, _POT), _kelvin_voigt, lambda s, e, v, a: e + v * s**a),
     _case(
         "fractional_zener",
         (0, 2, 3, 4),
         (_REST, (("relaxing_modulus", "relaxation_time", "exponent"), ("Pa", "s", "1"))),
         _zener,
+        lambda s, e, m, tau, a: e + m * (s * tau) ** a / (1 + (s * tau) ** a),
     ),
     # Two springpots in a row, a fluid: the one of larger exponent gives way at low frequencies.
-    _case("fractional_maxwell", (2, 3, 4, 5), (_SLOW, _FAST), _maxwell),
+    _case(
+        "fractional_maxwell",
+        (2, 3, 4, 5),
+        (_SLOW, _FAST),
+        _maxwell,
+        lambda s, v, a, w, b: 1 / (1 / (v * s**a) + 1 / (w * s**b)),
+    ),
     # Two springpots side by side, a fluid: the one of larger exponent leads at high frequencies.
-    _case("fractional_parallel", (0, 1, 2, 3), (_SLOW, _FAST), _parallel),
+    _case(
+        "fractional_parallel",
+        (0, 1, 2, 3),
+        (_SLOW, _FAST),
+        _parallel,
+        lambda s, w, b, v, a: v * s**a + w * s**b,
+    ),
 )
 
 

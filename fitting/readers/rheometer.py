@@ -106,24 +106,25 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
         if not (np.isfinite(limit) and limit > 0):
             raise InputError(f"--{name}-frequency {limit:g} is no frequency in Hz: give a positive number")
         kept &= side * hertz <= side * limit * (1 + side * 1e-9)
+    if kept.all():
+        return sweep
     if len(np.unique(hertz[kept])) < FEWEST:
         raise InputError(
             f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency leave {kept.sum()} of {len(kept)} points "
             f"(the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): leave {FEWEST} or more"
         )
-    notes = sweep.notes
-    if not kept.all():
-        ends = " and ".join(
-            f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
-        )
-        notes = (*notes, f"{(~kept).sum()} of {len(kept)} points {ends} are left out as asked for")
-    return some(sweep, kept)._replace(notes=notes)
+    ends = " and ".join(
+        f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
+    )
+    note = f"{(~kept).sum()} of {len(kept)} points {ends} are left out as asked for"
+    return some(sweep, kept)._replace(notes=(*sweep.notes, note))
 
 
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     """The points where `kept` (n,) is true."""
-    columns = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
-    return sweep._replace(**{q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in columns})
+    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
+    columns: dict[str, Any] = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
+    return sweep._replace(**columns)
 
 
 def _choose(path: str, tables: list[_Table], wanted: str | None) -> tuple[int, list[str]]:
@@ -196,8 +197,8 @@ def _quantity(cell: str) -> tuple[str, str | None] | None:
     words, lower = [w for w, _ in kept], [l for _, l in kept]
     if not lower:
         return None
-    if lower[0] in ("storage", "loss", "g'", "g''"):
-        quantity = "storage" if lower[0] in ("storage", "g'") else "loss"
+    if lower[0] in ("storage", "loss", "g'", "g''", "gp", "gpp"):
+        quantity = "storage" if lower[0] in ("storage", "g'", "gp") else "loss"
         stem = 2 if lower[1:2] in (["modulus"], ["mod"]) else 1
         certain = stem == 2 or lower[0].startswith("g")
     elif lower[0] in ("angular", "ang", "omega", "ω"):

@@ -65,7 +65,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def _band_sensitivity(fit: Fit) -> dict[str, Any]:
+def band_sensitivity(fit: Fit) -> dict[str, Any]:
     """Changes by the names of `standard_errors`, lists for ratios and times; null where too few points were left."""
     out: dict[str, Any] = {}
     for part, changes in fit.details.get("band_sensitivity", {}).items():
@@ -93,7 +93,7 @@ def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | No
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
-    content["band_sensitivity"] = _band_sensitivity(fits[0])
+    content["band_sensitivity"] = band_sensitivity(fits[0])
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
     if profile is not None:  # of the closed form, whichever method leads
