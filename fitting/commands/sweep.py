@@ -22,8 +22,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog=prog,
         description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
-        epilog=f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
-        + EXIT_CODES,
+        epilog=f"Tests in time: {prog} relaxation --help, {prog} creep --help. "
+        f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. " + EXIT_CODES,
     )
     command.add_argument(
         "sweep",

@@ -10,6 +10,10 @@ import scipy.stats
 from fitting.methods.least_squares import Solution
 
 
+#: Stands in a covariance for an error that has no bound; a square of it is still a number.
+LOST = 1e140
+
+
 class Estimate(NamedTuple):
     """Numbers in the order of `names`, and how well the data determine them."""
 
@@ -69,7 +73,7 @@ def estimated(
         names=tuple(names),
         values=values,
         root=root,
-        standard_errors=np.where(stuck, np.inf, errors),
+        standard_errors=np.where(stuck | (errors > 1e-10 * LOST), np.inf, errors),
         correlation=correlation,
         chi2=float(r @ r),
         components=components,
@@ -102,7 +106,9 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
-    return noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0]), s
+    with np.errstate(over="ignore", invalid="ignore"):  # a number that ran away has no finite error
+        root = noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0])
+    return np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST), s
 
 
 def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -113,29 +113,39 @@ def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
 MERGED = 1.5
 
 
-def _decades(sweep: Sweep) -> float:
-    return float(np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0]))
+class Band(Protocol):
+    """Data that resolve relaxation times, of a sweep or of a test in time."""
+
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest of them [s]."""
 
 
-def supported_modes(sweep: Sweep) -> int:
+def _decades(data: Band) -> float:
+    low, high = data.resolved
+    return float(np.log10(high / low))
+
+
+def supported_modes(data: Band) -> int:
     """How many modes the band has room for: about one a decade and one more, at least one."""
-    return max(1, int(_decades(sweep) + 1 + 1e-9))  # a decade is a decade in spite of rounding
+    return max(1, int(_decades(data) + 1 + 1e-9))  # a decade is a decade in spite of rounding
 
 
-def superfluous(sweep: Sweep, u: Estimate) -> list[str]:
+def superfluous(data: Band, u: Estimate) -> list[str]:
     """Sentences that advise against some of the modes; none for a number of modes that may be chosen."""
     modes = (len(u.values) - 1) // 2
-    fewer = "use fewer modes or a wider sweep" if modes > 1 else "use a wider sweep"
+    kind, measured = ("sweep", "measured frequencies") if isinstance(data, Sweep) else ("test", "measured times")
+    fewer = f"use fewer modes or a wider {kind}" if modes > 1 else f"use a wider {kind}"
     g, tau = u.values[1 : modes + 1], u.values[modes + 1 :]
     g_err, tau_err = u.standard_errors[1 : modes + 1], u.standard_errors[modes + 1 :]
-    low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
+    low, high = data.resolved
     out = []
     for k in range(modes):
         if not low / 100 <= tau[k] <= 100 * high:
             product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
             out.append(
-                f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the measured "
-                f"frequencies resolve: only {product} is determined, no factor of it; "
+                f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the "
+                f"{measured} resolve: only {product} is determined, no factor of it; "
                 f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
             )
         if not g_err[k] < 0.5 * g[k]:
@@ -154,9 +164,9 @@ def superfluous(sweep: Sweep, u: Estimate) -> list[str]:
                 f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
                 f"{modes - 1} mode{'s' if modes > 2 else ''}"
             )
-    if modes > supported_modes(sweep) or _decades(sweep) < 0.3:
+    if modes > supported_modes(data) or _decades(data) < 0.3:
         out.append(
-            f"the sweep spans {_decades(sweep):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
+            f"the {kind} spans {_decades(data):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
             f"(about one a decade and one more); {fewer}"
         )
     return out
@@ -200,5 +210,6 @@ def cautions(sweep: Sweep, u: Estimate, found: Solution, model: str = "prony") -
 
 
 def _percent(error: float, value: float) -> str:
-    ratio = 100 * error / abs(value) if value else np.inf
+    with np.errstate(over="ignore"):
+        ratio = 100 * error / abs(value) if value else np.inf
     return f"{ratio:.3g} %" if ratio < 1e4 else "more than 10000 %"

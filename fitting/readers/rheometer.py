@@ -50,6 +50,11 @@ class Sweep(NamedTuple):
             self.loss if self.loss_sd is None else self.loss_sd,
         )
 
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time [s] that the frequencies resolve."""
+        return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
+
 
 class _Column(NamedTuple):
     place: int
@@ -87,7 +92,7 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
     """
-    tables = _tables(str(path), _text(Path(path)).splitlines())
+    tables = _tables(str(path), text_of(Path(path)).splitlines())
     chosen, notes = _choose(str(path), tables, table)
     return _sweep(str(path), tables[chosen], notes)
 
@@ -156,18 +161,19 @@ def _named(path: str, tables: list[_Table], names: list[str], wanted: str) -> in
     raise InputError(f"{path}: --table {wanted} {found}; give the number or the whole name of one: {offered}")
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path, what: str = "a frequency sweep") -> str:
+    """Content of a text file of any encoding; `InputError` asking for the CSV file of `what`."""
     try:
         if path.is_dir():
-            raise InputError(f"{path} is a folder: give the CSV file of a frequency sweep")
+            raise InputError(f"{path} is a folder: give the CSV file of {what}")
         if not path.exists():
-            raise InputError(f"{path}: no such file; give the CSV file of a frequency sweep")
+            raise InputError(f"{path}: no such file; give the CSV file of {what}")
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; give the CSV file of a frequency sweep") from None
+        raise InputError(f"{path}: {error.strerror}; give the CSV file of {what}") from None
     if not data.strip():
         raise InputError(f"{path} is empty: export the sweep again")
-    workbook.refuse(path, data, "the sheet of the frequency sweep")
+    workbook.refuse(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     if b"\0" in data:
@@ -232,6 +238,12 @@ def _header(cells: list[str]) -> list[_Column]:
 def _delimiter(line: str) -> str:
     best = max("\t;,|", key=line.count)
     return best if best in line else ("  " if "  " in line.strip() else " ")
+
+
+def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
+    """The delimiter, found where none is given, and the cells of a line."""
+    delimiter = delimiter or _delimiter(line)
+    return delimiter, _split(line, delimiter)
 
 
 def _split(line: str, delimiter: str) -> list[str]:
@@ -313,7 +325,8 @@ def _with_unit_row(columns: list[_Column], lines: list[str], k: int, delimiter: 
     return columns, k
 
 
-def _number(text: str, delimiter: str) -> float | None:
+def to_number(text: str, delimiter: str) -> float | None:
+    """A number, with a decimal comma where commas do not separate cells; None for any other text."""
     text = text.strip().strip('"')
     if delimiter != "," and "," in text and "." not in text:
         text = text.replace(",", ".")
@@ -335,7 +348,7 @@ def _rows(path, columns, lines, k, delimiter, width):
                 break  # the next table of an instrument's export
             continue
         cells = _split(line, delimiter)
-        values = [_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
+        values = [to_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
         here = [cells[c.place] for c in columns if c in needed and c.place < len(cells)]
         blank = not any(re.match(r"[-+]?\.?\d|nan|inf", cell.lower()) for cell in here)
         if blank and (not rows or line.startswith("[") or delimiter == "\t"):
