@@ -16,7 +16,8 @@ def run(options: argparse.Namespace) -> int:
     sweeps = []
     for path in options.sweep:
         sweep = rheometer.read_sweep(path, options.table)
-        sweeps.append(rheometer.within(sweep, options.min_frequency, options.max_frequency))
+        sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
+        sweeps.append(rheometer.without_inertia(sweep, options.radius, options.height))
         for note in sweeps[-1].notes:
             print(f"note: {path.name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))

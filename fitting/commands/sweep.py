@@ -86,6 +86,7 @@ def run(options: argparse.Namespace) -> int:
     options.sweep, options.method = options.sweep[0], options.method or "torsion"
     sweep = rheometer.read_sweep(options.sweep, options.table)
     sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
+    sweep = rheometer.without_inertia(sweep, options.radius, options.height)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     fits = _fits(options, sweep)

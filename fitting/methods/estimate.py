@@ -9,7 +9,6 @@ import scipy.stats
 
 from fitting.methods.least_squares import Solution
 
-
 #: Stands in a covariance for an error that has no bound; a square of it is still a number.
 LOST = 1e140
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitting.readers import workbook
+from fitting.readers import raw_torque, workbook
 from liverjax.core.errors import InputError
 
 #: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
@@ -41,6 +41,8 @@ class Sweep(NamedTuple):
     loss_sd: np.ndarray | None = None
     source: str = ""
     notes: tuple[str, ...] = ()  # what the reader changed or chose, sentences
+    raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], where the file has them
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out for the instrument's sake
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -68,6 +70,7 @@ class _Table(NamedTuple):
     columns: list[_Column]
     rows: list[list[float]]  # in the order of the columns
     numbers: list[int]  # of the lines in the file
+    raw: dict[str, np.ndarray]  # what the instrument measured, one value a row
 
     @property
     def frequencies(self) -> int:
@@ -129,7 +132,8 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     """The points where `kept` (n,) is true."""
     names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
     columns: dict[str, Any] = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
-    return sweep._replace(**columns)
+    raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
+    return sweep._replace(**columns, raw=raw)
 
 
 def _choose(path: str, tables: list[_Table], wanted: str | None) -> tuple[int, list[str]]:
@@ -293,11 +297,59 @@ def _search(path: str, lines: list[str]) -> tuple[list[_Table], list[int]]:
         headers.append(k)
         name = _title(lines[free : k - 1])
         columns, k = _with_unit_row(columns, lines, k, delimiter)
+        above = k
         rows, numbers, k = _rows(path, columns, lines, k, delimiter, len(cells))
         if rows:
-            tables.append(_Table(name, columns, rows, numbers))
+            units = [_split(line, delimiter) for line in lines[headers[-1] : above]]
+            raw = _raw(cells, units, [_split(lines[n - 1], delimiter) for n in numbers], delimiter)
+            tables.append(_Table(name, columns, rows, numbers, raw))
         free = k
     return tables, headers
+
+
+def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
+    """Raw torque, angle and phase in SI, of the rows of a table; a column with a gap is none."""
+    found = {}
+    for quantity, (place, factor) in raw_torque.columns(cells, unit_rows[-1] if unit_rows else []).items():
+        values = [to_number(row[place], delimiter) if place < len(row) else None for row in rows]
+        if all(v is not None and np.isfinite(v) for v in values):
+            found[quantity] = factor * np.array(values, float)
+    return found
+
+
+def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
+    """The points whose modulus exceeds what is not known of the instrument's inertia; the others become `grey`.
+
+    Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m].
+    """
+    if not sweep.raw:
+        return sweep
+    geometry = np.pi * radius**4 / (2 * height) if radius and height else None
+    G = sweep.storage + 1j * sweep.loss
+    found = raw_torque.share(sweep.angular_frequency, G, sweep.raw, geometry)
+    if found is None:
+        return sweep
+    unknown = raw_torque.UNCERTAINTY * found.modulus
+    lost = unknown > np.abs(G)
+    k = int(np.argmax(found.modulus / np.abs(G)))
+    note = (
+        f"the raw torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2; at "
+        f"{sweep.angular_frequency[k] / (2 * np.pi):.3g} Hz it carries {found.modulus[k] / np.abs(G[k]):.3g} times the "
+        "torque of the sample"
+    )
+    if not lost.any():
+        return sweep._replace(notes=(*sweep.notes, note))
+    if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
+        raise InputError(
+            f"{sweep.source}: {note}: nearly all of the sweep is the instrument's; measure at lower frequencies"
+        )
+    lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
+    share = f"{100 * raw_torque.UNCERTAINTY:g} % of the inertia, which calibrations leave open"
+    left = (
+        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are left out: the sample carries less than {share}"
+    )
+    grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
+    return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)
 
 
 def _title(above: list[str]) -> str:
@@ -461,4 +513,5 @@ def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
     get: dict[str, Any] = {
         q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")
     }
-    return Sweep(omega[order], **get, source=path, notes=tuple(notes))
+    raw = {q: v[good][order] for q, v in table.raw.items()}
+    return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)

@@ -173,6 +173,10 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
         rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
     top.set(xscale="log", yscale="log", ylabel="modulus [Pa]")
     _legend_above(top, 2)
+    if sweep.grey is not None:
+        hertz = sweep.grey[:, 0] / (2 * np.pi)
+        top.plot(hertz, sweep.grey[:, 1], "o", color=GREY, ms=4, mfc="none", label="left out: inertia")
+        top.plot(hertz, sweep.grey[:, 2], "s", color=GREY, ms=4, mfc="none")
     doubtful = fits[0].details.get("consistency", {}).get("instrument_above_Hz")
     if doubtful is not None:
         for axes in (top, rest):
