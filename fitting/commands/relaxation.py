@@ -29,6 +29,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the answers before it")
     command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="of the sample [m], for torque and force")
+    command.add_argument(
+        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
+    )
     command.add_argument("--out", type=Path, metavar="DIR", help=f"folder of the results (default {kind})")
     return command
 
@@ -60,6 +63,10 @@ def run(options: argparse.Namespace) -> int:
     found = fits.fit(test, options.modes)
     time_report.write(out, test, found)
     print(time_report.table(test, found))
+    if options.cards:
+        from fitting.commands.sweep import write_cards
+
+        write_cards(out, found.model)
     for sentence in found.warnings:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {out}/fit.json, fit.png")

@@ -30,6 +30,10 @@ def run(options: argparse.Namespace) -> int:
         found = samples.fit(sweeps, options.model, options.modes, told)
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
+    if options.cards:
+        from fitting.commands.sweep import write_cards
+
+        write_cards(options.out, found.typical)
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")

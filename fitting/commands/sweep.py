@@ -13,7 +13,7 @@ from liverjax.core.files import writable
 
 if TYPE_CHECKING:
     from fitting.fits.viscoelastic import Fit
-    from fitting.methods.generalised_maxwell import Spectrum
+    from fitting.methods.generalised_maxwell import Maxwell, Spectrum
     from fitting.readers.rheometer import Sweep
 
 
@@ -58,6 +58,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
     command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
     command.add_argument(
+        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
+    )
+    command.add_argument(
         "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
     )
     return command
@@ -95,6 +98,8 @@ def run(options: argparse.Namespace) -> int:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
     sweep_report.write(options.out, sweep, fits, profile)
     print(sweep_report.table(sweep, fits))
+    if options.cards:
+        write_cards(options.out, fits[-1].model)
     for name, (low, high) in (profile or {}).items():
         ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
         print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
@@ -102,6 +107,15 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")
     return 0 if fits[-1].converged else 1
+
+
+def write_cards(out: Path, model: "Maxwell") -> None:
+    """Write material cards and say what a program cannot hold."""
+    from fitting.reports import material_cards
+
+    for sentence in material_cards.write(out / "cards", model):
+        print(f"note: {sentence}", file=sys.stderr)
+    print(f"written: {out}/cards")
 
 
 def _check(options: argparse.Namespace) -> None:
