@@ -13,13 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitting.readers import raw_torque, workbook
+from fitting.readers import raw_torque, trios_json, workbook
 from liverjax.core.errors import InputError
 
 #: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
 MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
 FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1", "rad_s-1", "1/s", "s-1"), 1.0)
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
+#: First words of the columns; those with an E are of tension or bending.
+STORAGE, LOSS = ("storage", "g'", "gp", "e'", "ep"), ("loss", "g''", "gpp", "e''", "epp")
 #: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.
 SMALLEST, LARGEST = 1e-30, 1e30
 #: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
@@ -178,6 +180,16 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
     if not data.strip():
         raise InputError(f"{path} is empty: export the sweep again")
     workbook.refuse(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
+    text = _decoded(path, data)
+    if text.lstrip().startswith("{"):
+        found = trios_json.tables(text)
+        if found is None:
+            raise InputError(f"{path} is JSON, but not the export of TRIOS (it has no Results): give CSV or text")
+        return found
+    return text
+
+
+def _decoded(path: Path, data: bytes) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     if b"\0" in data:
@@ -207,10 +219,12 @@ def _quantity(cell: str) -> tuple[str, str | None] | None:
     words, lower = [w for w, _ in kept], [l for _, l in kept]
     if not lower:
         return None
-    if lower[0] in ("storage", "loss", "g'", "g''", "gp", "gpp"):
-        quantity = "storage" if lower[0] in ("storage", "g'", "gp") else "loss"
+    if lower[:2] in (["e", "stor"], ["e", "storage"], ["e", "loss"]):  # DMA: "E_stor", "E_loss (MPa)"
+        lower, words = [f"e'{'' if lower[1].startswith('stor') else chr(39)}", *lower[2:]], words[1:]
+    if lower[0] in STORAGE + LOSS:
+        quantity = "storage" if lower[0] in STORAGE else "loss"
         stem = 2 if lower[1:2] in (["modulus"], ["mod"]) else 1
-        certain = stem == 2 or lower[0].startswith("g")
+        certain = stem == 2 or lower[0].startswith(("g", "e"))
     elif lower[0] in ("angular", "ang", "omega", "ω"):
         quantity, certain = "frequency", True
         stem = 2 if lower[1:2] in (["frequency"], ["freq"]) else 1
@@ -235,6 +249,8 @@ def _header(cells: list[str]) -> list[_Column]:
     """Columns by quantity; the first of known unit comes first, rad/s before Hz, others after it (to compare)."""
     found = [(k, cell, _quantity(cell)) for k, cell in enumerate(cells)]
     columns = [_Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
+    shear = {c.quantity for c in columns if not _is_tensile(c)}
+    columns = [c for c in columns if c.quantity not in shear or not _is_tensile(c)]  # G before E where a file has both
     columns.sort(key=lambda c: (not _known_unit(c.quantity.removesuffix("_sd"), c.unit), not _is_angular(c), c.place))
     return columns
 
@@ -481,19 +497,36 @@ def _usable(path: str, table: _Table, values: dict[int, np.ndarray]) -> tuple[np
     return good, [f"{len(faults)} of {len(good)} points {verb} left out as unusable: {told}"]
 
 
+def _is_tensile(column: _Column) -> bool:
+    return bool(re.match(r"\s*e['′’_ ]|\s*epp?\b|\s*[(]?e\b|\s*tensile", column.name.lower().replace('"', "'")))
+
+
+def _to_shear(table: _Table, places: dict[str, int], columns: dict[int, np.ndarray]) -> list[str]:
+    """Divide moduli of tension or bending by 3 in place; a note says so."""
+    tensile = [j for q, j in places.items() if q != "frequency" and _is_tensile(table.columns[j])]
+    for j in tensile:
+        columns[j] = columns[j] / 3
+    if not tensile:
+        return []
+    names = " and ".join(table.columns[j].name for j in tensile)
+    return [f"{names} are of tension or bending: G = E / 3 is taken, as of an incompressible material"]
+
+
 def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
     places: dict[str, int] = {}
     columns: dict[int, np.ndarray] = {}
     for j, column in enumerate(table.columns):
         if column.quantity not in places:
             places[column.quantity], columns[j] = j, _si(path, table, j, notes)
+    notes += _to_shear(table, places, columns)
     good, left_out = _usable(path, table, columns)
     values = {q: columns[j][good] for q, j in places.items()}
     for j, column in enumerate(table.columns):
         q = column.quantity
         if j == places[q] or not _known_unit(q.removesuffix("_sd"), column.unit):
             continue
-        if not np.allclose(_si(path, table, j, [])[good], values[q], rtol=0.01):
+        both = _si(path, table, j, [])[good] / (3 if _is_tensile(column) else 1)
+        if not np.allclose(both, values[q], rtol=0.01):
             name = table.columns[places[q]].name
             raise InputError(f"{path}: columns {name} and {column.name} disagree; remove the wrong one")
     notes += left_out
