@@ -2,7 +2,7 @@
 
 A soft tissue of three modes (30, 1 and 0.05 s). The sweep sees 0.1 to 10 Hz, so the slow mode lies outside its band; a
 creep test of 120 s sees it, but neither the fast one nor, through one number, G0 so well. A pull held for 30 s is the
-third. Noise: 2 % of every reading. Data are made with half the time step of the fit.
+third. Noise: 2 % of every reading. Data are made with half the time step of the fit and on a finer mesh.
 
     python -m experiments creep_and_sweep [--quick]
 """
@@ -22,7 +22,9 @@ from liverjax.core.plotting import COLOURS
 
 TRUE = generalised_maxwell.Maxwell(jnp.asarray(770.0), jnp.array([0.2, 0.2, 0.25]), jnp.array([30.0, 1.0, 0.05]))
 LAW = lj.laws.NeoHookean(mu=1.0, bulk=20.0)
-RADIUS, HEIGHT, CELL, NOISE = 0.01, 0.01, 0.004, 0.02
+RADIUS, HEIGHT, NOISE = 0.01, 0.01, 0.02
+#: Of the data: cells half as long at the rims, that grow more slowly, and a rounder polygon.
+FINE = glued.Cells(rim=0.02, edge=0.01, growth=0.5, corners=32)
 
 
 def sweep(rng: np.random.Generator) -> joint.Test:
@@ -42,15 +44,15 @@ def readings(fine: glued.Rig, rng: np.random.Generator) -> tuple[np.ndarray, np.
 
 def creep(rng: np.random.Generator, seconds: float, dt: float = 1.0) -> joint.Test:
     """A pull of 20 Pa."""
-    made = [glued.creep(RADIUS, HEIGHT, h, round(seconds / h), 20.0, CELL) for h in (dt, dt / 2)]
+    made = [glued.creep(RADIUS, HEIGHT, h, round(seconds / h), 20.0, c) for h, c in ((dt, None), (dt / 2, FINE))]
     return joint.through("creep", made[0], *readings(made[1], rng))
 
 
 def pull(rng: np.random.Generator, seconds: float, dt: float = 0.5) -> joint.Test:
     """5 % within a step, then held."""
     made = [
-        glued.tension(RADIUS, HEIGHT, h, 0.05 * np.minimum(1, h / dt * np.arange(1, round(seconds / h) + 1)), CELL)
-        for h in (dt, dt / 2)
+        glued.tension(RADIUS, HEIGHT, h, 0.05 * np.minimum(1, h / dt * np.arange(1, round(seconds / h) + 1)), c)
+        for h, c in ((dt, None), (dt / 2, FINE))
     ]
     return joint.through("pull", made[0], *readings(made[1], rng))
 
@@ -70,6 +72,7 @@ def main(quick: bool) -> None:
                 "parameters": dict(zip(found.names, found.values.tolist(), strict=True)),
                 "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
                 "off_in_standard_errors": ((found.values - true) / found.standard_errors).tolist(),
+                "mesh_bias": None if found.mesh_bias is None else found.mesh_bias.tolist(),
                 "chi2_per_reading": found.chi2 / found.components,
                 "readings": found.components,
                 "iterations": found.iterations,

@@ -2,12 +2,13 @@
 
 from typing import NamedTuple
 
+from experiments.pages import rigs
 from experiments.pages.results import load
 
 
 def stability() -> str:
-    """Inverted starts, the liver at any step, locking."""
-    return "\n".join([*_inverted(), "", *_steps(), "", *_cost(), "", *_locking()])
+    """Inverted starts, the liver at any step, locking, rigs."""
+    return "\n".join([*_inverted(), "", *_steps(), "", *_cost(), "", *_locking(), "", rigs.rigs()])
 
 
 class Returned(NamedTuple):

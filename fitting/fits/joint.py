@@ -5,7 +5,9 @@ the law is scaled to G0, as in the torsion fit.
 """
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +16,7 @@ import numpy as np
 
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, estimated
-from fitting.methods.least_squares import levenberg_marquardt_host
+from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.methods.uncertainty import parameter_names, parameter_vector
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
@@ -32,6 +34,7 @@ class Test(NamedTuple):
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of its noise
+    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) what a mesh without end would add; None: nothing
 
 
 def sweep(data: Sweep) -> Test:
@@ -72,7 +75,7 @@ def through(name: str, rig: glued.Rig, measured: Any, sd: Any) -> Test:
         readings, codes = glued.read(rig, law, viscosity)
         return readings, jnp.max(codes)
 
-    return Test(name, predict, measured, sd)
+    return Test(name, predict, measured, sd, partial(glued.mesh_error, rig))
 
 
 def fit(
@@ -85,6 +88,9 @@ def fit(
 ) -> Estimate:
     """The Maxwell parameters that explain all tests, with standard errors (names of `uncertainty.parameter_names`).
 
+    Where tests go through rigs, `mesh_bias` is the part of each value that their meshes cause: subtract it to correct.
+    A warning says where that is more than the standard error.
+
     Args:
         tests: one or more.
         start: where to begin; its number of modes is kept.
@@ -95,12 +101,15 @@ def fit(
     begin = time.perf_counter()
     worst: list[int] = []
 
+    def material(u):
+        model = generalised_maxwell.natural(u)
+        viscosity = Prony(ratios=model.ratios, relaxation_times=model.relaxation_times, part=part)
+        return laws.scaled(law, model.shear_modulus / law.shear_modulus()), viscosity, model
+
     @jax.jit
     def with_jacobian(u):
         def residuals(u):
-            model = generalised_maxwell.natural(u)
-            viscosity = Prony(ratios=model.ratios, relaxation_times=model.relaxation_times, part=part)
-            scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
+            scaled, viscosity, model = material(u)
             rows, codes = [], []
             for test in tests:
                 predicted, code = test.predict(scaled, viscosity, model)
@@ -121,4 +130,34 @@ def fit(
     names = parameter_names((len(found.u) - 1) // 2)
     converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
     estimate = estimated(names, parameter_vector, found, len(found.residuals))
+    if any(test.mesh_error for test in tests):
+        estimate = estimate._replace(mesh_bias=_mesh_bias(tests, material(found.u)[:2], found))
+        _compare(estimate)
     return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)
+
+
+def _mesh_bias(tests: Sequence[Test], material: tuple[Law, Prony], found: Solution) -> np.ndarray:
+    """What the meshes move the parameters (P,): J^+ of the estimated errors of the readings, over their noise.
+
+    To first order: good while the errors are below a quarter, and parameters are not nearly dependent.
+    """
+    missing = [
+        np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd
+        for test in tests
+    ]
+    J, to_natural = np.asarray(found.jacobian), np.asarray(jax.jacfwd(parameter_vector)(found.u))
+    if not np.all(np.isfinite(J)):
+        return np.full(len(to_natural), np.nan)
+    return to_natural @ (np.linalg.pinv(J) @ np.concatenate(missing))
+
+
+def _compare(estimate: Estimate) -> None:
+    """Warn where the mesh moves a parameter by more than its standard error."""
+    more = np.flatnonzero(~(np.abs(estimate.mesh_bias) <= estimate.standard_errors))
+    if len(more):
+        each = (f"{estimate.names[k]} by {estimate.mesh_bias[k]:.2g}" for k in more)
+        warnings.warn(
+            f"the mesh moves {', '.join(each)}, more than the standard error: subtract mesh_bias, or give the rigs "
+            "finer Cells",
+            stacklevel=3,
+        )

@@ -28,6 +28,7 @@ class Estimate(NamedTuple):
     converged: bool
     codes: tuple[int, ...] = ()  # worst code of each simulation
     seconds: float = 0.0
+    mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
 
     @property
     def covariance(self) -> np.ndarray:

@@ -1,5 +1,5 @@
 """Simulated tests: torsion in a rheometer; tension, indentation and creep of glued samples."""
 
-from fitting.rigs.glued import Rig, creep, indentation, read, tension
+from fitting.rigs.glued import Cells, Rig, creep, indentation, mesh_error, read, tension
 
-__all__ = ["Rig", "creep", "indentation", "read", "tension"]
+__all__ = ["Cells", "Rig", "creep", "indentation", "mesh_error", "read", "tension"]

@@ -2,9 +2,13 @@
 
 Each is a scene whose law and viscosity are filled in, and a reading of its run. The sample is glued to its plates: that
 is part of the simulation, so no factor of shape has to correct for it.
+
+By default the mesh is a narrow sector of the cylinder between two planes of symmetry, fine at the rims of the plates
+and at the punch's edge, where stresses are infinite. Its error is in experiments/TABLES.md.
 """
 
-from typing import Any
+import warnings
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +18,33 @@ import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, static, struct
 from liverjax.laws import Law
-from liverjax.mesh import shapes
+from liverjax.mesh import cylinders
+from liverjax.mesh.promotion import quadratic
 from liverjax.physics import boundary
+from liverjax.physics.loads import nodal_tractions
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
+from liverjax.simulation import automatic
 
 READINGS = ("force", "displacement")
+#: A punch narrower than this part of the sample, or a gap beside it, is below what the mesh is made for.
+NARROWEST = 0.01
+#: Where a default mesh is known to be within 1 %: height over radius, and largest K/mu by the form for volume changes.
+#: Mixed needs a law with bulk apart from shear, and a viscosity of `part = "isochoric"` or none.
+SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
+
+
+class Cells(NamedTuple):
+    """The mesh of a rig; the default is within 1 % of the converged answer (experiments/TABLES.md)."""
+
+    size: float | None = None  # [m] one for all cells, of the whole cylinder; None: a graded sector
+    rim: float = 0.04  # cells of a sector at the rim of a plate, over the shortest length there
+    edge: float = 0.02  # the same at a punch's edge
+    largest: float = 0.34  # longest cells of a sector over the radius; along the axis twice as long
+    growth: float = cylinders.GROWTH  # of cells away from rims and edge
+    corners: int = 24  # of the polygon that stands for the circle, of which a sector has one edge
+    order: int = 2  # of the elements
+    volumetric: str = "auto"  # how volume changes are treated, as of `lj.Solve`
 
 
 @struct
@@ -27,26 +53,90 @@ class Rig:
 
     scene: lj.Scene = param("1", "with a law that `read` replaces")
     nodes: Any = param("1", "node numbers (n,) that are read")
-    reading: str = static(default="force", about="force [N] on the nodes, or their mean displacement [m]")
+    weights: Any = param("1", "of each of these nodes (n,) in the reading")
+    reading: str = static(default="force", about="force [N], or mean displacement [m], of the whole cylinder's nodes")
+    whole: bool = static(default=False, about="the scene is the whole cylinder, not a sector of it")
+
+
+class _Sample(NamedTuple):
+    """A cylinder or a sector of it, glued to a plate at its bottom."""
+
+    mesh: lj.TetMesh
+    fixed: tuple
+    physics: tuple
+    parts: float  # how many such meshes are a cylinder
+    under: np.ndarray  # nodes of the top within the punch, or of all of it
+    volumetric: str
 
 
 def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]:
-    """What the rig shows at every step (T,) [N] or [m], and the steps' codes (T,)."""
-    result = lj.simulate(replace(rig.scene, law=law, viscosity=prony))
+    """What the rig shows at every step (T,) [N] or [m], and the steps' codes (T,).
+
+    Raises:
+        InputError: a law with directions of its own in a sector, where only what is alike all around the axis fits.
+    """
+    result = lj.simulate(_with(rig, law, prony))
+    return _reading(rig, result.positions, result.reactions), result.status
+
+
+def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
+    """Estimate of what a mesh without end would add to each reading (T,) [N] or [m]; not for tracing.
+
+    It takes a run, and one linear solve in a richer space a step (`liverjax.simulation.mesh_error`). NaN where a
+    step shows none.
+    """
+    result = lj.simulate(_with(rig, law, prony), mesh_error=True)
+    assert result.mesh_error is not None
+    return result.mesh_error.change(lambda x, force: _reading(rig, x, force), result)[1]
+
+
+def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
+    """The rig's scene with its law and viscosity."""
+    if not rig.whole and any(part.fibre is not None or part.green_energy is not None for part in law.summands()):
+        raise InputError(
+            f"law {type(law).__name__} has directions, and the rig's mesh is a sector of the cylinder: give the rig a "
+            "cell_size, then it is whole"
+        )
+    scene = replace(rig.scene, law=law, viscosity=prony)
+    most = STIFFEST.get(automatic.volumetric(scene))
+    ratio = _ratio(law)
+    if not rig.whole and most is not None and ratio is not None and ratio > most * (1 + 1e-9):
+        warnings.warn(
+            f"K/mu = {ratio:.3g} is above {most:g}, up to which the mesh is known to be within 1 %: see "
+            "rigs.mesh_error",
+            stacklevel=3,
+        )
+    return scene
+
+
+def _ratio(law: Law) -> float | None:
+    """Bulk over shear modulus; None where a law does not state them, or while they are traced."""
+    try:
+        moduli = law.bulk_modulus(), law.shear_modulus()
+    except InputError:
+        return None
+    if any(isinstance(m, jax.core.Tracer) for m in moduli):
+        return None
+    return float(np.max(np.asarray(moduli[0]) / np.asarray(moduli[1])))
+
+
+def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
+    """What is read of positions [m] and reactions [N] of all steps (T, V, 3)."""
     if rig.reading == "force":
-        return jnp.sum(result.reactions[:, rig.nodes, 2], axis=1), result.status
+        return reactions[:, rig.nodes, 2] @ rig.weights
     rest = rig.scene.mesh.points[rig.nodes, 2]
-    return jnp.mean(result.positions[:, rig.nodes, 2] - rest[None], axis=1), result.status
+    return (positions[:, rig.nodes, 2] - rest[None]) @ rig.weights
 
 
-def tension(radius: float, height: float, dt: float, strains: Any, cell_size: float | None = None) -> Rig:
+def tension(radius: float, height: float, dt: float, strains: Any, cell_size: float | Cells | None = None) -> Rig:
     """A cylinder pulled (or pressed) between glued plates; the force is read.
 
     Args:
         radius, height: of the sample [m].
         dt: time step [s].
         strains: nominal strain at the end of every step (T,).
-        cell_size: of the mesh [m]; default a third of the radius.
+        cell_size: edge length [m] of a mesh of the whole cylinder with cells of one size, or `Cells`; default a graded
+            sector.
 
     Raises:
         InputError: lengths or times that are not positive, strains that are not finite or flatten the sample.
@@ -54,39 +144,54 @@ def tension(radius: float, height: float, dt: float, strains: Any, cell_size: fl
     strains = _finite("strains", strains)
     if strains.min() <= -0.9:
         raise InputError(f"strains reach {strains.min():g}: keep them above -0.9")
-    mesh = _sample(radius, height, dt, cell_size)
-    return _driven(mesh, mesh.node_sets["top"], dt, height * strains)
+    cells = _cells(radius, height, dt, cell_size)
+    rim = cells.rim * min(radius, height / 2)
+    sample = _sample({radius: rim}, {0.0: rim, height: rim}, cells)
+    return _driven(sample, dt, height * strains)
 
 
 def indentation(
-    radius: float, height: float, punch: float, dt: float, depths: Any, cell_size: float | None = None
+    radius: float, height: float, punch: float, dt: float, depths: Any, cell_size: float | Cells | None = None
 ) -> Rig:
     """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; the force on it.
 
     Args:
-        radius, height, dt, cell_size: as of `tension`; the punch's edge is as sharp as the mesh is fine.
+        radius, height, dt, cell_size: as of `tension`; a ring of nodes is at the punch's edge.
 
     Raises:
-        InputError: as of `tension`; a punch wider than the sample or narrower than its mesh.
+        InputError: as of `tension`; a punch wider than the sample, or far narrower.
     """
     depths = _finite("depths", depths)
-    mesh = _sample(radius, height, dt, cell_size)
-    top = np.asarray(mesh.node_sets["top"])
-    under = top[np.hypot(*np.asarray(mesh.points)[top, :2].T) <= punch * (1 + 1e-9)]
-    if not (0 < punch < radius) or len(under) < 4:
-        raise InputError(f"punch = {punch:g} m must be below the radius {radius:g} and above a cell: mend one of them")
-    return _driven(mesh, jnp.asarray(under), dt, -depths)
+    cells = _cells(radius, height, dt, cell_size)
+    if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
+        raise InputError(
+            f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} of the radius {radius:g}: mend "
+            "one of them"
+        )
+    edge = cells.edge * min(punch, radius - punch, height)
+    rings = {punch: edge, radius: cells.rim * min(radius - punch, height)}
+    layers = {0.0: cells.rim * min(radius, height), height: edge}
+    return _driven(_sample(rings, layers, cells, punch), dt, -depths)
 
 
-def creep(radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | None = None) -> Rig:
+def creep(
+    radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | Cells | None = None
+) -> Rig:
     """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the mean displacement of the top.
 
-    The pull comes up over the first step, as it does in a rheometer over some time.
+    The pull comes up over the first step, as it does in a rheometer over some time. The mean is that over the area.
     """
-    mesh = _sample(radius, height, dt, cell_size)
-    triangles = boundary.boundary_triangles(mesh, mesh.node_sets["top"])
-    pull = lj.Traction(triangles=jnp.asarray(triangles), value=jnp.array([0.0, 0.0, float(stress)]))
-    return Rig(scene=_scene(mesh, dt, steps, traction=(pull,)), nodes=mesh.node_sets["top"], reading="displacement")
+    cells = _cells(radius, height, dt, cell_size)
+    rim = cells.rim * min(radius, height)
+    sample = _sample({radius: rim}, {0.0: rim, height: height}, cells)
+    mesh, top = sample.mesh, jnp.asarray(sample.under)
+    triangles = jnp.asarray(boundary.boundary_triangles(mesh, sample.under))
+    unit = lj.Traction(triangles=triangles, value=jnp.array([0.0, 0.0, 1.0]))
+    share = nodal_tractions(mesh, (unit,))[top, 2]
+    pull = replace(unit, value=float(stress) * unit.value)
+    scene = _scene(sample, dt, steps, traction=(pull,))
+    weights = share / jnp.sum(share)
+    return Rig(scene=scene, nodes=top, weights=weights, reading="displacement", whole=not sample.physics)
 
 
 def _finite(name: str, values: Any) -> np.ndarray:
@@ -96,25 +201,81 @@ def _finite(name: str, values: Any) -> np.ndarray:
     return values
 
 
-def _sample(radius: float, height: float, dt: float, cell_size: float | None) -> lj.TetMesh:
+def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | None) -> Cells:
+    """What a mesh is made of, after a look at all numbers."""
+    cells = cell_size if isinstance(cell_size, Cells) else Cells(size=cell_size)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(f"dt = {dt} must be positive: give the time step in seconds")
-    return shapes.cylinder(radius, height, cell_size or radius / 3)
+    for name, value in (("radius", radius), ("height", height), ("cell_size", cells.size)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} = {value} must be positive and finite: give a length in metres")
+    shape = height / radius
+    if cells.size is None and not SHAPES[0] * (1 - 1e-9) <= shape <= SHAPES[1] * (1 + 1e-9):
+        warnings.warn(
+            f"height = {height:g} m is {shape:.3g} radii, and the mesh is known to be within 1 % from {SHAPES[0]:g} to "
+            f"{SHAPES[1]:g}: see rigs.mesh_error",
+            stacklevel=3,
+        )
+    return cells
 
 
-def _driven(mesh: lj.TetMesh, nodes: jax.Array, dt: float, lift: np.ndarray) -> Rig:
+def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
+    """A sector with cells of given lengths at given radii and heights; whole, of one cell size, where that is given."""
+    radius, height = max(rings), max(layers)
+    if cells.size is not None:
+        rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))
+    largest = min(cells.size or cells.largest * radius, radius / 2)
+    radii = cylinders.graded(radius, rings, largest, cells.growth)
+    heights = cylinders.graded(height, layers, 2 * largest, cells.growth)
+    if cells.size is not None:
+        mesh, normal, parts = cylinders.graded_cylinder(radii, heights), None, 1.0
+    else:
+        mesh, normal, parts, _ = cylinders.sector(radii, heights, cells.corners)
+    mesh = _with_punch(mesh, radii, punch)
+    if cells.order == 2:
+        mesh = quadratic(mesh)
+    sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
+    bottom = lj.Fixed(nodes=jnp.asarray(sets["bottom"]))
+    if normal is None:
+        return _Sample(mesh, (bottom,), (), parts, sets["under"], cells.volumetric)
+    # The axis is in both planes: the nodes in the middle of its edges too.
+    axis = np.intersect1d(sets["start"], sets["end"])
+    fixed = (
+        bottom,
+        lj.Fixed(nodes=jnp.asarray(sets["start"]), axes="y"),
+        lj.Fixed(nodes=jnp.asarray(axis), axes="xy"),
+    )
+    slides = SlidingSupport(nodes=jnp.asarray(sets["end"]), normal=jnp.asarray(normal))
+    return _Sample(mesh, fixed, (slides,), parts, sets["under"], cells.volumetric)
+
+
+def _with_punch(mesh: lj.TetMesh, radii: np.ndarray, punch: float | None) -> lj.TetMesh:
+    """The mesh with a node set `under`: the top within the ring at `punch`, or all of it."""
+    top = np.asarray(mesh.node_sets["top"])
+    if punch is not None:
+        # The nodes of a layer are numbered from the axis outwards, ring after ring.
+        distance = np.hypot(*np.asarray(mesh.points)[top, :2].T)
+        ends = np.flatnonzero(np.diff(distance) > 1e-9 * radii[-1])
+        top = top[: 1 + ends[np.argmin(np.abs(radii - punch))]]
+    return replace(mesh, node_sets=mesh.node_sets | {"under": jnp.asarray(top)})
+
+
+def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
     history = np.zeros((len(lift) + 1, 3))
     history[1:, 2] = lift
     times = dt * np.arange(len(lift) + 1)
+    nodes = jnp.asarray(sample.under)
     moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history))
-    return Rig(scene=_scene(mesh, dt, len(lift), displaced=(moved,)), nodes=nodes)
+    scene = _scene(sample, dt, len(lift), displaced=(moved,))
+    return Rig(scene=scene, nodes=nodes, weights=jnp.full(len(nodes), sample.parts), whole=not sample.physics)
 
 
-def _scene(mesh: lj.TetMesh, dt: float, steps: int, **loads: Any) -> lj.Scene:
+def _scene(sample: _Sample, dt: float, steps: int, **loads: Any) -> lj.Scene:
     return lj.Scene(
-        mesh=mesh,
+        mesh=sample.mesh,
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
-        fixed=(lj.Fixed(nodes=mesh.node_sets["bottom"]),),
-        solve=lj.Solve(dt=dt, steps=steps, tolerance=1e-9),
+        fixed=sample.fixed,
+        physics=sample.physics,
+        solve=lj.Solve(dt=dt, steps=steps, tolerance=1e-8, volumetric=sample.volumetric),
         **loads,
     )

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.mesh.cylinders import graded, graded_cylinder
+from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
@@ -38,34 +40,60 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
     return tet_mesh(points, tets, faces)
 
 
-def cylinder(radius: float, height: float, cell_size: float) -> TetMesh:
+def cylinder(
+    radius: float,
+    height: float,
+    cell_size: float,
+    rim_cell: float | None = None,
+    rings: Sequence[float] = (),
+    match_area: bool = False,
+) -> TetMesh:
     """A cylinder about the z axis standing on z = 0: rings of 6 k nodes, layers of prisms cut into three tetrahedra.
 
     Args:
         radius, height: [m].
         cell_size: edge length aimed at [m]; at least two rings and one layer are made.
+        rim_cell: edge length [m] at the rims of both faces and at `rings`; cells grow from there to `cell_size`.
+        rings: radii [m] at which there is a ring of nodes, for instance that of a punch.
+        match_area: give the polygons the areas of their circles.
 
-    The mantle is a polygon of 6 n corners on the circle, so the volume is below pi r^2 h by O(cell_size^2).
+    Without `match_area` the mantle is a polygon of 6 n corners on the circle, so the volume is below pi r^2 h by
+    O(cell_size^2).
+
+    Raises:
+        InputError: lengths that are not positive, a ring outside the cylinder.
     """
     _positive("radius", [radius])
     _positive("height", [height])
     _positive("cell_size", [cell_size])
-    rings = max(2, math.ceil(radius / cell_size - 1e-9))
+    if rim_cell is not None or len(rings) or match_area:
+        return _graded(radius, height, (cell_size, cell_size if rim_cell is None else rim_cell), rings, match_area)
+    count = max(2, math.ceil(radius / cell_size - 1e-9))
     layers = max(1, math.ceil(height / cell_size - 1e-9))
-    disc, triangles = _disc(rings)
-    per_layer = len(disc)
-    z = np.repeat(np.linspace(0.0, height, layers + 1), per_layer)
-    points = np.column_stack([np.tile(disc * radius, (layers + 1, 1)), z])
-    prisms = np.concatenate(
-        [np.hstack([triangles + k * per_layer, triangles + (k + 1) * per_layer]) for k in range(layers)]
-    )
-    n = np.arange(len(points))
+    disc, triangles = _disc(count)
+    points, tets = stacked(disc * radius, triangles, np.linspace(0.0, height, layers + 1))
+    n, per_layer = np.arange(len(points)), len(disc)
     sets = {
         "bottom": n[:per_layer],
         "top": n[-per_layer:],
         "mantle": n[np.hypot(*points[:, :2].T) > radius * (1 - 1e-9)],
     }
-    return tet_mesh(points, _split_prisms(prisms), sets)
+    return tet_mesh(points, tets, sets)
+
+
+def _graded(
+    radius: float, height: float, cells: tuple[float, float], rings: Sequence[float], match_area: bool
+) -> TetMesh:
+    """A cylinder whose cells are `cells` long: anywhere, and at its rims and rings."""
+    cell_size, rim_cell = cells
+    _positive("rim_cell", [rim_cell])
+    for ring in rings:
+        if not (np.isfinite(ring) and 0 < ring < radius):
+            raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: mend them")
+    largest = min(cell_size, radius / 2)
+    radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)
+    heights = graded(height, {0.0: rim_cell, float(height): rim_cell}, cell_size)
+    return graded_cylinder(radii, heights, match_area)
 
 
 def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
@@ -86,20 +114,6 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
                 if m < k - 1:
                     triangles.append([inner[0], outer[1], inner[1]])
     return np.vstack(points), np.asarray(triangles)
-
-
-def _split_prisms(prisms: np.ndarray) -> np.ndarray:
-    """Three tetrahedra a prism (bottom a b c, top d e f); diagonals start at the lower node number, so faces match."""
-    # Rotate each prism so that its smallest bottom number comes first: then only one quadrilateral is left to decide.
-    shift = np.argmin(prisms[:, :3], axis=1)
-    turn = (np.arange(3)[None] + shift[:, None]) % 3
-    a, b, c = np.take_along_axis(prisms[:, :3], turn, axis=1).T
-    d, e, f = np.take_along_axis(prisms[:, 3:], turn, axis=1).T
-    first = np.column_stack([a, d, e, f])
-    low = b < c
-    second = np.where(low[:, None], np.column_stack([a, b, c, f]), np.column_stack([a, b, c, e]))
-    third = np.where(low[:, None], np.column_stack([a, b, f, e]), np.column_stack([a, c, f, e]))
-    return np.concatenate([first, second, third])
 
 
 def _positive(name: str, values: Sequence[float]) -> None:

@@ -52,9 +52,9 @@ class SlidingSupport(Physics):
         if self.axis:
             return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
-        # A node that is held along every axis has no direction left to take away.
-        loose = jnp.max(free.mask[self.nodes], axis=1, keepdims=True)
         normal = jnp.asarray(self.normal, free.mask.dtype)[None]
+        # A node that is held along all axes of the normal has no direction left to take away.
+        loose = jnp.max(free.mask[self.nodes] * (jnp.abs(normal) > 1e-12), axis=1, keepdims=True)
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def enriched(self, more: Callable[[Any], Any]) -> "SlidingSupport":

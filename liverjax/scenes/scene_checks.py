@@ -160,15 +160,16 @@ def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:
 
 
 def _no_two_normals(scene: Scene) -> None:
-    """A node may slide along one oblique plane only, and be held along no axis or all."""
+    """A node may slide along one oblique plane only, and be held along none or all of the axes of its normal."""
     taken: dict[int, str] = {}
     mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
     for name, physics in _named_physics(scene):
         if not isinstance(physics, SlidingSupport) or physics.axis:
             continue
+        across = np.abs(np.asarray(physics.normal)) > 1e-12
         for node in np.asarray(physics.nodes).tolist():
             other = taken.setdefault(node, name)
-            if other != name or 0 < mask[node].sum() < 3:
+            if other != name or 0 < mask[node, across].sum() < across.sum():
                 held = f"{other} and {name} both hold" if other != name else f"{name} and a held axis both hold"
                 raise InputError(f"{held} node {node}, in directions that are not at right angles: make places differ")
 

@@ -29,8 +29,10 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.scene_checks import CHOICES, check_scene
 
+#: Of a cylinder: what it needs, then what it may have.
+_CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
-    "mesh": ("file", "unit", "shape", "size", "cells", "radius", "height", "cell_size", "order"),
+    "mesh": ("file", "unit", "order", "shape", "size", "cells", *_CYLINDER),
     "region": ("where", "set", "law"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
     "porosity": ("bulk", "limit_bulk", "fluid_fraction", "permeability", "drained", "scheme", "keep_bulk"),
@@ -167,11 +169,22 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
             list(scale * _numbers("[mesh] size", table["size"], 3)), list(_numbers("[mesh] cells", table["cells"], 3))
         )
     if table["shape"] == "cylinder":
-        for key in ("radius", "height", "cell_size"):
-            if key not in table:
-                raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
-        return shapes.cylinder(*(scale * _number(f"[mesh] {k}", table[k]) for k in ("radius", "height", "cell_size")))
+        return _cylinder(table, scale)
     raise InputError(f"[mesh] shape = {table['shape']!r} is not known: use box or cylinder, or give a file")
+
+
+def _cylinder(table: dict, scale: float) -> TetMesh:
+    """A cylinder; its optional keys grade it to its rims and rings."""
+    for key in ("radius", "height", "cell_size"):
+        if key not in table:
+            raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
+    lengths = (scale * _number(f"[mesh] {k}", table[k]) for k in ("radius", "height", "cell_size"))
+    rim = scale * _number("[mesh] rim_cell", table["rim_cell"]) if "rim_cell" in table else None
+    rings = scale * _numbers("[mesh] rings", table.get("rings", []))
+    match = table.get("match_area", False)
+    if not isinstance(match, bool):
+        raise InputError(f"[mesh] match_area = {match!r} is not known: use true or false")
+    return shapes.cylinder(*lengths, rim, rings.tolist(), match)
 
 
 def _law(value: Any) -> Law:

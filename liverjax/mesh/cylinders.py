@@ -1,0 +1,181 @@
+"""Cylinders with rings and layers at given places: whole ones, and sectors of axisymmetric problems.
+
+A ring is a regular polygon. Its corners lie outside the circle, by so much that the polygon has the circle's area: a
+stiffness then differs from that of the circle by the fourth power of the polygon's angle, not by its square.
+"""
+
+import itertools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.prisms import stacked
+from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
+
+#: How fast cells grow away from a rim: with quadratic elements finer ones gain little (experiments/TABLES.md).
+GROWTH = 0.7
+
+
+def graded(length: float, cells: Mapping[float, float], largest: float, growth: float = GROWTH) -> np.ndarray:
+    """Places from 0 to `length`, close together near some of them.
+
+    Args:
+        length: [m].
+        cells: place [m] -> length of a cell there [m]; every place becomes one of the result.
+        largest: no cell is longer [m].
+        growth: how much longer a cell is than one nearer to such a place, over the distance between them.
+
+    Returns:
+        Rising places (n,) [m].
+    """
+    stops = np.unique([0.0, *cells, length])
+    parts = [np.zeros(1)]
+    for low, high in itertools.pairwise(stops):
+        # Geometric spacing at both ends: cells much shorter than the part are resolved.
+        half = np.concatenate([np.zeros(1), np.geomspace(1e-6, 0.5, 500)])
+        x = low + (high - low) * np.concatenate([half, 1 - half[-2::-1]])
+        cell = np.full_like(x, largest)
+        for place, size in cells.items():
+            cell = np.minimum(cell, size + growth * np.abs(x - place))
+        count = np.concatenate([np.zeros(1), np.cumsum((1 / cell[1:] + 1 / cell[:-1]) / 2 * np.diff(x))])
+        n = max(1, int(np.ceil(count[-1] - 1e-6)))
+        parts.append(np.interp(np.linspace(0.0, count[-1], n + 1)[1:], count, x))
+    return np.concatenate(parts)
+
+
+def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = True) -> TetMesh:
+    """A cylinder about the z axis with rings of nodes at `radii` and layers of nodes at `heights`.
+
+    Edges around the axis are about as long as the widest ring is wide. The number of corners grows across wide rings
+    only: a thin one has as many outside as inside.
+
+    Args:
+        radii: of the rings (n,) [m], rising from 0 (the axis).
+        heights: of the layers (m,) [m], rising.
+        match_area: give each polygon the area of its circle; else its corners are on the circle.
+
+    Returns:
+        A mesh with the node sets bottom, top and mantle.
+
+    Raises:
+        InputError: places that do not rise, radii that do not begin at 0.
+    """
+    radii, heights = _rising("radii", radii), _rising("heights", heights)
+    corners = _corners(radii)
+    disc, triangles = _rings(radii, corners, match_area)
+    points, tets = stacked(disc, triangles, heights)
+    n, per_layer = np.arange(len(points)), len(disc)
+    sets = {"bottom": n[:per_layer], "top": n[-per_layer:], "mantle": n[n % per_layer >= per_layer - corners[-1]]}
+    return tet_mesh(points, tets, sets)
+
+
+class Sector(NamedTuple):
+    """A part of a cylinder between two planes through its axis."""
+
+    mesh: TetMesh  # node sets bottom, top, mantle, axis, start (the plane y = 0) and end
+    normal: np.ndarray  # of the plane `end` (3,)
+    parts: float  # how many such sectors are a cylinder
+    stretch: float  # distance of a ring's corners from the axis, over its radius
+
+
+def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1) -> Sector:
+    """What lies between the plane y = 0 and a turned one of a cylinder whose rings have `corners` corners each.
+
+    An axisymmetric problem needs no more than one slice: both planes are planes of symmetry. Areas of polygons are
+    those of circles.
+
+    Args:
+        radii, heights: as of `graded_cylinder`.
+        corners: of every ring of the whole cylinder, at least 3.
+        slices: edges of a ring in the sector; `corners` / 4 of them are a quarter.
+
+    Raises:
+        InputError: as `graded_cylinder`; slices that fill half of the cylinder or more.
+    """
+    radii, heights = _rising("radii", radii), _rising("heights", heights)
+    if not 0 < 2 * slices < corners:
+        raise InputError(f"slices = {slices} of {corners} are no sector below half a cylinder: take fewer")
+    stretch, step = _stretch(corners), 2 * np.pi / corners
+    angle = step * np.arange(slices + 1)
+    ring = stretch * np.column_stack([np.cos(angle), np.sin(angle)])
+    plane = np.concatenate([np.zeros((1, 2)), *(r * ring for r in radii[1:])])
+    # Node 0 is the axis; a ring has slices + 1 nodes after it.
+    inner = np.zeros((len(radii) - 1, slices + 1), int)
+    outer = 1 + np.arange((len(radii) - 1) * (slices + 1)).reshape(len(radii) - 1, slices + 1)
+    inner[1:] = outer[:-1]
+    first = np.stack([inner[:, :-1], outer[:, :-1], outer[:, 1:]], axis=-1)
+    second = np.stack([inner[1:, :-1], outer[1:, 1:], inner[1:, 1:]], axis=-1)
+    points, tets = stacked(plane, np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)]), heights)
+    n = np.arange(len(points))
+    on_plane = n % len(plane)
+    sets = {
+        "bottom": n[: len(plane)],
+        "top": n[-len(plane) :],
+        "mantle": n[on_plane >= len(plane) - slices - 1],
+        "axis": n[on_plane == 0],
+        "start": n[np.isin(on_plane, [0, *outer[:, 0]])],
+        "end": n[np.isin(on_plane, [0, *outer[:, -1]])],
+    }
+    normal = np.array([-np.sin(angle[-1]), np.cos(angle[-1]), 0.0])
+    return Sector(tet_mesh(points, tets, sets), normal, corners / slices, stretch)
+
+
+def _stretch(corners: int) -> float:
+    """Radius of the corners of a regular polygon over that of the circle of the same area."""
+    step = 2 * np.pi / corners
+    return float(np.sqrt(step / np.sin(step)))
+
+
+def _corners(radii: np.ndarray) -> np.ndarray:
+    """How many corners the ring at each radius but the first has."""
+    width = np.diff(radii)
+    edge = width.max()
+    found, last = [], 6
+    for k, w in enumerate(width):
+        wanted = round(2 * np.pi * radii[k + 1] / edge)
+        # Across a ring thinner than half an edge, polygons of different corners would cut each other.
+        if k == 0 or w > edge / 2:
+            last = max(last, wanted)
+        found.append(last)
+    return np.array(found)
+
+
+def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and counter-clockwise triangles of a disc: one node in the middle, then ring after ring."""
+    points, triangles = [np.zeros((1, 2))], []
+    inner = np.zeros(1, int)
+    for radius, count in zip(radii[1:], corners, strict=True):
+        turns = np.arange(count) / count
+        size = radius * (_stretch(count) if match_area else 1.0)
+        points.append(size * np.column_stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)]))
+        outer = inner[-1] + 1 + np.arange(count)
+        triangles += _between(inner, outer)
+        inner = outer
+    return np.vstack(points), np.array(triangles)
+
+
+def _between(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
+    """Triangles between two rings: always the next edge, inside or outside, whose middle comes first."""
+    n, m = len(inner), len(outer)
+    if n == 1:
+        return [[inner[0], outer[j], outer[(j + 1) % m]] for j in range(m)]
+    found, i, j = [], 0, 0
+    while i < n or j < m:
+        if i == n or (j < m and (j + 0.5) / m <= (i + 0.5) / n):
+            found.append([inner[i % n], outer[j], outer[(j + 1) % m]])
+            j += 1
+        else:
+            found.append([inner[i], outer[j % m], inner[(i + 1) % n]])
+            i += 1
+    return found
+
+
+def _rising(name: str, places: np.ndarray) -> np.ndarray:
+    places = np.asarray(places, float)
+    if places.ndim != 1 or len(places) < 2 or not np.all(np.isfinite(places)) or not np.all(np.diff(places) > 0):
+        raise InputError(f"{name} = {places} must be two or more places that rise: sort them")
+    if name == "radii" and places[0] != 0:
+        raise InputError(f"radii begin at {places[0]:g}: begin with the axis, 0")
+    return places
