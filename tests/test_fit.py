@@ -173,13 +173,13 @@ def test_many_modes_of_a_melt_have_starts(modes):
 def test_where_the_active_set_cycles_the_bounded_solver_finds_the_same(monkeypatch):
     rng = np.random.default_rng(0)
     A, b = rng.uniform(0.1, 1, (20, 4)), rng.uniform(-1, 1, 20)
-    x, rest = generalised_maxwell._non_negative(A, b)
+    x, rest = generalised_maxwell.non_negative(A, b)
 
     def cycles(*_, **__):
         raise RuntimeError("Maximum number of iterations reached.")
 
     monkeypatch.setattr(scipy.optimize, "nnls", cycles)
-    y, other = generalised_maxwell._non_negative(A, b)
+    y, other = generalised_maxwell.non_negative(A, b)
     # lsq_linear ends where the cost gains less than 1e-10 of itself: its root, the distance, is half as far off.
     assert np.all(y >= 0) and np.isclose(other, rest, rtol=1e-10) and np.allclose(x, y, atol=1e-5)
 

@@ -1,5 +1,7 @@
 """Reading sweeps: units, instruments' exports, and one sentence for everything that cannot be read."""
 
+import json
+
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -301,6 +303,61 @@ def test_too_few_usable_points_are_refused(tmp_path):
     spread = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_sd_Pa,loss_sd_Pa\n"
     s = read_sweep(_write(tmp_path, spread + "".join(f"{k},300,30,{k - 1},3\n" for k in range(1, 6))))
     assert len(s.storage) == 4 and "storage_sd_Pa = 0 is not positive" in s.notes[0]
+
+
+TRIOS_JSON = {
+    "Schema": {"Url": "https://software.tainstruments.com/schemas/TRIOSJSONExportSchema"},
+    "Results": {
+        "Processed": {
+            "ResultsSteps": [{"Id": "a", "Name": "Amplitude - 1"}, {"Id": "b", "Name": "Frequency sweep - 2"}],
+            "ColumnHeaders": {
+                "Angular frequency_rad/s": {
+                    "DisplayName": "Angular frequency",
+                    "ValueType": "Number",
+                    "Unit": {"Name": "rad/s"},
+                },
+                "Status bits": {"DisplayName": "Status bits", "ValueType": "Text"},
+                "Storage modulus_MPa": {"DisplayName": "Storage modulus", "Unit": {"Name": "MPa"}},
+                "Loss modulus_MPa": {"DisplayName": "Loss modulus", "Unit": {"Name": "MPa"}},
+                "Results Step Id": {"DisplayName": "Results Step Id", "ValueType": "Uuid"},
+            },
+            "Rows": [
+                {
+                    "Angular frequency_rad/s": omega,
+                    "Status bits": "0x12",
+                    "Storage modulus_MPa": storage,
+                    "Loss modulus_MPa": 1e-5,
+                    "Results Step Id": step,
+                }
+                for step, omega, storage in (("a", 6.28, 4e-4), ("b", 1, 3e-4), ("b", 10, 4e-4), ("b", 100, 5e-4))
+            ],
+        }
+    },
+}
+
+
+def test_trios_json(tmp_path):
+    s = read_sweep(_write(tmp_path, json.dumps(TRIOS_JSON), "export.json"))
+    assert s.angular_frequency.tolist() == [1, 10, 100] and np.allclose(s.storage, [300, 400, 500])
+    assert "1 'Amplitude - 1', 2 'Frequency sweep - 2'" in s.notes[0]
+    older = TRIOS_JSON | {"Results": TRIOS_JSON["Results"]["Processed"]}
+    assert len(read_sweep(_write(tmp_path, json.dumps(older), "older.json")).storage) == 3
+    for text in ('{"Results": []}', '{"a": 1}', "{", '{"Results": {"ColumnHeaders": {}, "Rows": [1]}}'):
+        with pytest.raises(InputError, match="is JSON, but not the export of TRIOS"):
+            read_sweep(_write(tmp_path, text, "other.json"))
+
+
+def test_moduli_of_tension_are_thirds_and_said(tmp_path):
+    text = "Frequency,E_stor,E_loss\nHz,MPa,MPa\n1,0.3,0.03\n2,0.6,0.06\n4,0.9,0.09\n"
+    s = read_sweep(_write(tmp_path, text))
+    assert np.allclose(s.storage, [1e5, 2e5, 3e5]) and np.allclose(s.loss, [1e4, 2e4, 3e4])
+    assert any("G = E / 3 is taken" in n for n in s.notes)
+    primes = read_sweep(_write(tmp_path, "f [Hz],E' [MPa],E'' [MPa]\n1,0.3,0.03\n2,0.6,0.06\n4,0.9,0.09\n"))
+    assert np.allclose(primes.storage, s.storage)
+    both = "frequency_Hz,E' (Pa),storage_modulus_Pa,loss_modulus_Pa\n1,900,400,60\n2,999,500,70\n"
+    assert read_sweep(_write(tmp_path, both)).storage.tolist() == [400, 500]
+    short = "omega_rad_s,Gp_Pa,Gpp_Pa\n1,400,60\n2,500,70\n"
+    assert read_sweep(_write(tmp_path, short)).loss.tolist() == [60, 70]
 
 
 def test_a_workbook_is_called_one(tmp_path):

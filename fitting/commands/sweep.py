@@ -13,6 +13,7 @@ from liverjax.core.files import writable
 
 if TYPE_CHECKING:
     from fitting.fits.viscoelastic import Fit
+    from fitting.methods.generalised_maxwell import Maxwell, Spectrum
     from fitting.readers.rheometer import Sweep
 
 
@@ -20,16 +21,30 @@ def parser(prog: str) -> argparse.ArgumentParser:
     """Options of the command, which --help calls `prog`."""
     command = argparse.ArgumentParser(
         prog=prog,
-        description="Identify a generalised Maxwell (Prony) model from a rheometer's frequency sweep.",
-        epilog=f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
-        + EXIT_CODES,
+        description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
+        epilog=f"Tests in time: {prog} relaxation --help, {prog} creep --help. "
+        f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. " + EXIT_CODES,
     )
     command.add_argument(
-        "sweep", type=Path, metavar="SWEEP.csv", help="frequency sweep: CSV, TRIOS or RheoCompass text"
+        "sweep",
+        type=Path,
+        nargs="+",
+        metavar="SWEEP.csv",
+        help="frequency sweep: CSV, TRIOS or RheoCompass text; several files are samples of one material",
     )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
+    command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
+    command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
     command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
-    command.add_argument("--method", choices=("torsion", "closed-form"), default="torsion", help="default torsion")
+    command.add_argument(
+        "--model",
+        choices=("prony", "fractional", "spectrum", "auto"),
+        default="prony",
+        help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
+    )
+    command.add_argument(
+        "--method", choices=("torsion", "closed-form"), help="default torsion; of several samples closed-form"
+    )
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
@@ -42,6 +57,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
     command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
+    command.add_argument(
+        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
+    )
     command.add_argument(
         "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
     )
@@ -64,7 +82,14 @@ def run(options: argparse.Namespace) -> int:
     from fitting.reports import sweep_report
 
     _check(options)
+    if len(options.sweep) > 1:
+        from fitting.commands import samples
+
+        return samples.run(options)
+    options.sweep, options.method = options.sweep[0], options.method or "torsion"
     sweep = rheometer.read_sweep(options.sweep, options.table)
+    sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
+    sweep = rheometer.without_inertia(sweep, options.radius, options.height)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     fits = _fits(options, sweep)
@@ -73,6 +98,8 @@ def run(options: argparse.Namespace) -> int:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
     sweep_report.write(options.out, sweep, fits, profile)
     print(sweep_report.table(sweep, fits))
+    if options.cards:
+        write_cards(options.out, fits[-1].model)
     for name, (low, high) in (profile or {}).items():
         ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
         print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
@@ -80,6 +107,15 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")
     return 0 if fits[-1].converged else 1
+
+
+def write_cards(out: Path, model: "Maxwell") -> None:
+    """Write material cards and say what a program cannot hold."""
+    from fitting.reports import material_cards
+
+    for sentence in material_cards.write(out / "cards", model):
+        print(f"note: {sentence}", file=sys.stderr)
+    print(f"written: {out}/cards")
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -93,24 +129,54 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form":
         raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
+    if len(options.sweep) > 1:
+        _check_samples(options)
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
+    if options.model in ("fractional", "spectrum") and options.modes != "auto":
+        raise InputError(f"--modes {options.modes} is of --model prony: leave it out for --model {options.model}")
+    if options.profile and options.model != "prony":
+        raise InputError(f"--profile is of --model prony; leave it out for --model {options.model}")
     laws.find(options.law)
+
+
+def _check_samples(options: argparse.Namespace) -> None:
+    """Refuse what only one sweep can have."""
+    for name, asked, instead in (
+        ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
+        ("--profile", options.profile, "leave it out, or give one file"),
+        ("--model spectrum", options.model == "spectrum", "give --model prony, fractional or auto"),
+    ):
+        if asked:
+            raise InputError(f"{name} is of one sample, {len(options.sweep)} files are given: {instead}")
+
+
+def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
+    """The fit in closed form of the model asked for."""
+    from fitting.fits import models, viscoelastic
+
+    prony = None
+    if options.model in ("prony", "auto"):
+        if options.modes == "auto":
+            prony = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
+        else:
+            prony = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
+    if options.model == "prony":
+        assert prony is not None
+        return prony
+    return models.choose(sweep, options.model, prony, dense)
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
     """The closed form, and after it the fit through the simulation if asked for."""
-    from fitting.fits import viscoelastic
+    from fitting.fits import edges, viscoelastic
     from fitting.methods import generalised_maxwell
 
     if options.modes != "auto":
         viscoelastic.check_modes(sweep, options.modes)
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    if options.modes == "auto":
-        closed = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
-    else:
-        closed = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
+    closed = edges.honest(_closed(options, sweep, dense), sweep, dense)
     if options.method == "closed-form":
         return [closed]
     simulation = viscoelastic.Simulation(

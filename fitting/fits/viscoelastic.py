@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,18 @@ from liverjax.physics.viscosity import Prony
 OPTIMIZERS = ("levenberg-marquardt", "bfgs")
 
 
+class Kind(NamedTuple):
+    """What the numbers u of a fit mean: by default the Prony modes themselves."""
+
+    name: str = "prony"
+    maxwell: Callable[[jax.Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
+    names: tuple[str, ...] = ()  # of its own parameters, where they are not the modes
+    units: tuple[str, ...] = ()
+    values: Callable[[jax.Array], jax.Array] | None = None  # u -> its own parameters (P,)
+    prior: Callable[[jax.Array], jax.Array] | None = None  # u -> rows that stand below the residuals of the data
+    effective: float | None = None  # number of parameters that the data determine; None: the length of u
+
+
 class Fit(NamedTuple):
     """A fitted model with all that a report needs."""
 
@@ -36,6 +49,8 @@ class Fit(NamedTuple):
     run_time: float  # [s]
     compile_time: float
     details: dict[str, Any]
+    kind: Kind = Kind()
+    parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
 
     @property
     def modes(self) -> int:
@@ -48,13 +63,34 @@ class Fit(NamedTuple):
         return np.abs(np.concatenate([self.storage, self.loss]) / data - 1)
 
 
-def _timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
-    """Result, seconds of compilation, seconds of the run."""
+def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
+    """Result, seconds of compilation, seconds of the run; a function seen with these shapes is not compiled again."""
     begin = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
+    arguments = jax.tree.map(jnp.asarray, arguments)
+    leaves, tree = jax.tree.flatten(arguments)
+    compiled = _compiled(function, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
     middle = time.perf_counter()
     result = jax.block_until_ready(compiled(*arguments))
     return result, middle - begin, time.perf_counter() - middle
+
+
+@lru_cache(maxsize=16)  # the fits of several samples, and of parts of a band, are one program
+def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
+    arguments = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
+    return jax.jit(function).lower(*arguments).compile()
+
+
+@lru_cache(maxsize=16)
+def best_of(minimise: Callable, residuals: Callable, each: int = 0) -> Callable[..., Solution]:
+    """The lowest minimum over starting points (S, P); the first `each` of the data have a row for each start too."""
+
+    def best(starts, *data):
+        rows, common = data[:each], data[each:]
+        found = jax.vmap(lambda u, *own: minimise(residuals, u, *own, *common))(starts, *rows)
+        k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
+        return jax.tree.map(lambda leaf: leaf[k], found)
+
+    return best
 
 
 def check_modes(sweep: Sweep, modes: int) -> None:
@@ -80,37 +116,65 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
     """
     check_modes(sweep, modes)
     dense = dense or generalised_maxwell.refuse_impossible(sweep)
+    return from_starts(sweep, generalised_maxwell.starts(sweep, modes, dense), Kind(), optimizer)
+
+
+def from_starts(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = "levenberg-marquardt") -> Fit:
+    """The best minimum over `starts` (S, P) of Prony modes, of a solid or (by `kind`) of a fluid."""
     minimise = levenberg_marquardt if optimizer == OPTIMIZERS[0] else bfgs
-    starts = generalised_maxwell.starts(sweep, modes, dense)
-
-    def best(starts, *data):
-        found = jax.vmap(lambda u: minimise(generalised_maxwell.residuals, u, *data))(starts)
-        k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
-        return jax.tree.map(lambda leaf: leaf[k], found)
-
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
-    found, compiling, running = _timed(best, starts, *data)
-    model = generalised_maxwell.natural(found.u)
-    storage, loss = (np.asarray(v) for v in generalised_maxwell.moduli(model, jnp.asarray(sweep.angular_frequency)))
-    return _fit("closed-form", sweep, found, storage, loss, (), running, compiling, {"optimizer": optimizer})
+    found, compiling, running = timed(best_of(minimise, residuals_of(kind)), starts, *data)
+    return fitted(sweep, found, kind, running, compiling, {"optimizer": optimizer})
 
 
-def _fit(method, sweep, found, storage, loss, extra, running, compiling, details) -> Fit:
-    spread = uncertainty.estimate(found, sweep.storage_sd is not None)
-    sentences = _misfit(sweep, storage, loss) + tuple(uncertainty.cautions(sweep, spread, found))
+def residuals_of(kind: Kind) -> Callable[..., jax.Array]:
+    """Residuals of Prony modes, of a solid or a fluid."""
+    return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
+
+
+def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: dict[str, Any]) -> Fit:
+    """The fit in closed form at a minimum over u of `kind`, whose first residuals are those of the data."""
+    scales, measured = np.concatenate(sweep.deviations), np.concatenate([sweep.storage, sweep.loss])
+    storage, loss = np.split(np.asarray(found.residuals)[: len(measured)] * scales + measured, 2)
+    simulated = Simulated("closed-form", found, storage, loss)
+    return _fit(sweep, simulated, kind, (running, compiling), details)
+
+
+class Simulated(NamedTuple):
+    """A minimum and the moduli there [Pa]."""
+
+    method: str
+    solution: Solution
+    storage: np.ndarray
+    loss: np.ndarray
+    advice: tuple[str, ...] = ()  # where the simulation broke down
+
+
+def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], details: dict[str, Any]) -> Fit:
+    found, storage, loss = at.solution, at.storage, at.loss
+    spread = uncertainty.estimate(found, sweep.storage_sd is not None, kind.maxwell, (2 * len(storage), kind.effective))
+    own = None
+    if kind.values is not None:
+        rows = (2 * len(storage), sweep.storage_sd is not None, kind.effective)
+        own = uncertainty.estimated(kind.names, kind.values, found, *rows)
+    sentences = _misfit(sweep, storage, loss, kind)
+    sentences += tuple(uncertainty.cautions(sweep, spread, found, kind.name) if own is None else ())
     converged = bool(found.converged)
-    if not converged and not extra:
-        extra = ("try fewer modes",)
+    advice = at.advice or (("try fewer modes",) if own is None else ("try another model",))
     if not converged:
         reason = f"the fit did not converge in {int(found.iterations)} iterations; its best point is given"
-        sentences = (f"{reason}: {extra[0]}", *sentences)
-    G0, ratios, times = (np.asarray(v) for v in generalised_maxwell.natural(found.u))
+        sentences = (f"{reason}: {advice[0]}", *sentences)
+    G0, ratios, times = (np.asarray(v) for v in kind.maxwell(jnp.asarray(found.u)))
     model: Any = Maxwell(G0, ratios, times)  # type: ignore[arg-type]  # arrays of the host
     details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
-    return Fit(method, model, found, spread, converged, storage, loss, sentences, running, compiling, details)
+    return Fit(at.method, model, found, spread, converged, storage, loss, sentences, *seconds, details, kind, own)
 
 
-def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, ...]:
+#: N modes without an equilibrium modulus: their ratios add up to one.
+FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
+
+
+def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
     """A sentence where the model does not follow the data, naming the worst point."""
     e = np.abs(np.concatenate([storage / sweep.storage, loss / sweep.loss]) - 1)
     if e.mean() < 0.05 and e.max() < 0.3:
@@ -119,7 +183,7 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray) -> tuple[str, .
     where = f"{'storage' if worst < n else 'loss'}_modulus at {sweep.angular_frequency[worst % n] / (2 * np.pi):.3g} Hz"
     return (
         f"the fit misses the data by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
-        "try more modes, or look at the data",
+        f"try {'another --model' if kind.values else 'more modes or another --model'}, or look at the data",
     )
 
 
@@ -129,10 +193,13 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
 
 
 def information_criterion(fit: Fit) -> float:
-    """Bayesian information criterion with the noise level estimated: m ln(RSS/m) + k ln m."""
-    m, k = len(fit.solution.residuals), len(fit.solution.u)
-    mean_square = max(2 * float(fit.solution.cost) / m, 1e-300)
-    return m * np.log(mean_square) + k * np.log(m)
+    """Bayesian information criterion with the noise level estimated: m ln(RSS/m) + k ln m.
+
+    k is the number of parameters, or the effective one where a prior holds them.
+    """
+    m, k = 2 * len(fit.storage), len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
+    mean_square = max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, 1e-300)
+    return float(m * np.log(mean_square) + k * np.log(m))
 
 
 #: Mean relative residual at which a fit is exact to the digits of any data.
@@ -222,13 +289,31 @@ class Simulation(NamedTuple):
 
 
 def simulated_moduli(
-    u: jax.Array, rig: torsion.Rig, law: laws.Law, omega: Any, torque: Any, drive: torsion.Drive, scheme: str, part: str
+    model: Maxwell, rig: torsion.Rig, law: laws.Law, omega: Any, torque: Any, simulation: Simulation
 ) -> torsion.Moduli:
-    """`torsion.moduli` of unconstrained Maxwell parameters u, the law scaled to their G0."""
-    model = generalised_maxwell.natural(u)
+    """`torsion.moduli` of Prony modes, the law scaled to their G0."""
     scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
-    viscosity = Prony(ratios=model.ratios, relaxation_times=model.relaxation_times, scheme=scheme, part=part)
-    return torsion.moduli(rig, scaled, viscosity, omega, torque, drive)
+    viscosity = Prony(
+        ratios=model.ratios,
+        relaxation_times=model.relaxation_times,
+        scheme=simulation.scheme,
+        part=simulation.part,
+    )
+    return torsion.moduli(rig, scaled, viscosity, omega, torque, torsion.Drive(steps=simulation.steps))
+
+
+#: What the closed form says of data and model, which the simulation leaves as it is: words of warnings, and details.
+OF_THE_DATA = (
+    "modes would follow",
+    "about as well as",
+    "would follow the data more closely",
+    "no finite instantaneous",
+    "that relaxes",
+    "Kramers-Kronig",
+    "half decade",
+    "structured misfit",
+)
+KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency")
 
 
 def through_torsion(
@@ -251,15 +336,15 @@ def through_torsion(
 
     law = laws.typical(simulation.law)
     rig = torsion.make_rig(simulation.radius, simulation.height, simulation.cell_size, density=simulation.density)
-    drive = torsion.Drive(steps=simulation.steps)
     check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
     data = (rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales)
 
     def residuals(u, rig, law, omega, torque, measured, scales):
-        m = simulated_moduli(u, rig, law, omega, torque, drive, simulation.scheme, simulation.part)
-        return (jnp.concatenate([m.storage, m.loss]) - measured) / scales, m
+        m = simulated_moduli(kind.maxwell(u), rig, law, omega, torque, simulation)
+        r = (jnp.concatenate([m.storage, m.loss]) - measured) / scales
+        return r if kind.prior is None else jnp.concatenate([r, kind.prior(u)]), m
 
     def evaluate(u, *data):
         def twice(u):
@@ -269,7 +354,7 @@ def through_torsion(
         J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
         return r, J, m
 
-    u0 = start.solution.u
+    u0, kind = start.solution.u, start.kind
     begin = time.perf_counter()
     if optimizer == OPTIMIZERS[0]:
         compiled = jax.jit(evaluate).lower(u0, *data).compile()
@@ -284,7 +369,7 @@ def through_torsion(
         m = seen[np.asarray(found.u).tobytes()]
         running = time.perf_counter() - begin - compiling
     else:
-        (found, m), compiling, running = _timed(
+        (found, m), compiling, running = timed(
             lambda u, *data: (lambda s: (s, residuals(s.u, *data)[1]))(
                 bfgs(lambda u, *d: residuals(u, *d)[0], u, *data)
             ),
@@ -296,8 +381,11 @@ def through_torsion(
     found = found._replace(converged=jnp.asarray(bool(found.converged) and worst == status.CONVERGED))
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
-    fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)
-    more = tuple(w for w in start.warnings if "modes would follow" in w)
+    at = Simulated("torsion", found, storage, loss, advice)
+    fit = _fit(sweep, at, kind, (running, compiling), details)
+    more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
+    of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
+    fit = fit._replace(details=fit.details | of_the_model)
     return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
 
 

@@ -9,6 +9,9 @@ import scipy.stats
 
 from fitting.methods.least_squares import Solution
 
+#: Stands in a covariance for an error that has no bound; a square of it is still a number.
+LOST = 1e140
+
 
 class Estimate(NamedTuple):
     """Numbers in the order of `names`, and how well the data determine them."""
@@ -44,6 +47,7 @@ def estimated(
     found: Solution,
     components: int,
     deviations_given: bool = True,
+    effective: float | None = None,
 ) -> Estimate:
     """The estimate at a minimum: covariance of u, carried to the reported numbers by the delta method.
 
@@ -53,9 +57,13 @@ def estimated(
         found: minimum over u.
         components: how many of the residuals are measured; those that are not are 0 and count for nothing.
         deviations_given: as of `noise_factor`.
+        effective: where a prior holds u: the number of parameters that the data determine. The rows of the prior
+            then stand below the `components` rows of the data.
     """
     u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
-    noise = noise_factor(r, components - len(u), deviations_given)
+    if effective is not None:
+        r = r[:components]
+    noise = noise_factor(r, components - (len(u) if effective is None else effective), deviations_given)
     values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
@@ -65,7 +73,7 @@ def estimated(
         names=tuple(names),
         values=values,
         root=root,
-        standard_errors=np.where(stuck, np.inf, errors),
+        standard_errors=np.where(stuck | (errors > 1e-10 * LOST), np.inf, errors),
         correlation=correlation,
         chi2=float(r @ r),
         components=components,
@@ -75,7 +83,7 @@ def estimated(
     )
 
 
-def noise_factor(residuals: np.ndarray, freedom: int, deviations_given: bool) -> float:
+def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) -> float:
     """Noise over the residual scales.
 
     Without deviations the residuals estimate it. Given deviations are believed, except where the residuals are larger
@@ -98,7 +106,9 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
-    return noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0]), s
+    with np.errstate(over="ignore", invalid="ignore"):  # a number that ran away has no finite error
+        root = noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0])
+    return np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST), s
 
 
 def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

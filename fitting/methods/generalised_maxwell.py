@@ -63,6 +63,29 @@ def residuals(u: jax.Array, omega: jax.Array, storage: jax.Array, loss: jax.Arra
     return (jnp.concatenate(moduli(natural(u), omega)) - jnp.concatenate([storage, loss])) / scales
 
 
+def natural_fluid(u: jax.Array) -> Maxwell:
+    """Model without an equilibrium modulus of u (2N,): as `natural`, the last mode in place of the equilibrium part."""
+    n = u.shape[0] // 2
+    share = jax.nn.softmax(jnp.append(u[1:n], 0.0))
+    log_times = u[n] - jnp.append(0.0, jnp.cumsum(jnp.exp(u[n + 1 :])))
+    return Maxwell(jnp.exp(u[0]), share, jnp.exp(log_times))
+
+
+def fluid_residuals(
+    u: jax.Array, omega: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array
+) -> jax.Array:
+    """As `residuals`, of a model without an equilibrium modulus."""
+    return (jnp.concatenate(moduli(natural_fluid(u), omega)) - jnp.concatenate([storage, loss])) / scales
+
+
+def fluid_of(u: np.ndarray) -> np.ndarray:
+    """u of `natural_fluid` (2N,) from u of `natural` (2N + 1,): the equilibrium part is left out."""
+    n = (len(u) - 1) // 2
+    model = natural(jnp.asarray(u))
+    last = np.log(np.asarray(model.ratios[:-1])) - np.log(float(model.ratios[-1]))
+    return np.concatenate([u[:1], last, u[n + 1 :]])
+
+
 def largest_number_of_modes(sweep: Sweep) -> int:
     """N with 2N + 1 parameters below the 2n moduli at n different frequencies."""
     return len(np.unique(sweep.angular_frequency)) - 1
@@ -87,11 +110,11 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
     top = np.column_stack([np.ones_like(omega), x**2 / (1 + x**2)]) / size[:, None]
     bottom = np.column_stack([np.zeros_like(omega), x / (1 + x**2)]) / size[:, None]
     A, b = np.vstack([top, bottom]), np.concatenate([sweep.storage / size, sweep.loss / size])
-    weights, rest = _non_negative(A, b)
+    weights, rest = non_negative(A, b)
     return Spectrum(times, weights[1:], float(weights[0]), float(rest / np.sqrt(len(omega))))
 
 
-def _non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
+def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     """x >= 0 that brings A x nearest to b, and their distance.
 
     An active set that cycles (columns that are nearly the same, which close relaxation times give) leaves the problem
@@ -156,7 +179,7 @@ def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
     one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
     scale = np.concatenate(sweep.deviations)
     A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])]) / scale[:, None]
-    strengths, _ = _non_negative(A, np.concatenate([sweep.storage, sweep.loss]) / scale)
+    strengths, _ = non_negative(A, np.concatenate([sweep.storage, sweep.loss]) / scale)
     total = strengths.sum()
     share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
     share = share / share.sum()

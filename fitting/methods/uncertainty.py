@@ -1,6 +1,7 @@
 """How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.rheometer import Sweep
 
@@ -24,10 +26,28 @@ def parameter_names(modes: int) -> tuple[str, ...]:
     return ("shear_modulus", *ratios, *times)
 
 
-def estimate(found: Solution, deviations_given: bool) -> Estimate:
-    """Values, errors and correlation of G0, ratios and relaxation times at the minimum."""
-    names = parameter_names((len(found.u) - 1) // 2)
-    return estimated(names, parameter_vector, found, len(found.residuals), deviations_given)
+def estimate(
+    found: Solution,
+    deviations_given: bool,
+    maxwell: Callable[[jax.Array], Maxwell] = generalised_maxwell.natural,
+    components: tuple[int, float | None] | None = None,
+) -> Estimate:
+    """Values, errors and correlation of G0, ratios and relaxation times at the minimum.
+
+    Args:
+        found: minimum over u.
+        deviations_given: as of `noise_factor`.
+        maxwell: u -> Prony modes; the default is of their own parametrisation.
+        components: number of measured residuals (default all), and of effective parameters (default those of u).
+    """
+    count, effective = components or (len(found.residuals), None)
+
+    def vector(u):
+        model = maxwell(u)
+        return jnp.concatenate([model.shear_modulus[None], model.ratios, model.relaxation_times])
+
+    modes = jax.eval_shape(maxwell, jnp.asarray(found.u)).ratios.shape[0]
+    return estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
 
 
 def equilibrium_error(u: Estimate) -> float:
@@ -93,29 +113,39 @@ def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
 MERGED = 1.5
 
 
-def _decades(sweep: Sweep) -> float:
-    return float(np.log10(sweep.angular_frequency[-1] / sweep.angular_frequency[0]))
+class Band(Protocol):
+    """Data that resolve relaxation times, of a sweep or of a test in time."""
+
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest of them [s]."""
 
 
-def supported_modes(sweep: Sweep) -> int:
+def _decades(data: Band) -> float:
+    low, high = data.resolved
+    return float(np.log10(high / low))
+
+
+def supported_modes(data: Band) -> int:
     """How many modes the band has room for: about one a decade and one more, at least one."""
-    return max(1, int(_decades(sweep) + 1 + 1e-9))  # a decade is a decade in spite of rounding
+    return max(1, int(_decades(data) + 1 + 1e-9))  # a decade is a decade in spite of rounding
 
 
-def superfluous(sweep: Sweep, u: Estimate) -> list[str]:
+def superfluous(data: Band, u: Estimate) -> list[str]:
     """Sentences that advise against some of the modes; none for a number of modes that may be chosen."""
     modes = (len(u.values) - 1) // 2
-    fewer = "use fewer modes or a wider sweep" if modes > 1 else "use a wider sweep"
+    kind, measured = ("sweep", "measured frequencies") if isinstance(data, Sweep) else ("test", "measured times")
+    fewer = f"use fewer modes or a wider {kind}" if modes > 1 else f"use a wider {kind}"
     g, tau = u.values[1 : modes + 1], u.values[modes + 1 :]
     g_err, tau_err = u.standard_errors[1 : modes + 1], u.standard_errors[modes + 1 :]
-    low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
+    low, high = data.resolved
     out = []
     for k in range(modes):
         if not low / 100 <= tau[k] <= 100 * high:
             product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
             out.append(
-                f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the measured "
-                f"frequencies resolve: only {product} is determined, no factor of it; "
+                f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the "
+                f"{measured} resolve: only {product} is determined, no factor of it; "
                 f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
             )
         if not g_err[k] < 0.5 * g[k]:
@@ -134,15 +164,15 @@ def superfluous(sweep: Sweep, u: Estimate) -> list[str]:
                 f"relaxation times {tau[k]:.3g} s and {tau[k + 1]:.3g} s have merged: they act as one mode; use "
                 f"{modes - 1} mode{'s' if modes > 2 else ''}"
             )
-    if modes > supported_modes(sweep) or _decades(sweep) < 0.3:
+    if modes > supported_modes(data) or _decades(data) < 0.3:
         out.append(
-            f"the sweep spans {_decades(sweep):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
+            f"the {kind} spans {_decades(data):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
             f"(about one a decade and one more); {fewer}"
         )
     return out
 
 
-def cautions(sweep: Sweep, u: Estimate, found: Solution) -> list[str]:
+def cautions(sweep: Sweep, u: Estimate, found: Solution, model: str = "prony") -> list[str]:
     """Sentences on what the data do not tell, each with the number it rests on and what to do."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
@@ -157,7 +187,7 @@ def cautions(sweep: Sweep, u: Estimate, found: Solution) -> list[str]:
             )
     ratios = u.values[1 : modes + 1].sum()
     equilibrium = u.values[0] * (1 - ratios)
-    if not equilibrium > 2 * equilibrium_error(u):
+    if model == "prony" and not equilibrium > 2 * equilibrium_error(u):
         out.append(
             f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
             "from zero (a fluid); measure at lower frequencies"
@@ -180,5 +210,6 @@ def cautions(sweep: Sweep, u: Estimate, found: Solution) -> list[str]:
 
 
 def _percent(error: float, value: float) -> str:
-    ratio = 100 * error / abs(value) if value else np.inf
+    with np.errstate(over="ignore"):
+        ratio = 100 * error / abs(value) if value else np.inf
     return f"{ratio:.3g} %" if ratio < 1e4 else "more than 10000 %"

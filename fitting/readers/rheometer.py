@@ -13,13 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitting.readers import workbook
+from fitting.readers import raw_torque, trios_json, workbook
 from liverjax.core.errors import InputError
 
 #: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
 MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
 FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1", "rad_s-1", "1/s", "s-1"), 1.0)
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
+#: First words of the columns; those with an E are of tension or bending.
+STORAGE, LOSS = ("storage", "g'", "gp", "e'", "ep"), ("loss", "g''", "gpp", "e''", "epp")
 #: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.
 SMALLEST, LARGEST = 1e-30, 1e30
 #: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
@@ -41,6 +43,8 @@ class Sweep(NamedTuple):
     loss_sd: np.ndarray | None = None
     source: str = ""
     notes: tuple[str, ...] = ()  # what the reader changed or chose, sentences
+    raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], where the file has them
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out for the instrument's sake
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -49,6 +53,11 @@ class Sweep(NamedTuple):
             self.storage if self.storage_sd is None else self.storage_sd,
             self.loss if self.loss_sd is None else self.loss_sd,
         )
+
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time [s] that the frequencies resolve."""
+        return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
 
 
 class _Column(NamedTuple):
@@ -63,6 +72,7 @@ class _Table(NamedTuple):
     columns: list[_Column]
     rows: list[list[float]]  # in the order of the columns
     numbers: list[int]  # of the lines in the file
+    raw: dict[str, np.ndarray]  # what the instrument measured, one value a row
 
     @property
     def frequencies(self) -> int:
@@ -87,9 +97,45 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
     """
-    tables = _tables(str(path), _text(Path(path)).splitlines())
+    tables = _tables(str(path), text_of(Path(path)).splitlines())
     chosen, notes = _choose(str(path), tables, table)
     return _sweep(str(path), tables[chosen], notes)
+
+
+def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
+    """The points from `low` to `high` [Hz]; a note names how many are left out.
+
+    Raises:
+        InputError: fewer than `FEWEST` frequencies are left.
+    """
+    hertz = sweep.angular_frequency / (2 * np.pi)
+    kept = np.ones(len(hertz), bool)
+    for limit, side, name in ((low, -1, "min"), (high, 1, "max")):
+        if limit is None:
+            continue
+        if not (np.isfinite(limit) and limit > 0):
+            raise InputError(f"--{name}-frequency {limit:g} is no frequency in Hz: give a positive number")
+        kept &= side * hertz <= side * limit * (1 + side * 1e-9)
+    if kept.all():
+        return sweep
+    if len(np.unique(hertz[kept])) < FEWEST:
+        raise InputError(
+            f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency leave {kept.sum()} of {len(kept)} points "
+            f"(the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): leave {FEWEST} or more"
+        )
+    ends = " and ".join(
+        f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
+    )
+    note = f"{(~kept).sum()} of {len(kept)} points {ends} are left out as asked for"
+    return some(sweep, kept)._replace(notes=(*sweep.notes, note))
+
+
+def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
+    """The points where `kept` (n,) is true."""
+    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
+    columns: dict[str, Any] = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
+    raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
+    return sweep._replace(**columns, raw=raw)
 
 
 def _choose(path: str, tables: list[_Table], wanted: str | None) -> tuple[int, list[str]]:
@@ -121,18 +167,29 @@ def _named(path: str, tables: list[_Table], names: list[str], wanted: str) -> in
     raise InputError(f"{path}: --table {wanted} {found}; give the number or the whole name of one: {offered}")
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path, what: str = "a frequency sweep") -> str:
+    """Content of a text file of any encoding; `InputError` asking for the CSV file of `what`."""
     try:
         if path.is_dir():
-            raise InputError(f"{path} is a folder: give the CSV file of a frequency sweep")
+            raise InputError(f"{path} is a folder: give the CSV file of {what}")
         if not path.exists():
-            raise InputError(f"{path}: no such file; give the CSV file of a frequency sweep")
+            raise InputError(f"{path}: no such file; give the CSV file of {what}")
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; give the CSV file of a frequency sweep") from None
+        raise InputError(f"{path}: {error.strerror}; give the CSV file of {what}") from None
     if not data.strip():
         raise InputError(f"{path} is empty: export the sweep again")
-    workbook.refuse(path, data, "the sheet of the frequency sweep")
+    workbook.refuse(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
+    text = _decoded(path, data)
+    if text.lstrip().startswith("{"):
+        found = trios_json.tables(text)
+        if found is None:
+            raise InputError(f"{path} is JSON, but not the export of TRIOS (it has no Results): give CSV or text")
+        return found
+    return text
+
+
+def _decoded(path: Path, data: bytes) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     if b"\0" in data:
@@ -162,10 +219,12 @@ def _quantity(cell: str) -> tuple[str, str | None] | None:
     words, lower = [w for w, _ in kept], [l for _, l in kept]
     if not lower:
         return None
-    if lower[0] in ("storage", "loss", "g'", "g''"):
-        quantity = "storage" if lower[0] in ("storage", "g'") else "loss"
+    if lower[:2] in (["e", "stor"], ["e", "storage"], ["e", "loss"]):  # DMA: "E_stor", "E_loss (MPa)"
+        lower, words = [f"e'{'' if lower[1].startswith('stor') else chr(39)}", *lower[2:]], words[1:]
+    if lower[0] in STORAGE + LOSS:
+        quantity = "storage" if lower[0] in STORAGE else "loss"
         stem = 2 if lower[1:2] in (["modulus"], ["mod"]) else 1
-        certain = stem == 2 or lower[0].startswith("g")
+        certain = stem == 2 or lower[0].startswith(("g", "e"))
     elif lower[0] in ("angular", "ang", "omega", "ω"):
         quantity, certain = "frequency", True
         stem = 2 if lower[1:2] in (["frequency"], ["freq"]) else 1
@@ -190,6 +249,8 @@ def _header(cells: list[str]) -> list[_Column]:
     """Columns by quantity; the first of known unit comes first, rad/s before Hz, others after it (to compare)."""
     found = [(k, cell, _quantity(cell)) for k, cell in enumerate(cells)]
     columns = [_Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
+    shear = {c.quantity for c in columns if not _is_tensile(c)}
+    columns = [c for c in columns if c.quantity not in shear or not _is_tensile(c)]  # G before E where a file has both
     columns.sort(key=lambda c: (not _known_unit(c.quantity.removesuffix("_sd"), c.unit), not _is_angular(c), c.place))
     return columns
 
@@ -197,6 +258,12 @@ def _header(cells: list[str]) -> list[_Column]:
 def _delimiter(line: str) -> str:
     best = max("\t;,|", key=line.count)
     return best if best in line else ("  " if "  " in line.strip() else " ")
+
+
+def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
+    """The delimiter, found where none is given, and the cells of a line."""
+    delimiter = delimiter or _delimiter(line)
+    return delimiter, _split(line, delimiter)
 
 
 def _split(line: str, delimiter: str) -> list[str]:
@@ -246,11 +313,59 @@ def _search(path: str, lines: list[str]) -> tuple[list[_Table], list[int]]:
         headers.append(k)
         name = _title(lines[free : k - 1])
         columns, k = _with_unit_row(columns, lines, k, delimiter)
+        above = k
         rows, numbers, k = _rows(path, columns, lines, k, delimiter, len(cells))
         if rows:
-            tables.append(_Table(name, columns, rows, numbers))
+            units = [_split(line, delimiter) for line in lines[headers[-1] : above]]
+            raw = _raw(cells, units, [_split(lines[n - 1], delimiter) for n in numbers], delimiter)
+            tables.append(_Table(name, columns, rows, numbers, raw))
         free = k
     return tables, headers
+
+
+def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
+    """Raw torque, angle and phase in SI, of the rows of a table; a column with a gap is none."""
+    found = {}
+    for quantity, (place, factor) in raw_torque.columns(cells, unit_rows[-1] if unit_rows else []).items():
+        values = [to_number(row[place], delimiter) if place < len(row) else None for row in rows]
+        if all(v is not None and np.isfinite(v) for v in values):
+            found[quantity] = factor * np.array(values, float)
+    return found
+
+
+def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
+    """The points whose modulus exceeds what is not known of the instrument's inertia; the others become `grey`.
+
+    Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m].
+    """
+    if not sweep.raw:
+        return sweep
+    geometry = np.pi * radius**4 / (2 * height) if radius and height else None
+    G = sweep.storage + 1j * sweep.loss
+    found = raw_torque.share(sweep.angular_frequency, G, sweep.raw, geometry)
+    if found is None:
+        return sweep
+    unknown = raw_torque.UNCERTAINTY * found.modulus
+    lost = unknown > np.abs(G)
+    k = int(np.argmax(found.modulus / np.abs(G)))
+    note = (
+        f"the raw torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2; at "
+        f"{sweep.angular_frequency[k] / (2 * np.pi):.3g} Hz it carries {found.modulus[k] / np.abs(G[k]):.3g} times the "
+        "torque of the sample"
+    )
+    if not lost.any():
+        return sweep._replace(notes=(*sweep.notes, note))
+    if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
+        raise InputError(
+            f"{sweep.source}: {note}: nearly all of the sweep is the instrument's; measure at lower frequencies"
+        )
+    lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
+    share = f"{100 * raw_torque.UNCERTAINTY:g} % of the inertia, which calibrations leave open"
+    left = (
+        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are left out: the sample carries less than {share}"
+    )
+    grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
+    return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)
 
 
 def _title(above: list[str]) -> str:
@@ -278,7 +393,8 @@ def _with_unit_row(columns: list[_Column], lines: list[str], k: int, delimiter: 
     return columns, k
 
 
-def _number(text: str, delimiter: str) -> float | None:
+def to_number(text: str, delimiter: str) -> float | None:
+    """A number, with a decimal comma where commas do not separate cells; None for any other text."""
     text = text.strip().strip('"')
     if delimiter != "," and "," in text and "." not in text:
         text = text.replace(",", ".")
@@ -300,7 +416,7 @@ def _rows(path, columns, lines, k, delimiter, width):
                 break  # the next table of an instrument's export
             continue
         cells = _split(line, delimiter)
-        values = [_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
+        values = [to_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
         here = [cells[c.place] for c in columns if c in needed and c.place < len(cells)]
         blank = not any(re.match(r"[-+]?\.?\d|nan|inf", cell.lower()) for cell in here)
         if blank and (not rows or line.startswith("[") or delimiter == "\t"):
@@ -381,19 +497,36 @@ def _usable(path: str, table: _Table, values: dict[int, np.ndarray]) -> tuple[np
     return good, [f"{len(faults)} of {len(good)} points {verb} left out as unusable: {told}"]
 
 
+def _is_tensile(column: _Column) -> bool:
+    return bool(re.match(r"\s*e['′’_ ]|\s*epp?\b|\s*[(]?e\b|\s*tensile", column.name.lower().replace('"', "'")))
+
+
+def _to_shear(table: _Table, places: dict[str, int], columns: dict[int, np.ndarray]) -> list[str]:
+    """Divide moduli of tension or bending by 3 in place; a note says so."""
+    tensile = [j for q, j in places.items() if q != "frequency" and _is_tensile(table.columns[j])]
+    for j in tensile:
+        columns[j] = columns[j] / 3
+    if not tensile:
+        return []
+    names = " and ".join(table.columns[j].name for j in tensile)
+    return [f"{names} are of tension or bending: G = E / 3 is taken, as of an incompressible material"]
+
+
 def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
     places: dict[str, int] = {}
     columns: dict[int, np.ndarray] = {}
     for j, column in enumerate(table.columns):
         if column.quantity not in places:
             places[column.quantity], columns[j] = j, _si(path, table, j, notes)
+    notes += _to_shear(table, places, columns)
     good, left_out = _usable(path, table, columns)
     values = {q: columns[j][good] for q, j in places.items()}
     for j, column in enumerate(table.columns):
         q = column.quantity
         if j == places[q] or not _known_unit(q.removesuffix("_sd"), column.unit):
             continue
-        if not np.allclose(_si(path, table, j, [])[good], values[q], rtol=0.01):
+        both = _si(path, table, j, [])[good] / (3 if _is_tensile(column) else 1)
+        if not np.allclose(both, values[q], rtol=0.01):
             name = table.columns[places[q]].name
             raise InputError(f"{path}: columns {name} and {column.name} disagree; remove the wrong one")
     notes += left_out
@@ -413,4 +546,5 @@ def _sweep(path: str, table: _Table, notes: list[str]) -> Sweep:
     get: dict[str, Any] = {
         q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")
     }
-    return Sweep(omega[order], **get, source=path, notes=tuple(notes))
+    raw = {q: v[good][order] for q, v in table.raw.items()}
+    return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)

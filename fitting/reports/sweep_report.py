@@ -2,18 +2,22 @@
 
 import json
 import math
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.fits import edges, models
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
+
+MARK = "* moves by more than its error without the first or the last half decade"
 
 
 def numbers(values: Any) -> Any:
@@ -34,6 +38,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     e = u.standard_errors
     return {
         "method": fit.method,
+        "model": fit.kind.name,
         "converged": fit.converged,
         "modes": n,
         "shear_modulus": float(fit.model.shear_modulus),
@@ -46,6 +51,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },
+        **_own(fit),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
         "correlation_names": list(u.names),
@@ -59,11 +65,35 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     }
 
 
+def band_sensitivity(fit: Fit) -> dict[str, Any]:
+    """Changes by the names of `standard_errors`, lists for ratios and times; null where too few points were left."""
+    out: dict[str, Any] = {}
+    for part, changes in fit.details.get("band_sensitivity", {}).items():
+        out[part] = None if changes is None else {}
+        for name, change in (changes or {}).items():
+            stem = name.split("[")[0]
+            if stem == name:
+                out[part][name] = change
+            else:
+                out[part].setdefault(stem, []).append(change)
+    return out
+
+
+def _own(fit: Fit) -> dict[str, Any]:
+    """Parameters of a model that is not made of modes."""
+    p = fit.parameters
+    if p is None:
+        return {}
+    rows = zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True)
+    return {"parameters": {n: {"value": v, "standard_error": e, "unit": unit} for n, v, e, unit in rows}}
+
+
 def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | None) -> dict[str, Any]:
     """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others stand beside it); returns the JSON."""
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
+    content["band_sensitivity"] = band_sensitivity(fits[0])
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
     if profile is not None:  # of the closed form, whichever method leads
@@ -116,7 +146,8 @@ def figure(sweep: Sweep, fits: list[Fit]) -> Any:
     seconds = f"{fit.run_time:.2g} s run, {fit.compile_time:.2g} s compile"
     plural = "s" if fit.modes > 1 else ""
     mean = 100 * fit.relative_errors(sweep).mean()
-    fig.suptitle(f"{fit.method}, {fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}", fontsize=10)
+    model = "" if fit.parameters is None else f"{fit.kind.name}, "
+    fig.suptitle(f"{fit.method}, {model}{fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}", fontsize=10)
     return fig
 
 
@@ -142,6 +173,15 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
         rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
     top.set(xscale="log", yscale="log", ylabel="modulus [Pa]")
     _legend_above(top, 2)
+    if sweep.grey is not None:
+        hertz = sweep.grey[:, 0] / (2 * np.pi)
+        top.plot(hertz, sweep.grey[:, 1], "o", color=GREY, ms=4, mfc="none", label="left out: inertia")
+        top.plot(hertz, sweep.grey[:, 2], "s", color=GREY, ms=4, mfc="none")
+    doubtful = fits[0].details.get("consistency", {}).get("instrument_above_Hz")
+    if doubtful is not None:
+        for axes in (top, rest):
+            axes.axvspan(1.02 * doubtful, 1.05 * f[-1], color=GREY, alpha=0.15, lw=0)
+        rest.text(1.03 * doubtful, 0.02, "instrument", fontsize=7, va="bottom", transform=rest.get_xaxis_transform())
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
 
@@ -170,35 +210,69 @@ def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """The moduli, and one line a mode."""
+    """The moduli and one line a mode, or the numbers of another model."""
     u, n = fit.uncertainty, fit.modes
+    if fit.parameters is not None:
+        return _own_lines(fit)
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
+    decided = edges.moved(fit)
+
+    def mark(name):
+        return "*" if name in decided else " "
+
     rows = [
-        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa",
-        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa",
+        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa {mark('shear_modulus')}".rstrip(),
+        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa {mark('equilibrium_modulus')}".rstrip(),
         "",
         f"{'mode':4s} {'ratio [1]':>20s} {'relaxation time [s]':>22s}",
     ]
     for k in range(n):
-        ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}" for j in (1 + k, 1 + n + k))
-        rows.append(f"{k + 1:4d} {ratio:>20s} {time:>22s}")
-    return rows
+        places = ((1 + k, f"ratios[{k}]"), (1 + n + k, f"relaxation_times[{k}]"))
+        ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}{mark(name)}" for j, name in places)
+        rows.append(f"{k + 1:4d} {ratio:>20s} {time:>22s}".rstrip())
+    return [*rows, "* ends of the band decide it"] if decided else rows
+
+
+def _own_lines(fit: Fit) -> list[str]:
+    """Numbers of a model that is not made of modes; of a spectrum a summary, its strengths are in fit.json."""
+    p = fit.parameters
+    assert p is not None
+    rows = []
+    for name, value, error, unit in zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True):
+        if not name.startswith("strengths["):
+            mark = " *" if name in edges.moved(fit) else ""
+            rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}{mark}".rstrip())
+    found = fit.details.get("spectrum")
+    if found:
+        times = found["relaxation_times"]
+        rows.append(f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,")
+        rows.append(f"on a grid of {found['times_per_decade']} times a decade;")
+        rows.append(f"the data carry {found['decades_carried']:.2g} decades of them,")
+        rows.append(f"{found['effective_parameters']:.2g} parameters in effect")
+    apart = fit.details["conversion"]["largest_relative_error"]
+    return [*rows, f"as {fit.modes} Prony modes (largest", f"difference {100 * apart:.2g} %): see fit.json"]
 
 
 def _lines(fit: Fit) -> list[str]:
     u, n = fit.uncertainty, fit.modes
+    if fit.parameters is not None:
+        return _own_lines(fit)
 
-    def row(name, value, error, unit):
-        return f"{name:5s} {value:11.5g} ± {error:<9.2g} {unit}".rstrip()
+    decided = edges.moved(fit)
+
+    def row(name, value, error, unit, key):
+        mark = " *" if key in decided else ""
+        return f"{name:5s} {value:11.5g} ± {error:<9.2g} {unit:2s}{mark}".rstrip()
 
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
     rows = [
-        row("G0", u.values[0], u.standard_errors[0], "Pa"),
-        row("G_inf", equilibrium, equilibrium_error(u), "Pa"),
+        row("G0", u.values[0], u.standard_errors[0], "Pa", "shear_modulus"),
+        row("G_inf", equilibrium, equilibrium_error(u), "Pa", "equilibrium_modulus"),
     ]
     for i in range(n):
-        rows.append(row(f"g{i + 1}", u.values[1 + i], u.standard_errors[1 + i], ""))
-        rows.append(row(f"tau{i + 1}", u.values[1 + n + i], u.standard_errors[1 + n + i], "s"))
+        rows.append(row(f"g{i + 1}", u.values[1 + i], u.standard_errors[1 + i], "", f"ratios[{i}]"))
+        time = f"relaxation_times[{i}]"
+        rows.append(row(f"tau{i + 1}", u.values[1 + n + i], u.standard_errors[1 + n + i], "s", time))
     return rows
 
 
@@ -216,4 +290,6 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
         ]
         columns.append(rows)
     width = max(len(r) for r in columns[0]) + 3
-    return "\n".join("".join(f"{c:{width}s}" for c in row).rstrip() for row in zip(*columns, strict=True))
+    rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
+    decided = [MARK] if any(edges.moved(fit) for fit in fits) else []
+    return "\n".join([*rows, *decided, *models.table(fits[0])])

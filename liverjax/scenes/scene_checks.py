@@ -59,7 +59,9 @@ def check_choices(scene: Scene) -> None:
 
 
 def _body(body: Body, nodes: int) -> None:
-    density, gravity = np.shape(body.density), np.shape(body.gravity)
+    # Of a tuple of traced numbers NumPy knows no shape.
+    gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
+    density = np.shape(body.density)
     if density not in ((), (nodes,)):
         raise InputError(f"body density has shape {density}: give one number, or one a node ({nodes},), in kg/m^3")
     if gravity != (3,):

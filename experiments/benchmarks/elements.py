@@ -1,0 +1,195 @@
+"""Linear, quadratic and mixed elements: error, estimated error and run time, on bodies whose answers are known.
+
+* Cook's membrane, plane strain, K/mu from 3 to 1e4: mean rise of its right edge, against mixed elements on 20 x 20
+  cells (their own estimate stands beside it).
+* The beam of Land et al. 2015 (`known_answers`): its end, against 4.18 mm, where quadratic elements of another program
+  and of this one converge.
+* The liver phantom at rest under 2 m/s^2: largest displacement. No mesh of it is known to be converged: its rows show
+  the value of each mesh and what its estimate adds.
+
+The estimate is `simulate(…, mesh_error=True)`; effectivity is its change over the true error.
+``python -m experiments elements`` (10 minutes) writes results/elements.json.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import liverjax as lj
+from experiments.benchmarks.known_answers import land
+from experiments.common import either, plain_ticks, plt, save
+from experiments.liver import models
+from liverjax.core import status
+from liverjax.core.plotting import COLOURS
+from liverjax.core.struct import replace
+from liverjax.scenes.enriched import enriched
+
+RATIOS = either((3.0, 100.0, 1e4), (100.0,))
+MM = 1e-3
+MU = 770.0
+#: Form -> order of the elements, and how they are solved.
+FORMS: dict[str, tuple[int, dict]] = {
+    "linear": (1, {"volumetric": "element"}),
+    "linear, averaged": (1, {"volumetric": "nodal"}),
+    "quadratic": (2, {"volumetric": "element"}),
+    "quadratic, mixed": (2, {"volumetric": "mixed"}),
+}
+
+
+def membrane(n: int, ratio: float, form: str) -> lj.Scene:
+    """Cook's membrane of n x n cells, one thick, in plane strain."""
+    order, solve = FORMS[form]
+    flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
+    s, t, w = np.asarray(flat.points).T
+    points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), w], axis=1) * MM
+    mesh = lj.tet_mesh(points, flat.tetrahedra, flat.node_sets)
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    right = lj.boundary.boundary_triangles(mesh, mesh.node_sets["x_max"])
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=MU, bulk=MU * ratio),
+        fixed=(
+            lj.Fixed(nodes=mesh.node_sets["x_min"]),
+            lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="z"),
+        ),
+        traction=(lj.Traction(triangles=jnp.asarray(right), value=jnp.array([0.0, 0.01 * MU, 0.0])),),
+        solve=lj.Solve(steps=2, **solve),
+    )
+
+
+def rise(scene: lj.Scene) -> Callable:
+    """Mean rise [m] of the vertices of the membrane's right edge."""
+    nodes = np.asarray(scene.mesh.node_sets["x_max"])
+    nodes = nodes[nodes < scene.mesh.number_of_vertices]
+    return lambda x, R: jnp.mean(x[-1, nodes, 1] - scene.mesh.points[nodes, 1])
+
+
+def beam(n: int, form: str) -> lj.Scene:
+    """Land's beam, 10 n x n x n cells."""
+    scene = land(n)
+    order, solve = FORMS[form]
+    return replace(enriched(scene) if order == 2 else scene, solve=lj.Solve(steps=2, **solve))
+
+
+def end(scene: lj.Scene) -> Callable:
+    """Height [m] of the beam's end, (10, 0.5, 1) mm at rest, or next to it."""
+    k = int(np.argmin(np.linalg.norm(np.asarray(scene.mesh.points) - np.array([10, 0.5, 1]) * MM, axis=1)))
+    return lambda x, R: x[-1, k, 2]
+
+
+def liver(form: str) -> lj.Scene:
+    """The phantom at rest."""
+    order, solve = FORMS[form]
+    scene = replace(models()["hyperelastic"], solve=lj.Solve(linear_solver="cg", **solve))
+    return enriched(scene) if order == 2 else scene
+
+
+def largest(scene: lj.Scene) -> Callable:
+    """Largest displacement [m] of a vertex."""
+    V = scene.mesh.number_of_vertices
+    return lambda x, R: jnp.max(jnp.linalg.norm(x[-1, :V] - scene.mesh.points[:V], axis=1))
+
+
+def ran(scene: lj.Scene, of: Callable) -> dict[str, Any]:
+    """Value, what the mesh's estimate adds to it, and times; the second run counts."""
+    begin = time.perf_counter()
+    jax.block_until_ready(lj.simulate(scene).positions)
+    first = time.perf_counter() - begin
+    begin = time.perf_counter()
+    result = jax.block_until_ready(lj.simulate(scene))
+    run = time.perf_counter() - begin
+    result = lj.simulate(scene, mesh_error=True)
+    begin = time.perf_counter()
+    result = jax.block_until_ready(lj.simulate(scene, mesh_error=True))
+    value, change = result.mesh_error.change(of, result)
+    codes = np.asarray(result.status)
+    return {
+        "elements": scene.mesh.number_of_elements,
+        "nodes": scene.mesh.number_of_nodes,
+        "value": float(value),
+        "change": float(change),
+        "found": bool(np.asarray(result.mesh_error.found).all()),
+        "code": status.NAMES[int(codes.max())],
+        "newton": int(result.statistics.iterations.sum()),
+        "linear": int(result.statistics.linear_iterations.sum()),
+        "run_s": run,
+        "first_s": first,
+        "estimate_s": time.perf_counter() - begin - run,
+    }
+
+
+def judged(rows: list[dict], truth: float) -> list[dict]:
+    """With error, error of the corrected value and effectivity."""
+    for row in rows:
+        missing = truth - row["value"]
+        row |= {
+            "truth": truth,
+            "error": -missing / truth,
+            "corrected": (row["value"] + row["change"]) / truth - 1,
+            "effectivity": row["change"] / missing,
+        }
+    return rows
+
+
+def main() -> None:
+    """All bodies."""
+    rows: list[dict] = []
+
+    def keep(body: str, case: list[dict]) -> None:
+        for row in case:
+            rows.append({"body": body} | row)
+            print(rows[-1], flush=True)
+        save("elements", {"rows": rows})
+
+    for ratio in RATIOS:
+        case = []
+        for form, sizes in either(
+            {"linear": (8, 16), "linear, averaged": (16,), "quadratic": (4, 8, 16), "quadratic, mixed": (4, 8, 16)},
+            {"linear": (4,), "quadratic, mixed": (2,)},
+        ).items():
+            for n in sizes:
+                scene = membrane(n, ratio, form)
+                case.append({"form": form, "cells": n, "ratio": ratio} | ran(scene, rise(scene)))
+        finest = membrane(either(20, 4), ratio, "quadratic, mixed")
+        fine = ran(finest, rise(finest))
+        keep("Cook's membrane", judged(case, fine["value"] + fine["change"]))
+    case = []
+    for form, sizes in either({"linear": (1, 2, 4), "quadratic": (1, 2), "quadratic, mixed": (1, 2)}, {}).items():
+        for n in sizes:
+            scene = beam(n, form)
+            case.append({"form": form, "cells": n, "ratio": None} | ran(scene, end(scene)))
+    keep("Land's beam", judged(case, 4.18 * MM))
+    case = []
+    for form in either(("linear", "quadratic", "quadratic, mixed"), ()):
+        scene = liver(form)
+        case.append({"form": form, "cells": None, "ratio": None} | ran(scene, largest(scene)))
+    keep("liver phantom", case)
+    save("elements", {"rows": rows}, _figure(rows))
+
+
+def _figure(rows: list[dict]) -> plt.Figure:
+    """Error against run time of the bodies that have a truth."""
+    cases = [(b, r) for b, r in dict.fromkeys((row["body"], row["ratio"]) for row in rows if "error" in row)]
+    figure, all_axes = plt.subplots(1, max(len(cases), 1), figsize=(3.1 * max(len(cases), 1), 3.2), squeeze=False)
+    for axes, (body, ratio) in zip(all_axes[0], cases, strict=False):
+        for colour, form in zip(COLOURS, FORMS, strict=False):
+            own = [r for r in rows if (r["body"], r["ratio"], r["form"]) == (body, ratio, form)]
+            if own:
+                seconds = [r["run_s"] for r in own]
+                axes.loglog(seconds, [100 * abs(r["error"]) for r in own], "o-", color=colour, label=form)
+                axes.loglog(seconds, [100 * abs(r["corrected"]) for r in own], "x:", color=colour)
+        axes.set_title(body + (f", K/mu = {ratio:g}" if ratio else ""))
+        axes.set_xlabel("run time [s]")
+        plain_ticks(axes.yaxis)
+    all_axes[0][0].set_ylabel("error [%] (crosses: corrected)")
+    all_axes[0][0].legend(fontsize=7)
+    figure.tight_layout()
+    return figure
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""``python -m fitting relaxation FILE`` and ``… creep FILE``: Prony modes from a test in time."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fitting.commands.exit_codes import EXIT_CODES
+from liverjax.core.errors import InputError
+
+COLUMNS = """The file has a column of time and one of these: relaxation_modulus_Pa (creep: creep_compliance_1/Pa);
+strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns the test is computed as it
+was driven, ramp included; torque and force need the sample's size. """
+
+
+def parser(prog: str) -> argparse.ArgumentParser:
+    """Options of the command, which --help calls `prog`."""
+    kind = prog.split()[-1]
+    command = argparse.ArgumentParser(
+        prog=prog,
+        description=f"Identify a generalised Maxwell (Prony) model from a {kind} test, in closed form.",
+        epilog=COLUMNS + EXIT_CODES,
+    )
+    command.set_defaults(kind=kind)
+    command.add_argument("file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text")
+    command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
+    command.add_argument(
+        "--ramp", type=float, default=0.0, metavar="S", help="seconds of the ramp, where no column has it"
+    )
+    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the answers before it")
+    command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
+    command.add_argument("--height", type=float, metavar="M", help="of the sample [m], for torque and force")
+    command.add_argument(
+        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
+    )
+    command.add_argument("--out", type=Path, metavar="DIR", help=f"folder of the results (default {kind})")
+    return command
+
+
+def _modes(text: str) -> int | str:
+    try:
+        return text if text == "auto" else int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit the test; 1 if the fit did not converge."""
+    from fitting.fits import time_tests as fits
+    from fitting.readers import time_tests as reader
+    from fitting.reports import time_report
+    from liverjax.core.files import writable
+
+    for name in ("radius", "height"):
+        value = getattr(options, name)
+        if value is not None and not 0 < value <= 0.2:
+            raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
+    out = options.out or Path(options.kind)
+    sample = reader.Sample(options.radius, options.height)
+    test = reader.read(options.file, options.kind, sample, options.ramp, options.min_time)
+    for note in test.notes:
+        print(f"note: {note}", file=sys.stderr)
+    writable(out, ("fit.json", "fit.png"))
+    found = fits.fit(test, options.modes)
+    time_report.write(out, test, found)
+    print(time_report.table(test, found))
+    if options.cards:
+        from fitting.commands.sweep import write_cards
+
+        write_cards(out, found.model)
+    for sentence in found.warnings:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {out}/fit.json, fit.png")
+    return 0 if found.converged else 1

@@ -1,0 +1,40 @@
+"""``python -m fitting SAMPLE1.csv SAMPLE2.csv …``: every sample by itself, and the population they come from."""
+
+import argparse
+import sys
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit all samples with one model in closed form; 1 if one of the fits did not converge."""
+    from tqdm import tqdm
+
+    from fitting.fits import samples
+    from fitting.readers import rheometer
+    from fitting.reports import samples_report
+    from liverjax.core.files import writable
+
+    sweeps = []
+    for path in options.sweep:
+        sweep = rheometer.read_sweep(path, options.table)
+        sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
+        sweeps.append(rheometer.without_inertia(sweep, options.radius, options.height))
+        for note in sweeps[-1].notes:
+            print(f"note: {path.name}: {note}", file=sys.stderr)
+    writable(options.out, ("fit.json", "fit.png", "fit.h5"))
+    with tqdm(desc=f"{len(sweeps)} samples", disable=None, leave=False) as bar:
+
+        def told(text: str) -> None:
+            bar.set_postfix_str(text)
+            bar.update()
+
+        found = samples.fit(sweeps, options.model, options.modes, told)
+    content = samples_report.write(options.out, found)
+    print(samples_report.table(found))
+    if options.cards:
+        from fitting.commands.sweep import write_cards
+
+        write_cards(options.out, found.typical)
+    for sentence in content["warnings"]:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/fit.json, fit.png, fit.h5")
+    return 0 if content["converged"] else 1

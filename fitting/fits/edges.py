@@ -1,0 +1,122 @@
+"""How much the ends of the band decide: the fit repeated without its first and its last half decade."""
+
+from typing import Any
+
+import numpy as np
+
+from fitting.fits import viscoelastic
+from fitting.fits.viscoelastic import FLUID, Fit
+from fitting.methods import consistency, generalised_maxwell, relaxation_spectrum, springpots
+from fitting.methods.generalised_maxwell import Spectrum
+from fitting.methods.least_squares import levenberg_marquardt
+from fitting.readers.rheometer import Sweep, some
+
+HALF_DECADE = float(np.sqrt(10))
+#: Names of the two parts that are left out, and of the moduli in words.
+PARTS = ("without_first_half_decade", "without_last_half_decade")
+
+
+def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
+    """The fit with what its ends decide, the structure of its residuals, and what the data say of themselves."""
+    details, warnings = dict(fit.details), list(fit.warnings)
+    found = consistency.of_data(sweep, dense)
+    told = consistency.sentences(found, sweep)
+    details["consistency"] = {
+        "kramers_kronig_misfit": found.misfit,
+        "scatter": found.scatter if np.isfinite(found.scatter) else None,
+        "breaches": [{"from_Hz": a / (2 * np.pi), "to_Hz": b / (2 * np.pi), "what": w} for a, b, w in found.breaches],
+        "instrument_above_Hz": None if found.onset is None else found.onset / (2 * np.pi),
+    }
+    if np.max(fit.relative_errors(sweep)) > viscoelastic.EXACT:
+        runs, structured = consistency.structure(
+            sweep.angular_frequency, fit.storage - sweep.storage, fit.loss - sweep.loss
+        )
+        details["residuals"] = runs
+        told += structured
+    changes = sensitivity(fit, sweep)
+    details["band_sensitivity"] = changes
+    return fit._replace(details=details, warnings=(*warnings, *told, *_moved_most(fit, changes)))
+
+
+def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
+    """Change of each parameter, by name, without the first and without the last half decade.
+
+    None in place of a part where too few points are left. Of a spectrum only the equilibrium modulus is compared.
+    """
+    omega = sweep.angular_frequency
+    kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
+    return {part: _change(fit, sweep, k) for part, k in zip(PARTS, kept, strict=True)}
+
+
+def values(fit: Fit) -> dict[str, tuple[float, float]]:
+    """Parameters that are compared, with their standard errors, by the names of the report."""
+    from fitting.methods.uncertainty import equilibrium_error
+
+    if fit.parameters is not None:
+        rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)
+        return {n: (float(v), float(e)) for n, v, e in rows if not n.startswith("strengths[")}
+    u = fit.uncertainty
+    out = {n: (float(v), float(e)) for n, v, e in zip(u.names, u.values, u.standard_errors, strict=True)}
+    rest = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
+    first = {"shear_modulus": out.pop("shear_modulus")}
+    return first | ({} if fit.kind.name == FLUID.name else {"equilibrium_modulus": (rest, equilibrium_error(u))}) | out
+
+
+def moved(fit: Fit) -> set[str]:
+    """Names of the parameters that one half decade moves by more than their standard error."""
+    out = set()
+    for part in PARTS:
+        for name, change in (fit.details.get("band_sensitivity", {}).get(part) or {}).items():
+            value, error = values(fit)[name]
+            if abs(change) > error and abs(change) > 1e-6 * abs(value):
+                out.add(name)
+    return out
+
+
+def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None:
+    """New values minus old ones of a fit to the points kept; the program is that of all points, some without weight."""
+    if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
+        return None
+    part = some(sweep, kept)
+    old = {name: value for name, (value, _) in values(fit).items()}
+    if fit.kind.effective is not None:
+        found = fit.details["spectrum"]
+        grid = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
+        return {name: grid.equilibrium - value for name, value in old.items()}
+    scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
+    if fit.parameters is not None:
+        (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
+        reference = springpots.reference_frequency(sweep)
+        starts = springpots.starts(part)
+        starts[-1, list(model.free)] = np.asarray(fit.solution.u)
+        best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
+        data = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, scales)
+        u = viscoelastic.timed(best, starts, np.tile(model.switches, (len(starts), 1)), *data)[0].u
+        return {n: float(v) - old[n] for n, v in zip(model.names, model.values(u, reference), strict=True)}
+    starts = generalised_maxwell.starts(part, fit.modes, generalised_maxwell.spectrum(part))
+    fluid = fit.kind.name == FLUID.name
+    starts = np.stack([generalised_maxwell.fluid_of(u) for u in starts]) if fluid else starts
+    starts[-1] = np.asarray(fit.solution.u)
+    data = (sweep.angular_frequency, sweep.storage, sweep.loss, scales)
+    best = viscoelastic.best_of(levenberg_marquardt, viscoelastic.residuals_of(fit.kind))
+    G0, ratios, times = fit.kind.maxwell(viscoelastic.timed(best, starts, *data)[0].u)
+    numbers = np.concatenate([[G0], ratios, times])
+    new = dict(zip(fit.uncertainty.names, numbers.tolist(), strict=True))
+    new["equilibrium_modulus"] = float(G0 * (1 - ratios.sum()))
+    return {name: new[name] - value for name, value in old.items()}
+
+
+def _moved_most(fit: Fit, changes: dict[str, Any]) -> list[str]:
+    """A sentence on what each end decides, the worst three numbers of it."""
+    known, told = values(fit), []
+    for part, end in zip(PARTS, ("first", "last"), strict=True):
+        rows = [(n, d, *known[n]) for n, d in (changes[part] or {}).items()]
+        rows = [r for r in rows if abs(r[1]) > r[3] and abs(r[1]) > 1e-6 * abs(r[2])]
+        rows.sort(key=lambda r: -abs(r[1]) / max(r[3], 1e-300))
+        if rows:
+            listed = ", ".join(f"{n} by {100 * d / v:+.2g} %" if v else f"{n} by {d:+.2g}" for n, d, v, _ in rows[:3])
+            rest = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
+            told.append(f"leaving out the {end} half decade moves {listed}{rest}")
+    if not told:
+        return []
+    return [f"{'; '.join(told)}: more than their standard errors, so the ends of the band decide them"]

@@ -1,0 +1,249 @@
+"""Models beyond free Prony modes, fitted in closed form: springpots, a spectrum on a grid, fluids; and the choice.
+
+All are judged by the information criterion that chooses the number of modes. Each hands over Prony modes for the
+simulation, with the error of that conversion over the band.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits import viscoelastic
+from fitting.fits.viscoelastic import Fit, Kind, information_criterion
+from fitting.methods import conversion, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
+from fitting.methods.generalised_maxwell import Spectrum
+from fitting.methods.least_squares import Solution, levenberg_marquardt, with_jacobian
+from fitting.readers.rheometer import Sweep
+
+MODELS = ("prony", "fractional", "spectrum", "auto")
+#: Difference of the criterion that counts as strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90).
+STRONG = 10.0
+
+
+def fractional(sweep: Sweep) -> list[Fit]:
+    """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts; one program fits them all."""
+    reference, starts = springpots.reference_frequency(sweep), springpots.starts(sweep)
+    scaled = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
+    best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
+    out = []
+    for model in springpots.FRACTIONAL:
+        switches = np.tile(model.switches, (len(starts), 1))
+        found, compiling, running = viscoelastic.timed(best, starts, switches, *scaled)
+        free = jnp.array(model.free)
+        own = found._replace(u=found.u[free], jacobian=found.jacobian[:, free])
+        out.append(_fractional_fit(sweep, model, own, (running, compiling)))
+    return out
+
+
+def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution, seconds: tuple[float, float]) -> Fit:
+    reference = springpots.reference_frequency(sweep)
+
+    def at(u, omega):
+        return springpots.modulus(springpots.full(model, u), model.switches, omega / reference)
+
+    def values(u):
+        return model.values(springpots.full(model, u), reference)
+
+    made = _conversion(sweep, lambda omega: at(found.u, omega), model.solid)
+    kind = Kind(model.name, lambda u: conversion.modes(made, at(u, made.omega)), model.names, model.units, values)
+    return _finished(viscoelastic.fitted(sweep, found, kind, *seconds, {}), made)
+
+
+def spectrum(sweep: Sweep) -> Fit:
+    """A smooth spectrum that is not negative, at 2 or 3 times a decade."""
+    found = relaxation_spectrum.fit(sweep)
+    solid = int(found.equilibrium > 0)
+    strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]
+    prior = found.prior[:, 1 - solid :]
+
+    def columns(omega):
+        return jnp.asarray(relaxation_spectrum.columns(np.asarray(omega), found.times)[:, 1 - solid :])
+
+    def held(u):
+        return jnp.asarray(prior) @ jnp.exp(u)
+
+    def residuals(u):
+        data, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
+        return jnp.concatenate([(columns(sweep.angular_frequency) @ jnp.exp(u) - data) / scales, held(u)])
+
+    def complex_moduli(columns, u):
+        storage, loss = jnp.split(columns @ jnp.exp(u), 2)
+        return storage + 1j * loss
+
+    u = jnp.log(jnp.asarray(strengths))
+    made = _conversion(sweep, lambda omega: complex_moduli(columns(omega), u), bool(solid))
+    matched = columns(made.omega)
+    names = ("equilibrium_modulus",) * solid + tuple(f"strengths[{k}]" for k in range(len(found.times)))
+    kind = Kind(
+        name="spectrum",
+        maxwell=lambda u: conversion.modes(made, complex_moduli(matched, u)),
+        names=names,
+        units=("Pa",) * len(names),
+        values=jnp.exp,
+        prior=held,
+        effective=found.effective,
+    )
+    r, J = with_jacobian(residuals)(u)
+    cosine = jnp.max(jnp.abs(J.T @ r) / jnp.maximum(jnp.linalg.norm(J, axis=0) * jnp.linalg.norm(r), 1e-300))
+    solution = Solution(u, r, J, 0.5 * r @ r, jnp.array(1), cosine, jnp.array(True))
+    details = {
+        "relaxation_times": found.times.tolist(),
+        "times_per_decade": found.per_decade,
+        "smoothing": found.smoothing,
+        "effective_parameters": found.effective,
+        "decades_carried": found.decades,
+    }
+    return _finished(viscoelastic.fitted(sweep, solution, kind, 0.0, 0.0, {"spectrum": details}), made)
+
+
+def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> conversion.Conversion:
+    return conversion.convert(moduli, sweep.angular_frequency[0], sweep.angular_frequency[-1], solid)
+
+
+def _finished(fit: Fit, made: conversion.Conversion) -> Fit:
+    """With the error of the conversion, and what is to be said about the model."""
+    sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
+    if made.error > conversion.ALLOWED:
+        sentences.append(
+            f"{fit.modes} Prony modes follow the model {fit.kind.name} to {100 * made.error:.2g} % only; simulate a "
+            "narrower band with --max-frequency"
+        )
+    warnings = (*fit.warnings, *sentences, *_undetermined(fit))
+    details = fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}}
+    return fit._replace(details=details, warnings=warnings)
+
+
+def _cut_off(fit: Fit) -> str:
+    return (
+        f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus is that of the {fit.modes} "
+        "Prony modes that stand for it over the measured band, and holds for no higher frequency"
+    )
+
+
+def _undetermined(fit: Fit) -> list[str]:
+    """Numbers of a fractional model that the data leave free."""
+    if fit.parameters is None or fit.kind.effective is not None:
+        return []
+    free = [n for n, ok in zip(fit.kind.names, _determined(fit), strict=True) if not ok]
+    return (
+        [f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model"] if free else []
+    )
+
+
+def _determined(fit: Fit) -> np.ndarray:
+    """Which of its numbers have an error below half their value; exponents may also be 0 or 1 (spring, dashpot)."""
+    assert fit.parameters is not None
+    values, errors = fit.parameters.values, fit.parameters.standard_errors
+    bound = np.array(["exponent" in name for name in fit.kind.names]) & ((values < 1e-3) | (values > 1 - 1e-3))
+    return (errors < 0.5 * np.abs(values)) | bound
+
+
+def identifiable(fit: Fit, sweep: Sweep) -> bool:
+    """Converged, and the data determine every number of the model (a spectrum is held by its prior)."""
+    if fit.parameters is None:
+        return viscoelastic.identifiable(fit, sweep)
+    return fit.converged and (fit.kind.effective is not None or bool(np.all(_determined(fit))))
+
+
+def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
+    """N modes without an equilibrium modulus, N by the criterion."""
+    largest = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
+    chosen, failures = None, 0
+    for modes in range(1, largest + 1):
+        solid = generalised_maxwell.starts(sweep, modes, dense)
+        starts = np.stack([generalised_maxwell.fluid_of(u) for u in solid])
+        fit = viscoelastic.from_starts(sweep, starts, viscoelastic.FLUID)
+        better = chosen is None or information_criterion(fit) < information_criterion(chosen)
+        if chosen is None or (better and identifiable(fit, sweep)):
+            chosen, failures = fit, 0
+        else:
+            failures += 1
+        if failures == 2 or np.max(fit.relative_errors(sweep)) < viscoelastic.EXACT:
+            break
+    assert chosen is not None
+    return chosen
+
+
+def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
+    """The model of lowest criterion among those whose numbers the data determine.
+
+    Args:
+        sweep: data.
+        model: one of `MODELS`, but "prony".
+        prony: the modes chosen, which "auto" compares with.
+        dense: as of `viscoelastic.closed_form`.
+    """
+    tried: list[Fit] = []
+    if model in ("fractional", "auto"):
+        tried += fractional(sweep)
+    if model in ("spectrum", "auto"):
+        tried.append(spectrum(sweep))
+    if model == "auto" and prony is not None:
+        tried.append(prony)
+        if any("(a fluid)" in w for w in prony.warnings):
+            tried.append(fluid(sweep, dense))
+    able = [fit for fit in tried if identifiable(fit, sweep)] or tried
+    chosen = min(able, key=information_criterion)
+    return chosen._replace(
+        warnings=(*chosen.warnings, *_near(chosen, tried, able)),
+        run_time=sum(fit.run_time for fit in tried),
+        compile_time=sum(fit.compile_time for fit in tried),
+        details=chosen.details | {"models_compared": _compared(sweep, tried)},
+    )
+
+
+def _compared(sweep: Sweep, tried: list[Fit]) -> list[dict[str, Any]]:
+    """What the choice rests on, best first."""
+    best = min(information_criterion(fit) for fit in tried)
+    rows = [
+        {
+            "model": fit.kind.name,
+            "parameters": len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective,
+            "modes": fit.modes,
+            "information_criterion": information_criterion(fit),
+            "above_the_lowest": information_criterion(fit) - best,
+            "identifiable": identifiable(fit, sweep),
+            "mean_relative_error": float(np.mean(fit.relative_errors(sweep))),
+        }
+        for fit in tried
+    ]
+    return sorted(rows, key=lambda row: row["information_criterion"])
+
+
+def _near(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
+    """Sentences where another model explains the data about as well, or better with numbers that stay free."""
+    best, out = min(tried, key=information_criterion), []
+    if information_criterion(best) < information_criterion(chosen) - STRONG:
+        apart = information_criterion(chosen) - information_criterion(best)
+        out.append(
+            f"{best.kind.name} would follow the data more closely (criterion {apart:.2g} lower), but the data leave "
+            "some of its numbers free"
+        )
+    others = [f for f in able if f is not chosen]
+    if not others:
+        return out
+    second = min(others, key=information_criterion)
+    apart = information_criterion(second) - information_criterion(chosen)
+    if apart >= STRONG:
+        return out
+    return [
+        *out,
+        f"{second.kind.name} explains the data about as well as {chosen.kind.name} (criterion {apart:.2g} higher; 10 "
+        "is strong evidence): the data do not decide between them, least of all beyond their band",
+    ]
+
+
+def table(fit: Fit) -> list[str]:
+    """Lines on what the choice of a model rests on, best first; none where there was no choice."""
+    rows = fit.details.get("models_compared", [])
+    if len(rows) < 2:
+        return []
+    lines = [f"{'model':24s} {'parameters':>10s} {'criterion':>10s} {'mean error':>11s}"]
+    for row in rows:
+        free = "" if row["identifiable"] else "   numbers left free"
+        lines.append(
+            f"{row['model']:24s} {row['parameters']:10.3g} {'+' + format(row['above_the_lowest'], '.1f'):>10s} "
+            f"{100 * row['mean_relative_error']:9.2g} %{free}"
+        )
+    return lines

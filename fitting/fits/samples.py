@@ -1,0 +1,127 @@
+"""Several samples of one material: each fitted by itself, with one model for all, and the population they come from."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.fits import edges, models, viscoelastic
+from fitting.fits.viscoelastic import Fit, Kind, information_criterion
+from fitting.methods import conversion, generalised_maxwell, springpots, uncertainty
+from fitting.methods.generalised_maxwell import Maxwell, Spectrum
+from fitting.methods.population import Population, population
+from fitting.readers.rheometer import Sweep
+from liverjax.core.errors import InputError
+
+
+class Samples(NamedTuple):
+    """Fits of all samples with one model, and the population of each of its numbers."""
+
+    sweeps: list[Sweep]
+    fits: list[Fit]
+    populations: dict[str, Population | None]  # by the names of `edges.values`
+    typical: Maxwell  # Prony modes of the sample in the middle, for a simulation
+    compared: list[dict]  # models and numbers of modes, best first
+
+    @property
+    def kind(self) -> Kind:
+        """Of the model that all share."""
+        return self.fits[0].kind
+
+
+class _Candidate(NamedTuple):
+    label: dict
+    fits: list[Fit]
+    criterion: float  # summed over the samples
+    able: bool  # at least half of the samples determine all its numbers
+
+
+def fit(
+    sweeps: list[Sweep],
+    model: str = "prony",
+    modes: int | str = "auto",
+    progress: Callable[[str], None] = lambda text: None,
+) -> Samples:
+    """The model of the lowest summed criterion among those that half of the samples determine.
+
+    Args:
+        sweeps: two or more.
+        model: "prony", "fractional" or "auto".
+        modes: N of "prony", or "auto".
+        progress: told what is fitted.
+    """
+    dense = [generalised_maxwell.refuse_impossible(s) for s in sweeps]
+    tried: list[_Candidate] = []
+    if model in ("prony", "auto"):
+        tried += _modes(sweeps, dense, modes, progress)
+    if model in ("fractional", "auto"):
+        progress("springpots")
+        for fits in zip(*(models.fractional(s) for s in sweeps), strict=True):
+            tried.append(_candidate(sweeps, list(fits), {"model": fits[0].kind.name}))
+    able = [c for c in tried if c.able] or tried
+    best = min(able, key=lambda c: c.criterion)
+    progress("ends of the band")
+    fits = [edges.honest(f, s, d) for f, s, d in zip(best.fits, sweeps, dense, strict=True)]
+    lowest = min(c.criterion for c in tried)
+    rows = [c.label | {"above_the_lowest": c.criterion - lowest, "identifiable": c.able} for c in tried]
+    compared = sorted(rows, key=lambda row: row["above_the_lowest"])
+    populations = _populations(fits)
+    return Samples(sweeps, fits, populations, _typical(sweeps, fits, populations), compared)
+
+
+def _candidate(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Candidate:
+    determined = [models.identifiable(f, s) for f, s in zip(fits, sweeps, strict=True)]
+    return _Candidate(label, fits, sum(map(information_criterion, fits)), 2 * sum(determined) >= len(fits))
+
+
+def _modes(sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable) -> list[_Candidate]:
+    """Prony modes, their number raised until the summed criterion twice fails to fall."""
+    largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
+    numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
+    if modes != "auto":
+        for s in sweeps:
+            viscoelastic.check_modes(s, int(modes))
+        numbers = range(int(modes), int(modes) + 1)
+    tried: list[_Candidate] = []
+    failures = 0
+    for n in numbers:
+        progress(f"{n} modes")
+        fits = [viscoelastic.closed_form(s, n, d) for s, d in zip(sweeps, dense, strict=True)]
+        tried.append(_candidate(sweeps, fits, {"model": "prony", "modes": n}))
+        lower = tried[-1].able and tried[-1].criterion <= min(c.criterion for c in tried)
+        failures = 0 if lower or len(tried) == 1 else failures + 1
+        exact = max(np.max(f.relative_errors(s)) for f, s in zip(fits, sweeps, strict=True)) < viscoelastic.EXACT
+        if failures == 2 or exact:
+            break
+    return tried
+
+
+def _populations(fits: list[Fit]) -> dict[str, Population | None]:
+    known = [edges.values(f) for f in fits]
+    out = {}
+    for name in known[0]:
+        pairs = np.array([row[name] for row in known])
+        out[name] = population(pairs[:, 0], pairs[:, 1])
+    return out
+
+
+def _typical(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
+    """Prony modes at the means of the population; where there is none, modes stay out and other numbers are medians."""
+    kind, middle = fits[0].kind, {n: float(np.median([edges.values(f)[n][0] for f in fits])) for n in populations}
+    mean = {name: p.mean for name, p in populations.items() if p is not None}
+    if kind.values is None:
+        if "shear_modulus" not in mean:
+            raise InputError("the samples determine no shear modulus together: fit them one by one")
+        known = [k for k in range(len(populations)) if {f"ratios[{k}]", f"relaxation_times[{k}]"} <= set(mean)]
+        ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
+        ratios = ratios * min(1.0, (1 - 1e-9) / max(ratios.sum(), 1e-300))
+        return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
+    (model,) = (m for m in springpots.FRACTIONAL if m.name == kind.name)
+    low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)
+    values = [mean.get(name, middle[name]) for name in model.names]
+
+    def formula(omega):
+        return model.formula(1j * omega, *values)
+
+    made = conversion.convert(formula, low, high, model.solid)
+    return conversion.modes(made, formula(made.omega))

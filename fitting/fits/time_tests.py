@@ -1,0 +1,200 @@
+"""Prony modes from a relaxation or creep test as it was driven, in closed form."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits import viscoelastic
+from fitting.fits.viscoelastic import FLUID, Kind
+from fitting.methods import consistency, generalised_maxwell, time_response, uncertainty
+from fitting.methods.estimate import Estimate
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.readers.time_tests import TimeTest
+from liverjax.core.errors import InputError
+
+#: Answers that are fitted at most: of longer records those nearest to equal steps of log time.
+MOST = 300
+
+
+class TimeFit(NamedTuple):
+    """Prony modes of a test in time."""
+
+    kind: Kind
+    model: Maxwell
+    solution: Solution
+    uncertainty: Estimate
+    converged: bool
+    time: np.ndarray  # (m,) [s] of the answers that were fitted
+    measured: np.ndarray  # (m,) [Pa], of creep [1]
+    fitted: np.ndarray
+    scales: np.ndarray  # (m,) what the errors are relative to
+    warnings: tuple[str, ...]
+    run_time: float
+    compile_time: float
+    details: dict[str, Any]
+
+    @property
+    def modes(self) -> int:
+        """N."""
+        return len(self.model.ratios)
+
+    @property
+    def relative_errors(self) -> np.ndarray:
+        """|fit - data| (m,) over the scales, which are the data where these are above the noise."""
+        return np.abs(self.fitted - self.measured) / self.scales
+
+
+@lru_cache(maxsize=8)
+def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
+    """(u, time, driven, rows, answer, scales) -> (m,), of relaxation or creep, of a solid or a fluid."""
+    respond = time_response.stress if kind == "relaxation" else time_response.strain
+    natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
+
+    def residuals(u, time, driven, rows, answer, scales):
+        return (respond(natural(u), time, driven)[rows] - answer) / scales
+
+    return residuals
+
+
+def thinned(test: TimeTest) -> np.ndarray:
+    """Rows (m,) that are fitted: all, or about `MOST` of them, spread over log time."""
+    rows = np.flatnonzero(test.used)
+    if len(rows) <= MOST:
+        return rows
+    log_time = np.log(test.time[rows])
+    wanted = np.linspace(log_time[0], log_time[-1], MOST)
+    near = np.clip(np.searchsorted(log_time, wanted), 1, len(rows) - 1)
+    near -= wanted - log_time[near - 1] < log_time[near] - wanted
+    return rows[np.unique(near)]
+
+
+def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
+    """The number of modes, and solid or fluid, of the lowest criterion among those that the test determines.
+
+    Args:
+        test: data.
+        modes: N, or "auto".
+    """
+    rows = thinned(test)
+    largest = (len(rows) - 2) // 2
+    if modes != "auto" and not 1 <= int(modes) <= largest:
+        raise InputError(f"{test.source}: --modes {modes} is out of range: give 1 to {largest} for {len(rows)} answers")
+    top = min(uncertainty.supported_modes(test), largest)
+    numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
+    tried = _raised(test, rows, numbers, Kind())
+    solid = min(tried, key=criterion)
+    stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
+    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the data may be a fluid's
+        begin = max(numbers.start, solid.modes - 1)
+        tried += _raised(test, rows, range(begin, numbers.stop), FLUID)
+    return _told(_chosen(tried, test), test, tried)
+
+
+def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
+    """Fits of rising number of modes until the criterion twice fails to fall."""
+    tried: list[TimeFit] = []
+    best, failures = np.inf, 0
+    for n in numbers:
+        tried.append(_one(test, rows, n, kind))
+        lower = criterion(tried[-1]) < best and (len(tried) == 1 or identifiable(tried[-1], test))
+        best, failures = (criterion(tried[-1]), 0) if lower else (best, failures + 1)
+        if failures == 2 or np.max(tried[-1].relative_errors) < viscoelastic.EXACT:
+            break
+    return tried
+
+
+def _chosen(tried: list[TimeFit], test: TimeTest) -> TimeFit:
+    return min([f for f in tried if identifiable(f, test)] or tried, key=criterion)
+
+
+def criterion(fit: TimeFit) -> float:
+    """The information criterion of `viscoelastic.information_criterion`."""
+    m = len(fit.measured)
+    return float(m * np.log(max(2 * float(fit.solution.cost) / m, 1e-300)) + len(fit.solution.u) * np.log(m))
+
+
+def identifiable(fit: TimeFit, test: TimeTest) -> bool:
+    """Converged, and the test determines every mode."""
+    return fit.converged and not uncertainty.superfluous(test, fit.uncertainty)
+
+
+def _one(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
+    scales = _scales(test, rows)
+    data = (test.time, test.driven, rows, test.answer[rows], scales)
+    best = viscoelastic.best_of(levenberg_marquardt, _residuals(test.kind, kind.name))
+    found, compiling, running = viscoelastic.timed(best, _starts(test, rows, modes, kind), *data)
+    G0, ratios, times = (np.asarray(v) for v in kind.maxwell(found.u))
+    model: Any = Maxwell(G0, ratios, times)  # type: ignore[arg-type]  # arrays of the host
+    spread = uncertainty.estimate(found, False, kind.maxwell)
+    fitted = np.asarray(found.residuals) * scales + test.answer[rows]
+    at = (test.time[rows], test.answer[rows], fitted, scales)
+    return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, compiling, {})
+
+
+def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
+    every = np.full(len(test.time), np.nan)
+    every[test.used] = test.scales
+    return every[rows]
+
+
+def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int = 12) -> np.ndarray:
+    """Times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
+    driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
+    apparent = answer / np.maximum(driven, 1e-6 * driven.max())
+    apparent = apparent if test.kind == "relaxation" else 1 / apparent
+    low, high = np.log(test.resolved)
+    rng = np.random.default_rng(0)
+    grids = [np.linspace(low, high, modes + 2)[1:-1]]
+    grids += [np.sort(rng.uniform(low - 1, high + 1, modes)) for _ in range(count - 1)]
+    out = []
+    for grid in grids:
+        times = np.exp(np.sort(grid)[::-1])
+        for k in range(1, modes):
+            times[k] = min(times[k], 0.9 * times[k - 1])
+        A = np.column_stack([np.ones(len(rows)), np.exp(-test.time[rows][:, None] / times)])
+        strengths, _ = generalised_maxwell.non_negative(A / apparent[:, None], np.ones(len(rows)))
+        share = np.maximum(strengths / strengths.sum(), 0.01)
+        model = Maxwell(jnp.asarray(strengths.sum()), jnp.asarray(share[1:] / share.sum()), jnp.asarray(times))
+        u = np.asarray(generalised_maxwell.unconstrained(model))
+        out.append(generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u)
+    return np.stack(out)
+
+
+def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
+    """With the table of what was tried and the sentences that a user should read."""
+    lowest = min(map(criterion, tried))
+    table: list[dict[str, Any]] = [
+        {
+            "model": f.kind.name,
+            "modes": f.modes,
+            "above_the_lowest": criterion(f) - lowest,
+            "identifiable": identifiable(f, test),
+            "mean_relative_error": float(f.relative_errors.mean()),
+        }
+        for f in tried
+    ]
+    out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
+    mean = float(chosen.relative_errors.mean())
+    if mean > 0.05:
+        out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or look at the data")
+    out += uncertainty.superfluous(test, chosen.uncertainty)
+    low, high = test.resolved
+    for k, tau in enumerate(chosen.model.relaxation_times):
+        if not low <= tau <= high:
+            out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of the test")
+    residuals = chosen.fitted - chosen.measured
+    runs, chance = consistency.runs_probability(np.sign(residuals))
+    if chance < consistency.CHANCE and chosen.relative_errors.max() > viscoelastic.EXACT:
+        out.append(
+            f"structured misfit: the residuals change sign {runs - 1} times over {len(residuals)} answers (by chance: "
+            f"{chance:.1g}); the model misses something, or neighbouring answers share their noise"
+        )
+    details = {"tried": sorted(table, key=lambda row: row["above_the_lowest"]), "answers_fitted": len(residuals)}
+    details["residuals"] = {"runs": runs, "probability": chance}
+    seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
+    return chosen._replace(warnings=tuple(out), details=details, **seconds)

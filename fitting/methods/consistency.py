@@ -1,0 +1,154 @@
+"""What the data say about themselves, without a model: causality, the instrument's mark, order in the residuals.
+
+Every material that relaxes has a spectrum of non-negative strengths. Term by term, with x = omega tau, its moduli obey
+
+    0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
+
+because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). Data that break these bounds by more than their scatter are not of the
+material: at the high end the inertia of the instrument breaks them (it adds a term that grows as omega^2 to G'), at the
+low end the start of the test. The distance of the best spectrum of any shape is the same question for the whole band:
+it is the Kramers-Kronig relation together with non-negative dissipation.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.methods.generalised_maxwell import Spectrum
+from fitting.readers.rheometer import Sweep
+
+#: How many standard deviations of the scatter a breach must exceed, and the part of the modulus that is never one.
+SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
+#: Distance of the best spectrum [1] that is worth a sentence, and its ratio to the scatter.
+FAR, FAR_RATIO = 0.01, 5.0
+#: Chance below which signs of residuals are called structured.
+CHANCE = 0.005
+
+
+class Consistency(NamedTuple):
+    """Of a sweep without any model."""
+
+    misfit: float  # root mean square distance of the best non-negative spectrum, relative
+    scatter: float  # of neighbouring points about a smooth curve, relative
+    breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the bound that they break
+    onset: float | None  # last frequency [rad/s] before the instrument's mark, within half a decade of the end
+
+
+def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
+    """Relative standard deviation of points about a smooth curve, from four neighbours at a time (robust)."""
+    x, y = np.log(omega), np.log(modulus)
+    if len(x) < 6:
+        return math.inf
+    left = []
+    for k in range(len(x) - 3):
+        own = x[k : k + 4] - x[k]
+        _, _, Vt = np.linalg.svd(np.vander(own, 3, increasing=True).T)
+        left.append(Vt[-1] @ y[k : k + 4])  # what no parabola can follow, of unit variance
+    return float(np.median(np.abs(left)) / 0.6745)
+
+
+def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
+    """Bounds and spectrum together; `dense` as of `generalised_maxwell.spectrum`."""
+    omega, storage, loss = _merged(sweep)
+    noises = scatter(omega, storage), scatter(omega, loss)
+    breaches = []
+    for k in range(len(omega) - 1):
+        why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], noises)
+        if why:
+            breaches.append((float(omega[k]), float(omega[k + 1]), why))
+    late = [low for low, _, why in breaches if why.startswith("G' ") and low > omega[-1] / math.sqrt(10)]
+    return Consistency(dense.misfit, max(noises), tuple(breaches), min(late) if late else None)
+
+
+def _merged(sweep: Sweep) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One point a frequency: repeated ones are averaged."""
+    omega, place = np.unique(sweep.angular_frequency, return_inverse=True)
+    count = np.bincount(place)
+    return omega, np.bincount(place, sweep.storage) / count, np.bincount(place, sweep.loss) / count
+
+
+def _breach(omega, storage, loss, noise) -> str:
+    """The bound that two neighbours break, or nothing."""
+    step = math.log(omega[1] / omega[0])
+    # Of all spectra the largest mean of G'' between two values is reached where it changes as fast as it may.
+    most = step * min(max(loss) * math.exp(step / 2), math.inf)
+    rise, sd = storage[1] - storage[0], noise[0] * math.hypot(*storage)
+    margin = max(SIGNIFICANT * sd, NEGLIGIBLE * max(storage))
+    if rise > most + margin:
+        return "G' rises by more than its loss allows"
+    if -rise > margin:
+        return "G' falls"
+    if abs(math.log(loss[1] / loss[0])) > step + max(SIGNIFICANT * math.sqrt(2) * noise[1], NEGLIGIBLE):
+        return "G'' changes faster than the frequency"
+    return ""
+
+
+def sentences(found: Consistency, sweep: Sweep) -> list[str]:
+    """What a user should know of the data, each with its remedy."""
+    out, last = [], sweep.angular_frequency[-1] / (2 * np.pi)
+    if found.onset is not None:
+        hertz = found.onset / (2 * np.pi)
+        out.append(
+            f"above {hertz:.3g} Hz the storage modulus moves as that of no material that relaxes "
+            f"({found.breaches[-1][2]}): the mark of the instrument, whose inertia adds a term that grows as "
+            f"frequency^2; no model follows these points, leave them out with --max-frequency {_rounded_up(hertz):.4g}"
+        )
+    inner = [b for b in found.breaches if found.onset is None or b[0] < found.onset]
+    if inner:
+        low, high, why = inner[0]
+        start = low == sweep.angular_frequency[0]
+        cause = "the start of the test, or a drift" if start else "an outlier, a drift, or the instrument"
+        more = f" (and {len(inner) - 1} more places)" if len(inner) > 1 else ""
+        out.append(
+            f"between {low / (2 * np.pi):.3g} and {high / (2 * np.pi):.3g} Hz{more} {why}, by more than the scatter of "
+            f"the points: no material that relaxes does so; look for {cause}"
+        )
+    if found.misfit > max(FAR, FAR_RATIO * found.scatter):
+        out.append(
+            f"the data do not agree with themselves (Kramers-Kronig): the best spectrum of any shape stays "
+            f"{100 * found.misfit:.2g} % away on average up to {last:.3g} Hz, the points scatter by "
+            f"{100 * found.scatter:.2g} %; drift, strain beyond the linear range or the instrument do that, and no "
+            "model comes closer"
+        )
+    return out
+
+
+def _rounded_up(hertz: float) -> float:
+    """Four digits, not below the value: the point itself is kept."""
+    unit = 10.0 ** (math.floor(math.log10(hertz)) - 3)
+    return math.ceil(hertz / unit) * unit
+
+
+def runs_probability(signs: np.ndarray) -> tuple[int, float]:
+    """Number of runs of equal sign, and the chance of so few or fewer in random order (Wald and Wolfowitz 1940)."""
+    up = np.asarray(signs)[np.asarray(signs) != 0] > 0
+    n, a = len(up), int(up.sum())
+    b = n - a
+    runs = int(1 + np.sum(up[1:] != up[:-1])) if n else 0
+    if min(a, b) == 0:  # one sign only: as likely as 2^(1 - n)
+        return runs, 2.0 ** (1 - n) if n else 1.0
+    total = 0
+    for r in range(2, runs + 1):
+        k = r // 2
+        if r % 2 == 0:
+            total += 2 * math.comb(a - 1, k - 1) * math.comb(b - 1, k - 1)
+        else:
+            total += math.comb(a - 1, k) * math.comb(b - 1, k - 1) + math.comb(a - 1, k - 1) * math.comb(b - 1, k)
+    return runs, total / math.comb(n, a)
+
+
+def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
+    """Runs test of the residuals of G' and of G'' in the order of the frequency: numbers, and a sentence."""
+    numbers, told = {}, []
+    for name, residuals in (("storage_modulus", storage), ("loss_modulus", loss)):
+        runs, chance = runs_probability(np.sign(residuals))
+        numbers[name] = {"runs": runs, "probability": chance}
+        if chance < CHANCE:
+            told.append(f"of {name} change sign {runs - 1} times over {len(omega)} points (by chance: {chance:.1g})")
+    if not told:
+        return numbers, []
+    return numbers, [
+        f"structured misfit: the residuals {' and those '.join(told)}; the model misses something that is no noise, "
+        "and the standard errors do not know of it"
+    ]

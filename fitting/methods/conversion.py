@@ -1,0 +1,81 @@
+"""Any linear viscoelastic model as Prony modes for the simulation, and how far the two are apart over the band.
+
+The relaxation times are fixed, equally spaced on a log axis. The strengths come from non-negative least squares of the
+relative errors of G' and G''. With the set of non-zero strengths held, they are linear in the moduli of the model, so
+derivatives pass through the conversion.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.methods.generalised_maxwell import Maxwell, non_negative
+
+#: Largest relative error of G' and of G'' over the band that a conversion may have.
+ALLOWED = 0.01
+#: Frequencies a decade at which the conversion is matched and checked, and the widest margin of its times [decades].
+PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
+
+
+class Conversion(NamedTuple):
+    """From moduli at `omega` to Prony modes."""
+
+    omega: np.ndarray  # (n,) [rad/s], over the band
+    times: np.ndarray  # (N,) [s], descending
+    solid: bool  # an equilibrium modulus comes first among the strengths
+    strengths_of: np.ndarray  # (N + solid, 2n): strengths [Pa] of G' then G''
+    error: float  # largest of G' and G'', relative, at the model it was made for
+
+
+def _columns(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:
+    x = omega[:, None] * times
+    A = np.vstack([x**2 / (1 + x**2), x / (1 + x**2)])
+    rest = np.concatenate([np.ones(len(omega)), np.zeros(len(omega))])
+    return np.column_stack([rest, A]) if solid else A
+
+
+def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float, solid: bool) -> Conversion:
+    """The fewest modes that stay within `ALLOWED`, or the best of `MOST`.
+
+    Args:
+        moduli: complex modulus (n,) [Pa] of angular frequencies (n,).
+        low, high: ends of the band [rad/s].
+        solid: whether the modes have an equilibrium modulus beside them.
+    """
+    decades = np.log10(high / low)
+    omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))
+    G = np.asarray(moduli(omega))
+    target = np.concatenate([G.real, G.imag])
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    for modes in range(1, MOST + 1):
+        for margin in MARGINS:
+            ends = (10**margin / low, 10**-margin / high)
+            times = np.geomspace(*ends, modes) if modes > 1 else np.array([np.sqrt(ends[0] * ends[1])])
+            A = _columns(omega, times, solid)
+            strengths, _ = non_negative(A / target[:, None], np.ones(len(target)))
+            error = float(np.abs(A @ strengths / target - 1).max())
+            if best is None or error < best[0]:
+                best = error, times, strengths, A
+            if modes == 1:
+                break
+        assert best is not None
+        if best[0] < ALLOWED:
+            break
+    assert best is not None
+    error, times, strengths, A = best
+    kept = strengths[solid:] > 1e-9 * strengths.sum()
+    columns = np.concatenate([[True], kept]) if solid else kept
+    if solid and strengths[0] <= 1e-12 * strengths.sum():  # what is zero stays zero, without a slope
+        solid, columns = False, np.concatenate([[False], kept])
+    weighed = A[:, columns] / target[:, None]
+    return Conversion(omega, times[kept], solid, np.linalg.pinv(weighed) / target, error)
+
+
+def modes(conversion: Conversion, modulus: jax.Array) -> Maxwell:
+    """Prony modes of the complex modulus (n,) at `conversion.omega`."""
+    strengths = jnp.asarray(conversion.strengths_of) @ jnp.concatenate([modulus.real, modulus.imag])
+    total = jnp.sum(strengths)
+    return Maxwell(total, strengths[int(conversion.solid) :] / total, jnp.asarray(conversion.times))

@@ -1,0 +1,172 @@
+"""Fractional models in closed form: springs and springpots, whose moduli are powers of the frequency.
+
+A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). Sources:
+Bagley and Torvik (1983), J. Rheol. 27; Schiessel et al. (1995), J. Phys. A 28. All models here are cases of one:
+
+    G* = E (i omega)^gamma + 1 / (1 / (V (i omega)^alpha) + 1 / (W (i omega)^beta))     gamma, beta < alpha
+
+with some of its six numbers absent, so that one compiled program fits them all. Inside, frequencies are measured in
+units of the middle of the band, x = omega / reference: starts and scales of all fits are then alike.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.readers.rheometer import Sweep
+
+#: Places in u: log E, logit gamma / alpha, log V, logit alpha, log W, logit beta / alpha.
+SIZE = 6
+
+
+class Fractional(NamedTuple):
+    """One case: which of the six numbers are free, what is reported, and how to get it."""
+
+    name: str
+    free: tuple[int, ...]  # places in u
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Callable[[jax.Array, float], jax.Array]  # full u, reference [rad/s] -> (P,)
+    formula: Callable[..., np.ndarray]  # i omega and the values -> G* [Pa], as the literature writes it
+
+    @property
+    def solid(self) -> bool:
+        """There is an equilibrium modulus."""
+        return 0 in self.free and 1 not in self.free
+
+    @property
+    def switches(self) -> np.ndarray:
+        """1 or 0 (4,): E is there, gamma is, W is, beta is."""
+        return np.array([float(k in self.free) for k in (0, 1, 4, 5)])
+
+
+def _exponents(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """alpha, beta, gamma."""
+    alpha = jax.nn.sigmoid(u[3])
+    return alpha, alpha * jax.nn.sigmoid(u[5]), alpha * jax.nn.sigmoid(u[1])
+
+
+def modulus(u: jax.Array, switches: jax.Array, x: jax.Array) -> jax.Array:
+    """G* (n,) [Pa] of all six numbers u at x = omega / reference (n,)."""
+
+    def power(exponent):  # (i x)^exponent
+        return x**exponent * jnp.exp(0.5j * jnp.pi * exponent)
+
+    alpha, beta, gamma = _exponents(u)
+    beside = switches[0] * jnp.exp(u[0]) * power(switches[1] * gamma)
+    compliance = power(-alpha) * jnp.exp(-u[2]) + switches[2] * power(-switches[3] * beta) * jnp.exp(-u[4])
+    return beside + 1 / compliance
+
+
+def residuals(
+    u: jax.Array, switches: jax.Array, x: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array
+) -> jax.Array:
+    """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
+    G = modulus(u, switches, x)
+    return (jnp.concatenate([G.real, G.imag]) - jnp.concatenate([storage, loss])) / scales
+
+
+def _springpot(u, reference):
+    alpha, _, _ = _exponents(u)
+    return jnp.stack([jnp.exp(u[2]) * reference**-alpha, alpha])
+
+
+def _kelvin_voigt(u, reference):
+    return jnp.concatenate([jnp.exp(u[:1]), _springpot(u, reference)])
+
+
+def _zener(u, reference):
+    alpha, _, _ = _exponents(u)
+    return jnp.stack([jnp.exp(u[0]), jnp.exp(u[4]), jnp.exp((u[2] - u[4]) / alpha) / reference, alpha])
+
+
+def _maxwell(u, reference):
+    _, beta, _ = _exponents(u)
+    return jnp.concatenate([_springpot(u, reference), jnp.stack([jnp.exp(u[4]) * reference**-beta, beta])])
+
+
+def _parallel(u, reference):
+    _, _, gamma = _exponents(u)
+    return jnp.concatenate([jnp.stack([jnp.exp(u[0]) * reference**-gamma, gamma]), _springpot(u, reference)])
+
+
+_POT, _SLOW, _FAST = (
+    ((f"{name}springpot", f"{name}exponent"), (f"Pa s^{name}exponent", "1")) for name in ("", "slow_", "fast_")
+)
+_REST = (("equilibrium_modulus",), ("Pa",))
+
+
+def _case(name, free, parts, values, formula) -> Fractional:
+    names, units = (sum((part[k] for part in parts), ()) for k in (0, 1))
+    return Fractional(name, free, names, units, values, formula)
+
+
+FRACTIONAL = (
+    _case("springpot", (2, 3), (_POT,), _springpot, lambda s, v, a: v * s**a),
+    _case("fractional_kelvin_voigt", (0, 2, 3), (_REST, _POT), _kelvin_voigt, lambda s, e, v, a: e + v * s**a),
+    _case(
+        "fractional_zener",
+        (0, 2, 3, 4),
+        (_REST, (("relaxing_modulus", "relaxation_time", "exponent"), ("Pa", "s", "1"))),
+        _zener,
+        lambda s, e, m, tau, a: e + m * (s * tau) ** a / (1 + (s * tau) ** a),
+    ),
+    # Two springpots in a row, a fluid: the one of larger exponent gives way at low frequencies.
+    _case(
+        "fractional_maxwell",
+        (2, 3, 4, 5),
+        (_SLOW, _FAST),
+        _maxwell,
+        lambda s, v, a, w, b: 1 / (1 / (v * s**a) + 1 / (w * s**b)),
+    ),
+    # Two springpots side by side, a fluid: the one of larger exponent leads at high frequencies.
+    _case(
+        "fractional_parallel",
+        (0, 1, 2, 3),
+        (_SLOW, _FAST),
+        _parallel,
+        lambda s, w, b, v, a: v * s**a + w * s**b,
+    ),
+)
+
+
+def full(model: Fractional, u: jax.Array) -> jax.Array:
+    """All six numbers, those that the model lacks at 0."""
+    return jnp.zeros(SIZE).at[jnp.array(model.free)].set(u)
+
+
+def reference_frequency(sweep: Sweep) -> float:
+    """The middle of the band [rad/s], on the log axis."""
+    return float(np.sqrt(sweep.angular_frequency[0] * sweep.angular_frequency[-1]))
+
+
+def starts(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
+    """Starting points (count, SIZE): two pots that cross inside or near the band, then spread around the data."""
+    rng = np.random.default_rng(seed)
+    size = np.log(np.hypot(sweep.storage, sweep.loss))
+    half = 0.5 * np.log(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
+    typical = float(np.clip(2 / np.pi * np.arctan(np.median(sweep.loss / sweep.storage)), 0.02, 0.6))
+    ordered = [_crossing(np.median(size), typical, alpha, c * half) for alpha in (0.95, 0.65) for c in _CROSSINGS]
+    k = max(0, count - len(ordered))
+    alpha, other = rng.uniform(0.05, 0.95, k), rng.uniform(0.02, 0.9, (2, k))
+    pot = np.log(np.median(sweep.loss)) - np.log(np.sin(0.5 * np.pi * alpha)) + rng.uniform(-1, 1, k)
+    rest, row = rng.uniform(size.min() - 2, size.min(), k), rng.uniform(size.min(), size.max() + 2, k)
+    spread = np.column_stack([rest, _logit(other[0]), pot, _logit(alpha), row, _logit(other[1])])
+    return np.concatenate([np.array(ordered), spread])[:count]
+
+
+#: Where the two pots are equally stiff, in half bands from the middle.
+_CROSSINGS = (-1.5, -0.75, 0.0, 0.75, 1.5)
+
+
+def _logit(p: np.ndarray | float) -> np.ndarray:
+    return np.log(p / (1 - np.asarray(p)))
+
+
+def _crossing(level: float, smaller: float, alpha: float, log_x: float) -> list[float]:
+    """A pot of exponent `alpha` that is as stiff as one of exponent `smaller` at log_x."""
+    ratio = float(_logit(min(smaller / alpha, 0.95)))
+    return [level, ratio, level - (alpha - smaller) * log_x, float(_logit(alpha)), level, ratio]

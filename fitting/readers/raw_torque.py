@@ -1,0 +1,93 @@
+"""What the instrument's inertia does to a sweep, from the raw torque and displacement that exports may have.
+
+Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta, with K the geometry and I the inertia that
+the software has subtracted. I omega^2 / K is its share as a modulus; a part of it, `UNCERTAINTY`, is not known.
+"""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+#: Relative standard deviation of an instrument's inertia: how far calibrations of one instrument lie apart.
+UNCERTAINTY = 0.03
+#: What a heading begins with and the quantity; where several name one quantity, the first of this list is taken.
+HEADINGS = (
+    ("oscillation torque (sample)", "sample_torque"),
+    ("oscillation torque", "torque"),
+    ("raw oscillation phase", "phase"),
+    ("raw phase", "phase"),
+    ("oscillation displacement", "angle"),
+    ("torque", "torque"),
+    ("deflection angle", "angle"),
+    ("angle", "angle"),
+)
+_TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}
+UNITS = {
+    "torque": _TORQUE,
+    "sample_torque": _TORQUE,
+    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6},
+    "phase": {"°": np.pi / 180, "deg": np.pi / 180, "rad": 1.0},
+}
+
+
+class Share(NamedTuple):
+    """The inertia of the instrument in a sweep."""
+
+    inertia: float  # I [N m s^2]
+    modulus: np.ndarray  # (n,) I omega^2 / K [Pa]
+
+
+def columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float]]:
+    """Quantity -> place and factor to SI, of the headings that are known and have a known unit.
+
+    Args:
+        cells: headings.
+        units: of a line of their own, or nothing.
+    """
+    found: dict[str, tuple[int, int, float]] = {}
+    for k, cell in enumerate(cells):
+        name = cell.strip().strip('"')
+        plain = name.lower().replace("_", " ")
+        rank = next((j for j, (word, _) in enumerate(HEADINGS) if plain.startswith(word)), None)
+        if rank is None:
+            continue
+        word, quantity = HEADINGS[rank]
+        rest = re.sub(r"^[\s_\[(]+|[\s\])]+$", "", name[len(word) :])
+        unit = _plain(rest or (units[k] if k < len(units) else ""))
+        if unit in UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
+            found[quantity] = (rank, k, UNITS[quantity][unit])
+    return {quantity: (k, factor) for quantity, (_, k, factor) in found.items()}
+
+
+def _plain(unit: str) -> str:
+    return unit.replace("µ", "u").replace("μ", "u").replace("·", ".").replace("⋅", ".").strip('[]() "')
+
+
+def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> Share | None:
+    """The inertia that was subtracted; None where the columns do not tell it.
+
+    Args:
+        omega: (n,) [rad/s].
+        G: complex modulus (n,) [Pa], as corrected by the instrument.
+        raw: columns (n,) in SI: torque and angle, perhaps phase and sample_torque.
+        geometry: K [m^3], torque of 1 Pa and 1 rad; needed where there is no sample_torque.
+    """
+    if not {"torque", "angle"} <= set(raw) or np.any(~(np.abs(raw["angle"]) > 0)):
+        return None
+    stiffness = np.abs(raw["torque"] / raw["angle"])
+    K = geometry
+    if "sample_torque" in raw:
+        K = float(np.median(np.abs(raw["sample_torque"] / raw["angle"]) / np.abs(G)))
+    if K is None or not K > 0:
+        return None
+    if "phase" in raw:
+        inertias = (K * G.real - stiffness * np.cos(raw["phase"])) / omega**2
+    else:  # past the resonance, where the raw torque leads: the other root belongs to lower frequencies
+        inertias = (K * G.real + np.sqrt(np.maximum(stiffness**2 - (K * G.imag) ** 2, 0))) / omega**2
+    # Where inertia leads it is known best; elsewhere it is a small difference of large numbers.
+    led = np.argsort(omega)[-max(3, len(omega) // 6) :]
+    inertia, apart = float(np.median(inertias[led])), np.ptp(inertias[led])
+    if not (inertia > 0 and apart < 0.1 * inertia and inertia * omega[-1] ** 2 > K * np.abs(G[-1])):
+        return None
+    return Share(inertia, inertia * omega**2 / K)

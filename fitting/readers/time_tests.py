@@ -1,0 +1,268 @@
+"""Relaxation and creep from files: time with modulus, compliance, strain and stress, torque and angle, force and path.
+
+The lines are read as those of sweeps are: plain CSV, TRIOS and RheoCompass text, units in the header or below it.
+"""
+
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers.rheometer import MODULUS_UNITS, split_line, text_of, to_number
+from liverjax.core.errors import InputError
+
+_PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
+#: Units of every quantity, in SI; the first is taken where none is given.
+UNITS = {
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3},
+    "modulus": {"Pa": 1.0} | MODULUS_UNITS,
+    "compliance": {"1/Pa": 1.0} | _PER_PA,
+    "strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},
+    "stress": {"Pa": 1.0} | MODULUS_UNITS,
+    "torque": {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
+}
+#: Words that begin a heading, and the quantity; the longer ones come first.
+WORDS = (
+    ("relaxation modulus", "modulus"),
+    ("shear modulus", "modulus"),
+    ("modulus", "modulus"),
+    ("g(t)", "modulus"),
+    ("creep compliance", "compliance"),
+    ("compliance", "compliance"),
+    ("j(t)", "compliance"),
+    ("shear strain", "strain"),
+    ("strain", "strain"),
+    ("shear stress", "stress"),
+    ("stress", "stress"),
+    ("torque", "torque"),
+    ("angle", "angle"),
+    ("deflection angle", "angle"),
+    ("axial force", "force"),
+    ("force", "force"),
+    ("displacement", "displacement"),
+    ("step time", "time"),
+    ("time", "time"),
+)
+#: What a file must have beside the time, best first.
+FORMS = (
+    ("strain", "stress"),
+    ("angle", "torque"),
+    ("displacement", "force"),
+    ("modulus",),
+    ("compliance",),
+)
+
+
+#: Relative error at which a floor of the noise begins to count.
+RELATIVE = 0.03
+
+
+class TimeTest(NamedTuple):
+    """A relaxation or creep test in SI units, as shear."""
+
+    kind: str  # relaxation or creep
+    time: np.ndarray  # (n,) [s], ascending
+    driven: np.ndarray  # (n,) strain, of creep stress [Pa], at these times
+    answer: np.ndarray  # (n,) stress [Pa], of creep strain
+    used: np.ndarray  # (n,) rows whose answer is fitted
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def scales(self) -> np.ndarray:
+        """What the residuals of the used answers are divided by: the answers, and a floor for those lost in noise."""
+        answer = self.answer[self.used]
+        smooth = np.abs(np.diff(answer, 3))  # three differences of independent noise have 20 times its variance
+        noise = float(np.median(smooth)) / 0.6745 / np.sqrt(20) if len(smooth) else 0.0
+        return np.hypot(answer, noise / RELATIVE)
+
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time [s] that the test sees: from the first answer used to the last."""
+        time = self.time[self.used]
+        return float(time[0]), float(time[-1])
+
+
+class Sample(NamedTuple):
+    """Size of the sample [m], where the columns are of torque or force."""
+
+    radius: float | None = None
+    height: float | None = None
+
+
+def read(
+    path: str | os.PathLike, kind: str, sample: Sample = Sample(), ramp: float = 0.0, start: float = 0.0
+) -> TimeTest:
+    """Read a test.
+
+    Args:
+        path: text with a header that names time and one of `FORMS`.
+        kind: "relaxation" or "creep".
+        sample: radius and height of a cylinder, for torque and force.
+        ramp: of a modulus or compliance: seconds in which strain or stress was raised; 0 for a step.
+        start: answers before this time [s] are not fitted.
+
+    Raises:
+        InputError: one sentence naming file, column or line, value and remedy.
+    """
+    columns, notes = _columns(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    time = columns["time"]
+    if np.any(np.diff(time) <= 0) or time[0] < 0:
+        k = int(np.argmax(np.diff(time) <= 0)) + 1
+        order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
+        raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
+    form = next((f for f in FORMS if set(f) <= set(columns)), None)
+    if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own(kind)):
+        raise InputError(
+            f"{path}: a {kind} test needs, beside time, {_own(kind)}, or strain and stress, angle and torque, or "
+            f"displacement and force; the file has {', '.join(columns)}"
+        )
+    if form[0] in ("modulus", "compliance"):
+        time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp)
+    else:
+        if ramp:
+            raise InputError(f"{path}: --ramp {ramp:g} is for a file without the {form[0]}; leave it out")
+        strain, stress, told = _as_shear(str(path), form, columns, sample)
+        notes += told
+        driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
+        time, driven, answer = _from_rest(time, driven, answer)
+    return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
+
+
+def _own(kind: str) -> str:
+    return "modulus" if kind == "relaxation" else "compliance"
+
+
+def _columns(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns in SI of the first table that has time and an answer, and notes."""
+    for k, line in enumerate(lines):
+        delimiter, cells = split_line(line.lstrip("# "))
+        found = _heading(cells)
+        if "time" in found and any(set(f) <= set(found) for f in FORMS):
+            rows, units = _rows(path, lines, k + 1, delimiter, found)
+            return _in_si(path, found, np.array(rows), units)
+    first = next((line.strip() for line in lines if line.strip()), "")[:80]
+    raise InputError(
+        f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, strain and stress_Pa, "
+        f"angle_rad and torque_N.m, or displacement_m and force_N (the first line is {first!r}); add that header"
+    )
+
+
+def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
+    """Quantity -> place and unit of the first cell that names it."""
+    found: dict[str, tuple[int, str | None]] = {}
+    for k, cell in enumerate(cells):
+        text = cell.strip().strip('"')
+        bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", text) if not text.lower().endswith("(t)") else None
+        unit = bracket.group(1) if bracket else None
+        name = (text[: bracket.start()] if bracket else text).replace("_", " ").strip()
+        for word, quantity in WORDS:
+            if name.lower().startswith(word):
+                rest = name[len(word) :].strip()
+                if rest and not _known(quantity, rest):
+                    break  # "strain rate", "stress (step)"
+                found.setdefault(quantity, (k, unit or rest or None))
+                break
+    return found
+
+
+def _plain(unit: str) -> str:
+    return unit.replace("µ", "u").replace("μ", "u").replace("·", ".").replace("⋅", ".").strip('[]() "')
+
+
+def _known(quantity: str, unit: str) -> bool:
+    return _plain(unit) in UNITS[quantity]
+
+
+def _rows(path, lines, k, delimiter, found):
+    """Numbers below the header, and the units that a line of their own gives."""
+    rows, units = [], {}
+    needed = {q: place for q, (place, _) in found.items()}
+    while k < len(lines):
+        line = lines[k]
+        k += 1
+        _, cells = split_line(line, delimiter)
+        values = [to_number(cells[p], delimiter) if p < len(cells) else None for p in needed.values()]
+        if all(v is not None for v in values):
+            rows.append(values)
+            continue
+        named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known(q, cells[p])}
+        if not rows and named:
+            units = named
+        elif rows and any(v is not None for v in values) and line.strip():
+            raise InputError(f"{path}: line {k}: {line.strip()[:40]!r} has a cell that is no number; mend or remove it")
+        elif rows and line.strip() and not line.lstrip().startswith("#"):
+            break
+    if len(rows) < 4:
+        raise InputError(f"{path}: {len(rows)} rows of numbers are below the header; give four or more")
+    return rows, units
+
+
+def _in_si(path, found, rows, units):
+    notes, columns = [], {}
+    for j, (quantity, (_, unit)) in enumerate(found.items()):
+        unit = units.get(quantity) or unit
+        if unit is None:
+            unit = next(iter(UNITS[quantity]))
+            notes.append(f"the column of {quantity} states no unit; {unit} is taken")
+        if not _known(quantity, unit):
+            raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(UNITS[quantity])}")
+        columns[quantity] = rows[:, j] * UNITS[quantity][_plain(unit)]
+    good = np.all(np.isfinite(rows), axis=1)
+    if not good.all():
+        notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a number in them is not finite")
+    return {q: v[good] for q, v in columns.items()}, notes
+
+
+def _as_a_step(path, time, modulus, ramp):
+    """A strain (or stress) of 1, at once or over a ramp."""
+    if not (np.isfinite(ramp) and ramp >= 0):
+        raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
+    kept = time > 0
+    times = np.unique(np.concatenate([[0.0], time[kept], [ramp] if ramp else []]))
+    answer = np.full(len(times), np.nan)
+    answer[np.searchsorted(times, time[kept])] = modulus[kept]
+    return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
+
+
+def _from_rest(time, driven, answer):
+    """A first point at rest, where the record begins under load."""
+    if time[0] > 0:
+        time, driven, answer = (np.concatenate([[0.0], v]) for v in (time, driven, answer))
+    return time, driven, answer
+
+
+def _as_shear(path, form, columns, sample):
+    """Strain, stress [Pa] of shear, and notes."""
+    if form == ("strain", "stress"):
+        return columns["strain"], columns["stress"], []
+    if sample.radius is None or sample.height is None:
+        raise InputError(f"{path}: {form[1]} needs the sample's size: give --radius and --height in metres")
+    r, h = sample.radius, sample.height
+    if form == ("angle", "torque"):
+        return columns["angle"] * r / h, columns["torque"] * 2 / (np.pi * r**3), []
+    note = "force and displacement are taken as those of an incompressible cylinder between slippery plates: G = E / 3"
+    return columns["displacement"] / h, columns["force"] / (3 * np.pi * r**2), [note]
+
+
+def _checked(test: TimeTest, start: float) -> TimeTest:
+    if not np.max(np.abs(test.driven)) > 0:
+        word = "strain" if test.kind == "relaxation" else "stress"
+        raise InputError(f"{test.source}: the {word} is zero throughout; a {test.kind} test needs one")
+    sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
+    driven, answer = sign * test.driven, sign * test.answer
+    used = test.used & np.isfinite(answer) & (test.time >= start)
+    if used.sum() < 4:
+        raise InputError(
+            f"{test.source}: {used.sum()} usable answers are left; give four or more (--min-time too late?)"
+        )
+    if not np.median(answer[used]) > 0:
+        raise InputError(
+            f"{test.source}: most answers have the sign against the {test.kind} test's input; mend the signs"
+        )
+    return test._replace(driven=driven, answer=answer, used=used)

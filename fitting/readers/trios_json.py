@@ -1,0 +1,41 @@
+"""TA TRIOS exports in JSON, turned into the text tables that the other readers know.
+
+Layout: TRIOSJSONExportSchema of TA Instruments. `Results` (or its part `Processed`, else `Raw`) holds `ColumnHeaders`,
+key -> name and unit, `Rows` of key -> value, and the steps of the test by their id.
+"""
+
+import json
+from typing import Any
+
+#: Key of a row that says which step it belongs to.
+STEP = "Results Step Id"
+
+
+def tables(text: str) -> str | None:
+    """Tab-separated tables, one a step, with a row of names and a row of units; None where the text is no such JSON."""
+    try:
+        content = json.loads(text)
+        results = content["Results"]
+        results = next((results[part] for part in ("Processed", "Raw") if part in results), results)
+        headers, rows = results["ColumnHeaders"], results["Rows"]
+        steps = {step["Id"]: str(step.get("Name", "")) for step in results.get("ResultsSteps", [])}
+        lines = []
+        for step in dict.fromkeys(row.get(STEP) for row in rows):
+            own = [row for row in rows if row.get(STEP) == step]
+            keys = [k for k in headers if all(_is_number(row.get(k)) for row in own)]
+            lines += ["[step]", steps.get(step, "") or "step"]
+            lines.append("\t".join(_cell(headers[k].get("DisplayName", k)) for k in keys))
+            lines.append("\t".join(_cell((headers[k].get("Unit") or {}).get("Name", "")) for k in keys))
+            lines += ["\t".join(repr(float(row[k])) for k in keys) for row in own]
+            lines.append("")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return "\n".join(lines)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _cell(text: Any) -> str:
+    return " ".join(str(text).split())

@@ -1,0 +1,112 @@
+"""Prony modes as material cards of FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
+
+All cards are neo-Hookean with G0, the instantaneous shear modulus. The whole stress relaxes, as in the simulations here
+(part = "all"). A shear test says nothing of the bulk modulus: it is that of Poisson's ratio `POISSON`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from fitting.methods.generalised_maxwell import Maxwell
+
+#: Poisson's ratio of the elastic law: nearly incompressible.
+POISSON = 0.49
+#: Terms that FEBio's viscoelastic material has, and the largest sum of ratios that Abaqus takes (it must be below 1).
+FEBIO_TERMS, ABAQUS_SUM = 6, 1 - 1e-6
+
+
+def write(folder: Path, model: Maxwell) -> list[str]:
+    """Write the four files; returns sentences on what a program cannot hold."""
+    folder.mkdir(parents=True, exist_ok=True)
+    told = []
+    if len(model.ratios) > FEBIO_TERMS:
+        told.append(f"FEBio holds {FEBIO_TERMS} modes, the model has {len(model.ratios)}: no card for it")
+        (folder / "febio.feb").unlink(missing_ok=True)
+    else:
+        (folder / "febio.feb").write_text(febio(model))
+    if np.sum(model.ratios) > ABAQUS_SUM:
+        told.append("the model is a fluid: Abaqus needs an equilibrium modulus, its card keeps a millionth of G0")
+    for name, card in (("abaqus.inp", abaqus), ("ansys.inp", ansys), ("sofa.xml", sofa)):
+        (folder / name).write_text(card(model))
+    return told
+
+
+def _bulk(shear: float) -> float:
+    return 2 * shear * (1 + POISSON) / (3 * (1 - 2 * POISSON))
+
+
+def _number(value: float) -> str:
+    return f"{float(value):.10g}"
+
+
+def febio(model: Maxwell) -> str:
+    """A viscoelastic material; g0 is the part that stays, so the elastic law is the instantaneous one."""
+    G0, ratios, times = model
+    young = _number(2 * (1 + POISSON) * float(G0))
+    terms = [f"      <t{k}>{_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
+    terms += [f"      <g{k}>{_number(g)}</g{k}>" for k, g in enumerate(ratios, 1)]
+    return "\n".join(
+        [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            "<!-- SI units: Pa, s. Set the density of your tissue. -->",
+            '<febio_spec version="4.0">',
+            "  <Material>",
+            '    <material id="1" name="tissue" type="viscoelastic">',
+            f"      <g0>{_number(max(0.0, 1 - float(np.sum(ratios))))}</g0>",
+            *terms,
+            '      <elastic type="neo-Hookean">',
+            f"        <E>{young}</E>",
+            f"        <v>{POISSON}</v>",
+            "      </elastic>",
+            "    </material>",
+            "  </Material>",
+            "</febio_spec>",
+            "",
+        ]
+    )
+
+
+def abaqus(model: Maxwell) -> str:
+    """Hyperelastic, instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K; a line g, k, tau for each mode."""
+    G0, ratios, times = model
+    kept = np.asarray(ratios) * min(1.0, ABAQUS_SUM / max(float(np.sum(ratios)), 1e-300))
+    rows = [f"{_number(g)}, {_number(g)}, {_number(t)}" for g, t in zip(kept, times, strict=True)]
+    return "\n".join(
+        [
+            "** SI units: Pa, s. Add *DENSITY.",
+            "*MATERIAL, NAME=TISSUE",
+            "*HYPERELASTIC, NEO HOOKE, MODULI=INSTANTANEOUS",
+            f"{_number(float(G0) / 2)}, {_number(2 / _bulk(float(G0)))}",
+            "*VISCOELASTIC, TIME=PRONY",
+            *rows,
+            "",
+        ]
+    )
+
+
+def ansys(model: Maxwell) -> str:
+    """Mechanical APDL: neo-Hookean mu = G0, d = 2 / K; the same Prony pairs for shear and bulk, six numbers a line."""
+    G0, ratios, times = model
+    pairs = [_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
+    data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
+    lines = ["! SI units: Pa, s. Add MP,DENS.", "TB,HYPER,1,1,2,NEO"]
+    lines.append(f"TBDATA,1,{_number(float(G0))},{_number(2 / _bulk(float(G0)))}")
+    for option in ("SHEAR", "BULK"):
+        lines += [f"TB,PRONY,1,1,{len(ratios)},{option}", *data]
+    return "\n".join([*lines, ""])
+
+
+def sofa(model: Maxwell) -> str:
+    """A hyperelastic force field at the equilibrium modulus: SOFA itself has no Prony series, a comment holds it."""
+    G0, ratios, times = model
+    rest = float(G0) * (1 - float(np.sum(ratios)))
+    shear = rest if rest > 1e-6 * float(G0) else float(G0)
+    what = "equilibrium" if shear == rest else "instantaneous (the model is a fluid)"
+    modes = "; ".join(f"{_number(g)} {_number(t)}" for g, t in zip(ratios, times, strict=True))
+    return (
+        f"<!-- SI units: Pa, s. The {what} shear modulus: SOFA has no Prony series of its own.\n"
+        f"     G0 {_number(float(G0))}; ratio and relaxation time of each mode: {modes} -->\n"
+        '<TetrahedronHyperelasticityFEMForceField materialName="NeoHookean" '
+        f'ParameterSet="{_number(shear)} {_number(_bulk(shear))}" />\n'
+    )

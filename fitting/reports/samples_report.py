@@ -1,0 +1,183 @@
+"""What a fit of several samples leaves behind: fit.json, fit.png, fit.h5, and a table on the terminal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.fits import edges
+from fitting.fits.samples import Samples
+from fitting.reports.sweep_report import band_sensitivity, numbers, summary
+from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
+from liverjax.core.versions import versions
+
+
+def write(out: Path, found: Samples) -> dict[str, Any]:
+    """Write all three files; returns the JSON."""
+    out.mkdir(parents=True, exist_ok=True)
+    content = numbers(_content(found))
+    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    save(figure(found), out / "fit.png")
+    _store(out / "fit.h5", found, content)
+    return content
+
+
+def _content(found: Samples) -> dict[str, Any]:
+    """On top the sample in the middle of the population, below it the population and every sample."""
+    typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
+    own = {} if found.kind.values is None else {"parameters": {n: {"value": p.mean} for n, p in _known(found).items()}}
+    rest = float(typical.shear_modulus * (1 - np.sum(np.asarray(typical.ratios))))
+    return {
+        "method": "closed-form",
+        "model": found.kind.name,
+        "converged": all(f.converged for f in found.fits),
+        "modes": len(typical.ratios),
+        "shear_modulus": float(typical.shear_modulus),
+        "equilibrium_modulus": max(0.0, rest),
+        "ratios": np.asarray(typical.ratios).tolist(),
+        "relaxation_times": np.asarray(typical.relaxation_times).tolist(),
+        **own,
+        "population": {name: _population(p) for name, p in found.populations.items()},
+        "samples": [_sample(found, k) for k in range(len(found.fits))],
+        "models_compared": found.compared,
+        "mean_relative_error": float(errors.mean()),
+        "max_relative_error": float(errors.max()),
+        "warnings": warnings(found),
+        "run_time_s": sum(f.run_time for f in found.fits),
+        "compile_time_s": sum(f.compile_time for f in found.fits),
+        "versions": versions(),
+    }
+
+
+def _pairs(found: Samples) -> zip:
+    return zip(found.fits, found.sweeps, strict=True)
+
+
+def _known(found: Samples) -> dict[str, Any]:
+    return {name: p for name, p in found.populations.items() if p is not None}
+
+
+def _population(p: Any) -> dict[str, Any] | None:
+    if p is None:
+        return None
+    return {
+        "mean": p.mean,
+        "spread_of_logarithms": p.spread,
+        "interval_95_of_the_mean": list(p.mean_interval),
+        "interval_95_of_a_new_sample": list(p.new_interval),
+    }
+
+
+def _sample(found: Samples, k: int) -> dict[str, Any]:
+    """The fit of one sample by itself, and its numbers drawn towards the population."""
+    fit, sweep = found.fits[k], found.sweeps[k]
+    pooled = {
+        name: {"value": p.pooled[k], "standard_deviation_of_logarithm": p.pooled_errors[k]}
+        for name, p in _known(found).items()
+    }
+    more = {"data": sweep.source, "notes": list(sweep.notes), "pooled": pooled}
+    return summary(fit, sweep) | {"band_sensitivity": band_sensitivity(fit)} | more
+
+
+def warnings(found: Samples) -> list[str]:
+    """What concerns the population, and of the samples' own sentences how many there are."""
+    out = []
+    for name, p in found.populations.items():
+        own = np.array([edges.values(f)[name][0] for f in found.fits])
+        if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
+            out.append(f"{name}: it is {np.round(own[0]):g} in all samples, the springpot is a pure spring or dashpot")
+        elif p is None:
+            out.append(f"{name}: fewer than two samples determine it; it has no population")
+        elif p.spread == 0:
+            out.append(f"{name}: the errors of the samples explain their spread; no spread between samples is seen")
+    failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
+    if failed:
+        out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
+    for words, told in (
+        ("mark of the instrument", "the last points are the instrument's"),
+        ("Kramers-Kronig", "the data do not agree with themselves"),
+        ("structured misfit", "the misfit has structure"),
+        ("half decade", "the ends of the band decide some numbers"),
+    ):
+        count = sum(any(words in w for w in f.warnings) for f in found.fits)
+        if count:
+            out.append(f"in {count} of {len(found.fits)} samples {told}; fit.json has the sentences of each")
+    return out
+
+
+def table(found: Samples) -> str:
+    """The population, the samples, and what the choice of the model rests on."""
+    units = dict(zip(found.kind.names, found.kind.units, strict=True))
+    rows = [
+        f"{len(found.fits)} samples, {found.kind.name}",
+        f"{'':22s} {'mean':>10s} {'spread':>7s}   {'95 % of the mean':22s}   95 % of a new sample",
+    ]
+    for name, p in found.populations.items():
+        unit = units.get(name, {"shear_modulus": "Pa", "equilibrium_modulus": "Pa"}.get(name, ""))
+        unit = "s" if name.startswith("relaxation_time") else "" if unit == "1" else unit
+        if p is None:
+            rows.append(f"{name:22s} {'?':>10s}")
+            continue
+        ends = (f"{low:.4g} to {high:.4g}" for low, high in (p.mean_interval, p.new_interval))
+        middle, new = ends
+        rows.append(f"{name:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
+    rows.append(f"{'sample':32s} {'mean error':>10s}   {next(iter(found.populations))}")
+    for fit, sweep in _pairs(found):
+        name, (value, error) = next(iter(edges.values(fit).items()))
+        mark = " *" if name in edges.moved(fit) else ""
+        mean = f"{100 * fit.relative_errors(sweep).mean():.2g} %"
+        rows.append(f"{Path(sweep.source).name[-32:]:32s} {mean:>10s}   {value:.4g} ± {error:.2g}{mark}")
+    if len(found.compared) > 1:
+        rows.append(f"{'model':28s} {'criterion':>10s}")
+        for row in found.compared:
+            label = row["model"] + (f", {row['modes']} modes" if "modes" in row else "")
+            free = "" if row["identifiable"] else "   numbers left free"
+            rows.append(f"{label:28s} {'+' + format(row['above_the_lowest'], '.1f'):>10s}{free}")
+    return "\n".join(rows)
+
+
+def figure(found: Samples) -> Any:
+    """Moduli of all samples on the left; every number of every sample, and its population, on the right."""
+    fig = pyplot().figure(figsize=(10, max(5.0, 0.7 * len(found.populations) + 1.5)), layout="constrained")
+    left, right = fig.subplots(1, 2, width_ratios=(5.6, 4.4))
+    for fit, sweep in _pairs(found):
+        f = sweep.angular_frequency / (2 * np.pi)
+        for data, fitted, colour in ((sweep.storage, fit.storage, BLUE), (sweep.loss, fit.loss, ORANGE)):
+            left.plot(f, data, "o", color=colour, ms=3, mfc="none", alpha=0.6)
+            left.plot(f, fitted, "-", color=colour, lw=0.9, alpha=0.8)
+    left.plot([], [], "o-", color=BLUE, ms=3, label="G' measured and fitted")
+    left.plot([], [], "o-", color=ORANGE, ms=3, label="G'' measured and fitted")
+    left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="modulus [Pa]")
+    left.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.3)
+    known = _known(found)
+    for row, (name, p) in enumerate(known.items()):
+        own = np.array([edges.values(f)[name][0] for f in found.fits]) / p.mean
+        right.plot(own, np.full(len(own), row), "|", color=GREY, ms=9)
+        right.plot(np.array(p.new_interval) / p.mean, [row - 0.2] * 2, "-", color=ORANGE, lw=1.2)
+        right.plot(np.array(p.mean_interval) / p.mean, [row + 0.2] * 2, "-", color=BLUE, lw=2.5)
+    for marker, colour, label in (
+        ("|", GREY, "sample"),
+        ("-", BLUE, "95 % of the mean"),
+        ("-", ORANGE, "of a new sample"),
+    ):
+        right.plot([], [], marker, color=colour, label=label)
+    right.set(xscale="log", xlabel="value / mean [1]", yticks=range(len(known)), yticklabels=list(known))
+    right.invert_yaxis()
+    right.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.3)
+    return fig
+
+
+def _store(path: Path, found: Samples, content: dict[str, Any]) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file.attrs["fit.json"] = json.dumps(content)
+        for k, (fit, sweep) in enumerate(_pairs(found)):
+            group = file.create_group(f"samples/{k}")
+            group.attrs["data"] = sweep.source
+            group["angular_frequency"] = sweep.angular_frequency
+            group["storage"], group["loss"] = sweep.storage, sweep.loss
+            group["fitted_storage"], group["fitted_loss"] = fit.storage, fit.loss
+            group["covariance"] = fit.uncertainty.covariance
+            group["covariance"].attrs["order"] = list(fit.uncertainty.names)

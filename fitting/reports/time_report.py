@@ -1,0 +1,101 @@
+"""What a fit of a relaxation or creep test leaves behind: fit.json, fit.png, and a table on the terminal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.fits.time_tests import TimeFit
+from fitting.methods import time_response
+from fitting.methods.uncertainty import equilibrium_error
+from fitting.readers.time_tests import TimeTest
+from fitting.reports.sweep_report import numbers
+from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
+from liverjax.core.versions import versions
+
+
+def write(out: Path, test: TimeTest, fit: TimeFit) -> dict[str, Any]:
+    """Write both files; returns the JSON, whose names are those of a sweep's."""
+    out.mkdir(parents=True, exist_ok=True)
+    u, n = fit.uncertainty, fit.modes
+    e, errors = u.standard_errors, fit.relative_errors
+    content = numbers(
+        {
+            "method": test.kind,
+            "model": fit.kind.name,
+            "converged": fit.converged,
+            "modes": n,
+            "shear_modulus": float(fit.model.shear_modulus),
+            "equilibrium_modulus": _equilibrium(fit),
+            "ratios": fit.model.ratios.tolist(),
+            "relaxation_times": fit.model.relaxation_times.tolist(),
+            "standard_errors": {
+                "shear_modulus": e[0],
+                "equilibrium_modulus": equilibrium_error(u),
+                "ratios": e[1 : n + 1].tolist(),
+                "relaxation_times": e[n + 1 :].tolist(),
+            },
+            "interval_quantile_95": u.quantile,
+            "correlation": u.correlation.tolist(),
+            "correlation_names": list(u.names),
+            "noise_factor": u.noise,
+            "mean_relative_error": float(errors.mean()),
+            "max_relative_error": float(errors.max()),
+            "warnings": list(fit.warnings),
+            "run_time_s": fit.run_time,
+            "compile_time_s": fit.compile_time,
+            "details": fit.details,
+            "data": test.source,
+            "notes": list(test.notes),
+            "versions": versions(),
+        }
+    )
+    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    save(figure(test, fit), out / "fit.png")
+    return content
+
+
+def _equilibrium(fit: TimeFit) -> float:
+    return max(0.0, float(fit.model.shear_modulus * (1 - fit.model.ratios.sum())))
+
+
+def table(test: TimeTest, fit: TimeFit) -> str:
+    """Parameters ± standard error, and what the choice of the number of modes rests on."""
+    u, n = fit.uncertainty, fit.modes
+    rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
+    rows.append(f"G0    {u.values[0]:11.5g} ± {u.standard_errors[0]:<9.2g} Pa")
+    if fit.kind.name == "prony":
+        rows.append(f"G_inf {_equilibrium(fit):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
+    for k in range(n):
+        rows.append(f"g{k + 1:<4d} {u.values[1 + k]:11.5g} ± {u.standard_errors[1 + k]:<9.2g}".rstrip())
+        rows.append(f"tau{k + 1:<2d} {u.values[1 + n + k]:11.5g} ± {u.standard_errors[1 + n + k]:<9.2g} s")
+    errors = fit.relative_errors
+    rows.append(f"mean error {100 * errors.mean():.3g} %, largest {100 * errors.max():.3g} %")
+    for row in fit.details["tried"] if len(fit.details["tried"]) > 1 else []:
+        free = "" if row["identifiable"] else "   numbers left free"
+        rows.append(f"{row['model']:12s} {row['modes']:2d} modes, criterion +{row['above_the_lowest']:.1f}{free}")
+    return "\n".join(rows)
+
+
+def figure(test: TimeTest, fit: TimeFit) -> Any:
+    """The test and its fit on the left, G(t) and J(t) of the model on the right."""
+    fig = pyplot().figure(figsize=(10, 4.6), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    unit = "stress [Pa]" if test.kind == "relaxation" else "strain [1]"
+    left.plot(fit.time, fit.measured, "o", color=BLUE, ms=3, mfc="none", label="measured")
+    left.plot(fit.time, fit.fitted, "-", color=ORANGE, lw=1.2, label="fitted")
+    left.set(xscale="log", yscale="log", xlabel="time [s]", ylabel=unit)
+    left.legend(fontsize=8, frameon=False)
+    low, high = test.resolved
+    t = np.geomspace(low, high, 200)
+    right.plot(t, time_response.relaxation_modulus(fit.model, t), color=BLUE, label="G(t) [Pa]")
+    right.plot(t, 1 / time_response.creep_compliance(fit.model, t), "--", color=ORANGE, label="1 / J(t) [Pa]")
+    for tau in fit.model.relaxation_times:
+        right.axvline(tau, color=GREY, lw=0.8)
+    right.set(xscale="log", yscale="log", xlabel="time [s]", ylabel="modulus [Pa]", xlim=(low / 1.1, high * 1.1))
+    right.legend(fontsize=8, frameon=False)
+    plural = "s" if fit.modes > 1 else ""
+    mean = 100 * fit.relative_errors.mean()
+    fig.suptitle(f"{test.kind}, {fit.kind.name}, {fit.modes} mode{plural}: mean error {mean:.2g} %", fontsize=10)
+    return fig

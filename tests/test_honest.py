@@ -1,0 +1,157 @@
+"""What a fit says of its data: bounds of every material, the instrument's mark, order in residuals, the ends."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from conftest import ROOT, SHARED
+
+from fitting.__main__ import main
+from fitting.fits import edges, models, viscoelastic
+from fitting.methods import consistency, generalised_maxwell
+from fitting.methods.consistency import runs_probability
+from fitting.readers.rheometer import Sweep, read_sweep, some, within
+from liverjax import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+LIONS_MANE = ROOT / "data" / "lions_mane_frequency_sweep.csv"
+OMEGA = np.geomspace(0.1, 100, 31)
+
+
+def material(seed: int, noise: float = 0.0, omega: np.ndarray = OMEGA) -> Sweep:
+    """Random Maxwell modes, some outside of the band."""
+    rng = np.random.default_rng(seed)
+    times, strengths = 10 ** rng.uniform(-4, 3, 6), rng.uniform(0, 100, 6)
+    x = 1j * omega[:, None] * times
+    G = rng.uniform(10, 200) + (strengths * x / (1 + x)).sum(axis=1)
+    factor = 1 + noise * rng.standard_normal((2, len(omega)))
+    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+
+
+def of_data(s: Sweep) -> consistency.Consistency:
+    return consistency.of_data(s, generalised_maxwell.spectrum(s))
+
+
+@pytest.mark.parametrize("ups", [2, 4, 5])
+def test_chances_of_runs_are_those_of_counting_every_order(ups):
+    n = 9
+    rows = [np.isin(np.arange(n), places) for places in itertools.combinations(range(n), ups)]
+    runs = np.array([1 + np.sum(r[1:] != r[:-1]) for r in rows])
+    for row, own in zip(rows, runs, strict=True):
+        found, chance = runs_probability(np.where(row, 1, -1))
+        assert found == own and chance == pytest.approx(np.mean(runs <= own), rel=1e-12)
+    assert runs_probability(np.ones(5)) == (1, 2.0**-4)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])
+def test_no_material_is_accused(noise):
+    accused = [bool(consistency.sentences(of_data(material(seed, noise)), material(seed, noise))) for seed in range(60)]
+    # Four standard deviations, three bounds at 30 places: 0.3 % of sweeps by chance.
+    assert sum(accused) <= 1
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_inertia_of_the_instrument_is_named(sign):
+    for seed in range(5):
+        s = material(seed, 0.001)
+        last = s.storage[-1]
+        spoiled = s._replace(storage=s.storage + sign * 0.5 * last * (s.angular_frequency / 100) ** 2)
+        found = of_data(spoiled)
+        told = consistency.sentences(found, spoiled)
+        assert found.onset is not None and "mark of the instrument" in told[0], seed
+        # what the sentence asks for keeps the last good point and mends the sweep
+        limit = float(told[0].split("--max-frequency ")[1].split()[0])
+        kept = within(spoiled, None, limit)
+        assert np.isclose(kept.angular_frequency[-1], found.onset)
+
+
+def test_a_drift_is_called_one():
+    s = material(3, 0.001)
+    drifting = s._replace(storage=s.storage * np.linspace(1.6, 1.0, len(s.storage)))
+    told = consistency.sentences(of_data(drifting), drifting)
+    assert any("Kramers-Kronig" in t or "no material that relaxes" in t for t in told)
+
+
+def test_measured_sweeps_are_judged_as_their_raw_torque_is():
+    """The sample carries 0.4 to 1.8 % of the raw torque at the end of these sweeps; elsewhere it carries it all."""
+    s = read_sweep(LIONS_MANE)
+    found = of_data(s)
+    assert found.onset == pytest.approx(79.4327, rel=1e-4)
+    folder = SHARED / "data" / "rheology" / "pyrheo"
+    if not folder.is_dir():
+        pytest.skip("the measured sweeps of others are not here")
+    for file in sorted(folder.glob("osc*.csv")):
+        assert of_data(read_sweep(file)).onset is None, file.name
+
+
+def test_structured_residuals_are_called_so():
+    x = np.linspace(0, 1, 30)
+    numbers, told = consistency.structure(x, np.sin(6 * x), np.random.default_rng(0).standard_normal(30))
+    assert "structured misfit" in told[0] and "storage_modulus" in told[0] and "loss_modulus" not in told[0]
+    assert numbers["storage_modulus"]["runs"] == 2 and numbers["loss_modulus"]["probability"] > 0.01
+
+
+def two_modes(noise: float, omega: np.ndarray = OMEGA) -> Sweep:
+    x = 1j * omega[:, None] * np.array([1.0, 0.05])
+    G = 300 + (np.array([200.0, 300.0]) * x / (1 + x)).sum(axis=1)
+    factor = 1 + noise * np.random.default_rng(0).standard_normal((2, len(omega)))
+    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+
+
+def test_changes_are_those_of_a_fit_to_the_points_left():
+    s = two_modes(0.02)
+    f = viscoelastic.closed_form(s, 2)
+    changes = edges.sensitivity(f, s)
+    # A fresh fit to a file without the points: another program, other starts.
+    last = viscoelastic.closed_form(some(s, s.angular_frequency < 100 / np.sqrt(10) * 0.999), 2)
+    expected = last.uncertainty.values - f.uncertainty.values
+    found = [changes["without_last_half_decade"][name] for name in f.uncertainty.names]
+    assert np.allclose(found, expected, atol=1e-4 * f.uncertainty.standard_errors)
+    assert np.abs(found).max() > 0
+
+
+def test_exact_data_are_moved_by_no_end():
+    s = two_modes(0.0)
+    f = edges.honest(viscoelastic.closed_form(s, 2), s, generalised_maxwell.spectrum(s))
+    for changes in f.details["band_sensitivity"].values():
+        assert max(abs(c) for c in changes.values()) < 1e-6 * 800
+    assert not edges.moved(f) and not any("half decade" in w or "structured" in w for w in f.warnings)
+
+
+def test_springpots_are_compared_too():
+    G = 300 + 100 * (1j * OMEGA) ** 0.4
+    s = Sweep(OMEGA, G.real, G.imag)
+    f = next(f for f in models.fractional(s) if f.kind.name == "fractional_kelvin_voigt")
+    for changes in edges.sensitivity(f, s).values():
+        assert list(changes) == ["equilibrium_modulus", "springpot", "exponent"]
+        assert np.allclose(list(changes.values()), 0, atol=1e-4)
+
+
+def test_the_front_page_says_that_its_ends_decide(tmp_path, capsys):
+    code = main([str(LIONS_MANE), "--method", "closed-form", "--modes", "3", "--out", str(tmp_path)])
+    out = capsys.readouterr().out
+    content = json.loads((tmp_path / "fit.json").read_text())
+    changes = content["band_sensitivity"]["without_last_half_decade"]
+    assert code == 0 and set(changes) == set(content["standard_errors"])
+    assert len(changes["ratios"]) == 3 and len(changes["relaxation_times"]) == 3
+    assert abs(changes["shear_modulus"]) > content["standard_errors"]["shear_modulus"]
+    assert "Pa *" in out and "without the first or the last half decade" in out
+    words = ("mark of the instrument", "Kramers-Kronig", "structured misfit", "so the ends of the band decide them")
+    assert all(any(w in sentence for sentence in content["warnings"]) for w in words)
+
+
+def test_points_outside_the_limits_are_left_out_and_said():
+    s = read_sweep(LIONS_MANE)
+    kept = within(s, 0.02, 12.65)
+    assert kept.angular_frequency[0] > 0.1257 and kept.angular_frequency[-1] == pytest.approx(79.4327)
+    assert "left out as asked for" in kept.notes[-1] and len(kept.storage_sd) == len(kept.storage)
+    assert within(s, None, None) is s and within(s, None, 1e9) is s
+    for low, high, sentence in (
+        (None, 0.01, r"leave 0 of 31 points .*leave 3 or more"),
+        (None, -1.0, "--max-frequency -1 is no frequency"),
+        (float("nan"), None, "--min-frequency nan is no frequency"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            within(s, low, high)

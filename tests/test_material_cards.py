@@ -1,0 +1,102 @@
+"""Material cards, read back as the program reads them: the moduli are those of the model."""
+
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from fitting.__main__ import main
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.reports import material_cards
+
+OMEGA = np.geomspace(0.01, 100, 9)
+SOLID = Maxwell(np.array(770.0), np.array([0.235, 0.333]), np.array([0.27, 0.03]))
+FLUID = Maxwell(np.array(770.0), np.array([0.6, 0.4]), np.array([0.27, 0.03]))
+MANY = Maxwell(np.array(1e4), np.full(7, 0.1), np.geomspace(100, 1e-3, 7))
+
+
+def complex_modulus(rest, strengths, times, omega=OMEGA):
+    """Of what stays [Pa] and modes [Pa, s]: the sum over the elements, nothing of the project."""
+    s = 1j * omega[:, None] * np.asarray(times)
+    return rest + (np.asarray(strengths) * s / (1 + s)).sum(axis=1)
+
+
+def exact(model):
+    G0, g, tau = (np.asarray(v) for v in model)
+    return complex_modulus(G0 * (1 - g.sum()), G0 * g, tau)
+
+
+def from_febio(text):
+    """Stress = integral of G(t - s) dS_elastic/ds with G(t) = g0 + sum g_i exp(-t / t_i) (FEBio theory manual, 5.3)."""
+    material = ET.fromstring(text.split("?>", 1)[1]).find("Material/material")
+    terms = {e.tag: float(e.text) for e in material if e.tag != "elastic"}
+    shear = float(material.find("elastic/E").text) / (2 * (1 + float(material.find("elastic/v").text)))
+    n = len([t for t in terms if t.startswith("t")])
+    strengths, times = ([terms[f"{c}{k}"] for k in range(1, n + 1)] for c in "gt")
+    return complex_modulus(shear * terms["g0"], shear * np.array(strengths), times)
+
+
+def from_abaqus(text):
+    """G0 = 2 C10, K0 = 2 / D1; g, k, tau a line (Abaqus Analysis User's Guide, time domain viscoelasticity)."""
+    keyword, rows = "", {}
+    for line in text.splitlines():
+        if line.startswith("*") and not line.startswith("**"):
+            keyword = line.split(",")[0]
+        elif keyword and not line.startswith("**") and line.strip():
+            rows.setdefault(keyword, []).append([float(v) for v in line.split(",")])
+    C10, D1 = rows["*HYPERELASTIC"][0]
+    g, k, tau = np.array(rows["*VISCOELASTIC"]).T
+    assert np.array_equal(g, k) and g.sum() < 1 and "MODULI=INSTANTANEOUS" in text
+    assert 3 * (2 / D1) / (2 * 2 * C10) > 20  # nearly incompressible
+    return complex_modulus(2 * C10 * (1 - g.sum()), 2 * C10 * g, tau)
+
+
+def from_ansys(text):
+    """mu, d of TB,HYPER,,,,NEO and pairs a_i, t_i of TB,PRONY (Ansys material reference)."""
+    tables, now = {}, ""
+    for line in text.splitlines():
+        cells = line.split(",")
+        if cells[0] == "TB":
+            now = cells[1] + (cells[5] if cells[1] == "PRONY" else "")
+            tables[now] = {}
+            if cells[1] == "PRONY":
+                tables[now]["terms"] = int(cells[4])
+        elif cells[0] == "TBDATA":
+            assert len(cells) <= 8  # six numbers a line
+            tables[now] |= {int(cells[1]) + k: float(v) for k, v in enumerate(cells[2:])}
+    assert tables["PRONYSHEAR"] == tables["PRONYBULK"]
+    n, shear = tables["PRONYSHEAR"]["terms"], tables["HYPER"][1]
+    a, tau = (np.array([tables["PRONYSHEAR"][2 * k + j] for k in range(n)]) for j in (1, 2))
+    return complex_modulus(shear * (1 - a.sum()), shear * a, tau)
+
+
+@pytest.mark.parametrize("model", [SOLID, FLUID, MANY], ids=["solid", "fluid", "many modes"])
+def test_cards_read_back_are_the_model(model, tmp_path):
+    told = material_cards.write(tmp_path, model)
+    readers = {"febio.feb": from_febio, "abaqus.inp": from_abaqus, "ansys.inp": from_ansys}
+    for name, reader in readers.items():
+        if name == "febio.feb" and len(model.ratios) > 6:
+            assert not (tmp_path / name).exists() and "FEBio holds 6 modes" in told[0]
+            continue
+        # Ten digits; of a fluid Abaqus keeps a millionth of G0.
+        off = np.abs(reader((tmp_path / name).read_text()) - exact(model))
+        assert np.all(off <= 1e-8 * np.abs(exact(model)) + 2e-6 * float(model.shear_modulus) * (model is FLUID)), name
+    assert any("fluid" in t for t in told) == (model is FLUID)
+
+
+def test_the_card_of_sofa_is_the_equilibrium(tmp_path):
+    field = ET.fromstring("<s>" + material_cards.sofa(SOLID) + "</s>")[0]
+    mu, bulk = (float(v) for v in field.get("ParameterSet").split())
+    assert mu == pytest.approx(770 * (1 - 0.568)) and bulk > 20 * mu and field.get("materialName") == "NeoHookean"
+    numbers = re.search(r"each mode: (.*) -->", material_cards.sofa(SOLID))[1]
+    assert numbers == "0.235 0.27; 0.333 0.03"
+
+
+def test_the_command_writes_them(tmp_path, capsys):
+    file = ROOT / "data" / "porcine_liver_frequency_sweep.csv"
+    assert main([str(file), "--method", "closed-form", "--modes", "2", "--cards", "--out", str(tmp_path)]) == 0
+    assert "/cards" in capsys.readouterr().out
+    found = from_abaqus((tmp_path / "cards" / "abaqus.inp").read_text())
+    assert np.allclose(found, exact(SOLID), rtol=1e-4)

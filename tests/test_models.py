@@ -1,0 +1,277 @@
+"""Models beyond Prony modes: springpots, a spectrum on a grid, fluids; their choice and their conversion to modes."""
+
+import json
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+import scipy.optimize
+from conftest import ROOT, SHARED
+
+from fitting.__main__ import main
+from fitting.fits import models, viscoelastic
+from fitting.methods import conversion, generalised_maxwell, relaxation_spectrum, springpots
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.rheometer import Sweep, read_sweep
+from liverjax import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+OMEGA = np.geomspace(0.1, 100, 16)
+CASES = {model.name: model for model in springpots.FRACTIONAL}
+#: The models as the literature writes them, of the numbers that are reported.
+FORMULAS = {
+    "springpot": lambda iw, v, a: v * iw**a,
+    "fractional_kelvin_voigt": lambda iw, e, v, a: e + v * iw**a,
+    "fractional_zener": lambda iw, e, m, tau, a: e + m * (iw * tau) ** a / (1 + (iw * tau) ** a),
+    "fractional_maxwell": lambda iw, v, a, w, b: v * iw**a * w * iw**b / (v * iw**a + w * iw**b),
+    "fractional_parallel": lambda iw, w, b, v, a: v * iw**a + w * iw**b,
+}
+TRUTHS = {
+    "springpot": (700.0, 0.3),
+    "fractional_kelvin_voigt": (300.0, 100.0, 0.45),
+    "fractional_zener": (300.0, 900.0, 0.05, 0.6),
+    "fractional_maxwell": (900.0, 0.9, 400.0, 0.2),
+    "fractional_parallel": (400.0, 0.1, 30.0, 0.8),
+}
+
+
+def fractional_sweep(name: str, noise: float = 0.0, seed: int = 0, omega: np.ndarray = OMEGA) -> Sweep:
+    G = FORMULAS[name](1j * omega, *TRUTHS[name])
+    factor = 1 + noise * np.random.default_rng(seed).standard_normal((2, len(omega)))
+    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+
+
+def prony_moduli(model: Maxwell, omega: np.ndarray) -> np.ndarray:
+    x = 1j * omega[:, None] * np.asarray(model.relaxation_times)
+    rest = 1 - np.sum(model.ratios)
+    return np.asarray(model.shear_modulus) * (rest + (np.asarray(model.ratios) * x / (1 + x)).sum(axis=1))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_reported_numbers_are_those_of_the_formula_of_the_literature(name):
+    model, rng = CASES[name], np.random.default_rng(1)
+    for reference in (1.0, 30.0):
+        u = jnp.asarray(rng.uniform(-1, 1, springpots.SIZE))
+        ours = np.asarray(springpots.modulus(u, model.switches, OMEGA / reference))
+        values = [mpmath.mpf(float(v)) for v in model.values(u, reference)]
+        theirs = [complex(FORMULAS[name](mpmath.mpc(0, w), *values)) for w in OMEGA]
+        assert np.allclose(ours, theirs, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def fractional_fits():
+    """Every model fitted to the data of every model, without noise."""
+    return {name: models.fractional(fractional_sweep(name)) for name in CASES}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_noise_free_springpots_are_recovered_and_chosen(fractional_fits, name):
+    fits = {f.kind.name: f for f in fractional_fits[name]}
+    assert np.allclose(fits[name].parameters.values, TRUTHS[name], rtol=1e-5)
+    able = [f for f in fits.values() if models.identifiable(f, fractional_sweep(name))]
+    assert min(able, key=viscoelastic.information_criterion).kind.name == name
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_conversions_stay_within_a_percent_of_the_formula(fractional_fits, name):
+    f = next(f for f in fractional_fits[name] if f.kind.name == name)
+    stated = f.details["conversion"]["largest_relative_error"]
+    fine = np.geomspace(OMEGA[0], OMEGA[-1], 487)  # five times finer than where it was matched
+    G, ours = FORMULAS[name](1j * fine, *TRUTHS[name]), prony_moduli(f.model, fine)
+    found = max(np.abs(ours.real / G.real - 1).max(), np.abs(ours.imag / G.imag - 1).max())
+    assert stated < conversion.ALLOWED and found < 1.02 * stated + 1e-5  # between points it may be a little more
+    if name in ("springpot", "fractional_maxwell", "fractional_parallel"):  # fluids: nothing stays
+        assert np.isclose(f.model.ratios.sum(), 1, rtol=1e-12)
+
+
+def test_converted_modes_relax_as_the_mittag_leffler_function(fractional_fits):
+    """In time, where nothing was matched: the fractional Zener solid relaxes as E_a(-(t/tau)^a), summed by mpmath."""
+    f = next(f for f in fractional_fits["fractional_zener"] if f.kind.name == "fractional_zener")
+    e, m, tau, a = TRUTHS["fractional_zener"]
+
+    def mittag_leffler(z):
+        with mpmath.workdps(60):
+            return float(mpmath.nsum(lambda k: z**k / mpmath.gamma(a * k + 1), [0, mpmath.inf], method="d"))
+
+    for t in (0.03, 0.1, 0.3, 1.0):  # inside 1/100 to 1/0.1 s, away from the ends
+        exact = e + m * mittag_leffler(-(mpmath.mpf(t / tau) ** a))
+        G0, g, times = f.model
+        ours = float(G0 * (1 - np.sum(g * (1 - np.exp(-t / times)))))
+        assert abs(ours / exact - 1) < conversion.ALLOWED, t
+
+
+def scipy_best(s: Sweep, name: str, count: int, seed: int = 0) -> float:
+    """Lowest cost of SciPy's least squares from random starts, with the formula of the literature."""
+    rng, scales = np.random.default_rng(seed), np.concatenate(s.deviations)
+    size, best = np.log(s.storage.max()), np.inf
+    exponents = np.array(["exponent" in n for n in CASES[name].names])
+    middle = -0.5 * np.log(s.angular_frequency[0] * s.angular_frequency[-1])
+    spread = 0.5 * np.log(s.angular_frequency[-1] / s.angular_frequency[0]) + 1
+
+    def residuals(q):
+        p = np.where(exponents, 1 / (1 + np.exp(-q)), np.exp(np.clip(q, -200, 200)))
+        G = FORMULAS[name](1j * s.angular_frequency, *p)
+        r = (np.concatenate([G.real, G.imag]) - np.concatenate([s.storage, s.loss])) / scales
+        return np.where(np.isfinite(r), r, 1e6)
+
+    for _ in range(count):
+        q = rng.uniform(size - 3, size + 2, len(exponents))
+        q[exponents] = rng.uniform(-3, 3, exponents.sum())
+        for k, n in enumerate(CASES[name].names):
+            if n == "relaxation_time":
+                q[k] = middle + rng.uniform(-spread, spread)
+            elif "springpot" in n:  # a pot as stiff as the data somewhere in the band
+                alpha = 1 / (1 + np.exp(-q[k + 1]))
+                q[k] += alpha * (middle + rng.uniform(-spread, spread))
+        try:
+            best = min(best, scipy.optimize.least_squares(residuals, q, x_scale="jac", max_nfev=200).cost)
+        except np.linalg.LinAlgError:
+            continue
+    return best
+
+
+GIVEN = {"lion's mane": "lions_mane_frequency_sweep.csv", "porcine liver": "porcine_liver_frequency_sweep.csv"}
+
+
+@pytest.mark.parametrize("data", GIVEN)
+def test_no_fractional_fit_is_worse_than_scipy_from_random_starts(data):
+    s = read_sweep(ROOT / "data" / GIVEN[data])
+    with np.errstate(all="ignore"):
+        for f in models.fractional(s):
+            # The exchange of the two pots is no other model: SciPy may take the larger exponent for either.
+            assert float(f.solution.cost) <= scipy_best(s, f.kind.name, 20) * (1 + 1e-6), f.kind.name
+
+
+@pytest.mark.slow
+def test_every_given_sweep_is_fitted_no_worse_than_by_scipy_from_100_starts():
+    files = sorted((SHARED / "data" / "rheology" / "pyrheo").glob("osc*.csv"))
+    files += sorted((SHARED / "data" / "lions_mane").glob("*.csv"))
+    if not files:
+        pytest.skip("the measured sweeps are not here")
+    for file in files:
+        s = read_sweep(file)
+        with np.errstate(all="ignore"):
+            for f in models.fractional(s):
+                best = scipy_best(s, f.kind.name, 100)
+                assert float(f.solution.cost) <= best * (1 + 1e-6), (file.name, f.kind.name)
+
+
+def box_spectrum(omega: np.ndarray, low: float, high: float, noise: float = 0.0) -> Sweep:
+    """H = 100 Pa an e-fold between two times, and 50 Pa that stay: moduli known exactly (Tobolsky's box)."""
+    storage = 50 + 50 * np.log((1 + (omega * high) ** 2) / (1 + (omega * low) ** 2))
+    loss = 100 * (np.arctan(omega * high) - np.arctan(omega * low))
+    factor = 1 + noise * np.random.default_rng(0).standard_normal((2, len(omega)))
+    return Sweep(omega, storage * factor[0], loss * factor[1])
+
+
+def test_a_box_spectrum_is_found_inside_the_box():
+    s = box_spectrum(np.geomspace(1e-3, 1e3, 61), 1e-2, 1e2, 0.01)
+    found = relaxation_spectrum.fit(s)
+    step = np.log(10) / found.per_decade
+    inside = (found.times > 0.1) & (found.times < 10)
+    assert inside.sum() >= 2 * found.per_decade - 1
+    # 1 % noise in moduli, and smoothing over two steps of the grid: the level of 100 Pa to a tenth.
+    assert np.allclose(found.strengths[inside], 100 * step, rtol=0.1)
+    assert found.strengths[(found.times > 1e3) | (found.times < 1e-3)].sum() < 0.05 * found.strengths.sum()
+    assert 3 < found.decades <= 6 and found.effective < len(s.storage) / 2
+
+
+def test_no_start_of_scipy_is_below_the_spectrum():
+    s = read_sweep(ROOT / "data" / GIVEN["lion's mane"])
+    found = relaxation_spectrum.fit(s)
+    scales, data = np.concatenate(s.deviations), np.concatenate([s.storage, s.loss])
+    A = relaxation_spectrum.columns(s.angular_frequency, found.times) / scales[:, None]
+    A, b = np.vstack([A, found.prior]), np.concatenate([data / scales, np.zeros(len(found.prior))])
+    ours = 0.5 * np.sum((A @ np.concatenate([[found.equilibrium], found.strengths]) - b) ** 2)
+    rng = np.random.default_rng(0)
+    for _ in range(10):  # from anywhere, to the same minimum: the problem is convex
+        start = rng.uniform(0, 2 * s.storage.max(), A.shape[1])
+        bounded = scipy.optimize.least_squares(
+            lambda x: A @ x - b, start, lambda x: A, bounds=(0, np.inf), x_scale="jac"
+        )
+        assert ours <= bounded.cost * (1 + 1e-9)
+
+
+def test_a_spectrum_has_as_many_parameters_as_the_data_give_it():
+    s = box_spectrum(np.geomspace(1e-2, 1e2, 41), 1e-3, 1e3, 0.02)
+    stiff, free = (relaxation_spectrum.at(s, 3, w) for w in (1e4, 1e-6))
+    assert stiff.effective < 4 < free.effective and stiff.decades > free.decades
+
+
+def maxwell_fluid(noise: float) -> Sweep:
+    omega = np.geomspace(0.1, 40, 31)
+    G = 400 * 1j * omega * 5 / (1 + 1j * omega * 5) + 600 * 1j * omega * 0.05 / (1 + 1j * omega * 0.05)
+    factor = 1 + noise * np.random.default_rng(0).standard_normal((2, len(omega)))
+    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+
+
+def test_a_fluid_is_recovered_without_an_equilibrium_modulus():
+    s = maxwell_fluid(0.02)
+    f = models.fluid(s, generalised_maxwell.spectrum(s))
+    assert f.modes == 2 and f.kind.name == "prony_fluid" and float(f.model.ratios.sum()) == pytest.approx(1, abs=1e-14)
+    truth = np.array([1000, 0.4, 0.6, 5, 0.05])
+    assert np.all(np.abs(f.uncertainty.values - truth) < 3 * f.uncertainty.standard_errors)
+    assert not any("equilibrium" in w for w in f.warnings)
+
+
+def automatic(s: Sweep) -> viscoelastic.Fit:
+    dense = generalised_maxwell.spectrum(s)
+    return models.choose(s, "auto", viscoelastic.choose_modes(s, dense)[0], dense)
+
+
+@pytest.mark.slow
+def test_auto_takes_the_model_that_made_the_data():
+    fluid = automatic(maxwell_fluid(0.02))
+    assert fluid.kind.name == "prony_fluid"
+    rows = fluid.details["models_compared"]
+    assert rows[0]["above_the_lowest"] == 0 and {"prony", "spectrum", "springpot"} <= {r["model"] for r in rows}
+    zener = automatic(fractional_sweep("fractional_zener", 0.02, 1, np.geomspace(0.1, 40, 31)))
+    assert zener.kind.name == "fractional_zener" and zener.details["conversion"]["largest_relative_error"] < 0.01
+
+
+@pytest.mark.parametrize("model", ["fractional", "spectrum"])
+def test_the_command_writes_the_model(model, tmp_path, capsys):
+    file = ROOT / "data" / GIVEN["porcine liver"]
+    assert main([str(file), "--method", "closed-form", "--model", model, "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    out = capsys.readouterr().out
+    assert content["model"] == {"fractional": "fractional_zener", "spectrum": "spectrum"}[model]
+    assert content["modes"] == len(content["ratios"]) == len(content["relaxation_times"])
+    assert content["details"]["conversion"]["largest_relative_error"] < 0.01
+    assert content["parameters"]["equilibrium_modulus"]["unit"] == "Pa"
+    assert content["standard_errors"]["relaxation_times"] == [None] * content["modes"]  # chosen, not measured
+    assert ("criterion" in out) == (model == "fractional") and "Prony modes" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--model", "spectrum", "--modes", "3"], "--modes 3 is of --model prony: leave it out"),
+        (["--model", "auto", "--profile"], "--profile is of --model prony"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options, sentence, tmp_path, capsys):
+    file = ROOT / "data" / GIVEN["porcine liver"]
+    assert main([str(file), *options, "--out", str(tmp_path)]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_fractional_model_goes_through_the_torsion_simulation():
+    s = fractional_sweep("fractional_zener", omega=np.geomspace(0.5, 30, 7))
+    closed = next(f for f in models.fractional(s) if f.kind.name == "fractional_zener")
+    f = viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004))
+    # Of the fit: the conversion (below 1 %) and 50 steps a cycle (0.15 %).
+    assert f.converged and np.allclose(f.parameters.values, TRUTHS["fractional_zener"], rtol=0.05)
+    assert np.max(f.relative_errors(s)) < 0.01
+
+
+def test_a_sweep_of_no_maxwell_solid_is_refused_for_every_model(tmp_path, capsys):
+    file = tmp_path / "sweep.csv"
+    file.write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n0.1,30,300\n1,60,400\n10,90,500\n")
+    assert main([str(file), "--model", "auto", "--out", str(tmp_path / "fit")]) == 2
+    assert "are the two columns exchanged" in capsys.readouterr().err
+    with pytest.raises(InputError):
+        generalised_maxwell.refuse_impossible(read_sweep(file))

@@ -1,0 +1,83 @@
+"""The instrument's inertia from raw torque: synthetic instruments, and measured files whose inertia is known."""
+
+import re
+
+import numpy as np
+import pytest
+from conftest import SHARED
+
+from fitting.readers.rheometer import read_sweep, without_inertia
+from liverjax import InputError
+
+RADIUS, HEIGHT, INERTIA = 0.005, 0.002, 25e-6
+K = np.pi * RADIUS**4 / (2 * HEIGHT)
+OMEGA = np.geomspace(1, 200, 20)
+G = 5000 * (1j * OMEGA) ** 0.1
+
+
+def export(path, inertia=INERTIA, sample=True, phase=True, theta=1e-3):
+    """A synthetic export as TRIOS writes it; the equation of motion of a plate is the witness."""
+    M = (K * G - inertia * OMEGA**2) * theta
+    columns = {
+        ("Angular frequency", "rad/s"): OMEGA,
+        ("Torque", "µN.m"): 0 * OMEGA - 80.0,  # another torque, of the whole step
+        ("Raw phase", "°"): np.degrees(np.angle(M)),
+        ("Oscillation torque", "µN.m"): 1e6 * np.abs(M),
+        ("Oscillation displacement", "rad"): 0 * OMEGA + theta,
+        ("Oscillation torque (sample)", "µN.m"): 1e6 * K * np.abs(G) * theta,
+        ("Storage modulus", "Pa"): G.real,
+        ("Loss modulus", "Pa"): G.imag,
+    }
+    left = [key for key in columns if (sample or "sample" not in key[0]) and (phase or "phase" not in key[0])]
+    lines = ["[step]", "Frequency sweep - 1", "\t".join(k[0] for k in left), "\t".join(k[1] for k in left)]
+    lines += ["\t".join(f"{v:.12g}" for v in row) for row in zip(*(columns[k] for k in left), strict=True)]
+    path.write_text("\n".join(lines) + "\n")
+    return read_sweep(path)
+
+
+@pytest.mark.parametrize("phase", [True, False])
+@pytest.mark.parametrize("sample", [True, False])
+def test_the_inertia_is_found_and_the_points_below_it_left_out(sample, phase, tmp_path):
+    s = export(tmp_path / "e.txt", sample=sample, phase=phase)
+    size = () if sample else (RADIUS, HEIGHT)
+    kept = without_inertia(s, *size)
+    found = float(re.search(r"inertia of ([\d.]+) uN", kept.notes[0])[1])
+    assert found == pytest.approx(25.0, rel=1e-3)
+    lost = np.abs(G) < 0.03 * INERTIA * OMEGA**2 / K
+    assert 0 < lost.sum() < 10 and np.allclose(kept.angular_frequency, OMEGA[~lost])
+    assert np.allclose(kept.grey[:, 0], OMEGA[lost]) and np.allclose(kept.grey[:, 1], G.real[lost])
+    assert f"{lost.sum()} of 20 points" in kept.notes[1]
+
+
+def test_what_is_not_told_changes_nothing(tmp_path):
+    s = export(tmp_path / "a.txt", sample=False)
+    assert without_inertia(s) is s  # neither the torque of the sample nor its size
+    light = export(tmp_path / "b.txt", inertia=1e-12)
+    assert without_inertia(light).grey is None and len(without_inertia(light).storage) == 20
+
+
+def test_a_sweep_of_nothing_but_the_instrument_is_refused(tmp_path):
+    with pytest.raises(InputError, match="nearly all of the sweep is the instrument's"):
+        without_inertia(export(tmp_path / "e.txt", inertia=1.0))
+
+
+def test_ten_measured_sweeps_have_one_inertia():
+    files = sorted((SHARED / "data" / "lions_mane").glob("*.csv"))
+    if not files:
+        pytest.skip("the raw sweeps are not here")
+    for file in files:
+        gap = float(re.search(r"gap after preload ([\d.]+) um", file.read_text())[1]) * 1e-6
+        s = without_inertia(read_sweep(file), 0.004, gap)
+        # 22.47 uN m s^2 in all ten, and 2 to 5 points of 31 that are the instrument's
+        assert float(re.search(r"inertia of ([\d.]+) uN", s.notes[0])[1]) == pytest.approx(22.47, abs=0.02)
+        assert 2 <= len(s.grey) <= 5
+
+
+def test_a_sweep_whose_raw_phase_nears_180_degrees_loses_those_points():
+    file = SHARED / "data" / "rheology" / "rheojax" / "multi_technique.txt"
+    if not file.is_file():
+        pytest.skip("the measured export is not here")
+    s = read_sweep(file)
+    kept = without_inertia(s)
+    assert "instrument inertia of 24" in " ".join(kept.notes)
+    assert kept.grey is None or kept.grey[:, 0].min() > 100

@@ -1,0 +1,236 @@
+"""Relaxation and creep: exact convolution, files, recovery of what another program computed, measured pairs."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from conftest import SHARED
+
+from fitting.__main__ import main
+from fitting.fits import time_tests as fits
+from fitting.methods import time_response
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.time_tests import Sample, read
+from liverjax import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+SOLID = Maxwell(jnp.array(900.0), jnp.array([0.3, 0.4]), jnp.array([5.0, 0.2]))
+FLUID = Maxwell(jnp.array(900.0), jnp.array([0.35, 0.65]), jnp.array([5.0, 0.2]))
+
+
+def relaxation(model, t):
+    G0, g, tau = (np.asarray(v) for v in model)
+    return G0 * (1 - g.sum()) + G0 * np.sum(g * np.exp(-np.asarray(t)[..., None] / tau), axis=-1)
+
+
+@pytest.mark.parametrize("model", [SOLID, FLUID], ids=["solid", "fluid"])
+def test_stress_is_the_convolution_of_quadrature(model):
+    time = np.array([0.0, 0.1, 0.5, 0.6, 3.0, 20.0])
+    strain = np.array([0.01, 0.05, 0.05, -0.02, 0.04, 0.04])  # begins with a jump
+    found = np.asarray(time_response.stress(model, time, strain))
+    for k, t in enumerate(time):
+        exact = strain[0] * relaxation(model, t)
+        for j in range(k):
+            slope = (strain[j + 1] - strain[j]) / (time[j + 1] - time[j])
+            part = scipy.integrate.quad(lambda s, t=t: relaxation(model, t - s), time[j], time[j + 1], epsabs=1e-13)
+            exact += slope * part[0]
+        assert np.isclose(found[k], exact, rtol=1e-10)
+
+
+@pytest.mark.parametrize("model", [SOLID, FLUID], ids=["solid", "fluid"])
+def test_creep_and_relaxation_are_of_one_material(model):
+    """Their convolution is the time itself: the integral of G(t - s) J(s) from 0 to t is t, for every t."""
+    for t in (0.05, 1.0, 30.0):
+        product = scipy.integrate.quad(
+            lambda s, t=t: float(relaxation(model, t - s) * time_response.creep_compliance(model, np.array([s]))[0]),
+            0,
+            t,
+            points=[t - min(t, 1.0) * 0.5],
+            epsrel=1e-9,
+        )[0]
+        assert np.isclose(product, t, rtol=1e-7)
+
+
+def test_creep_of_one_mode_is_the_textbook_one():
+    G0, g, tau = 900.0, 0.4, 0.2
+    one = Maxwell(jnp.array(G0), jnp.array([g]), jnp.array([tau]))
+    t = np.geomspace(1e-3, 10, 20)
+    rest = G0 * (1 - g)
+    exact = 1 / rest - (1 / rest - 1 / G0) * np.exp(-t * (1 - g) / tau)
+    assert np.allclose(time_response.creep_compliance(one, t), exact, rtol=1e-12)
+    flows = Maxwell(jnp.array(G0), jnp.array([1.0]), jnp.array([tau]))
+    assert np.allclose(time_response.creep_compliance(flows, t), (1 + t / tau) / G0, rtol=1e-12)
+
+
+def test_strain_of_a_driven_stress_is_that_of_steps_added_up():
+    time = np.linspace(0, 4, 9)
+    stress = np.interp(time, [0, 1, 2.5, 4], [20.0, 80.0, 80.0, 10.0])
+    found = np.asarray(time_response.strain(SOLID, time, stress))
+    fine = np.linspace(0, 4, 4001)
+    middle = 0.5 * (fine[1:] + fine[:-1])  # many small steps at the middle of each interval: second order
+    rises = np.diff(np.interp(fine, time, stress))
+    for k, t in enumerate(time):
+        past = middle < t
+        J = time_response.creep_compliance(SOLID, t - middle[past])
+        exact = stress[0] * time_response.creep_compliance(SOLID, np.array([t]))[0] + J @ rises[past]
+        assert np.isclose(found[k], exact, rtol=1e-6)
+
+
+def driven(model, time, value, kind):
+    """The answer by SciPy's solver of differential equations: dashpots, no convolution and no recursion."""
+    G0, g, tau = (np.asarray(v) for v in model)
+    rest = 1 - g.sum()
+
+    def rate(t, v):
+        now = np.interp(t, time, value)
+        strain = now if kind == "relaxation" else (now / G0 + g @ v) / (rest + g.sum())
+        return (strain - v) / tau
+
+    v = scipy.integrate.solve_ivp(
+        rate, (time[0], time[-1]), np.zeros(len(g)), "Radau", time, rtol=1e-9, atol=1e-13, max_step=0.05
+    ).y
+    if kind == "relaxation":
+        return G0 * (value - g @ v)
+    return value / G0 + g @ v
+
+
+def write(path, header, *columns):
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_what_an_ode_solver_computed_is_recovered_from_the_file(kind, tmp_path):
+    time = np.concatenate([[0.0], np.geomspace(0.02, 40, 80)])
+    value = np.interp(time, [0, 0.3], [0.0, 0.02 if kind == "relaxation" else 15.0])  # a ramp of 0.3 s
+    exact = np.linspace(0, 0.3, 16)[1:-1]
+    time = np.unique(np.concatenate([time, exact, [0.3]]))
+    value = np.interp(time, [0, 0.3], [0.0, value.max()])
+    answer = driven(SOLID, time, value, kind)
+    header, columns = "time_s,strain,stress_Pa", (value, answer) if kind == "relaxation" else (answer, value)
+    test = read(write(tmp_path / "t.csv", header, time, *columns), kind)
+    f = fits.fit(test, 2)
+    assert f.converged and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
+    # Taken for a step, the ramp cannot be followed.
+    step = fits.fit(test._replace(driven=np.full(len(test.time), test.driven.max()), used=test.time > 0.02), 2)
+    assert step.relative_errors.mean() > 0.01 > 1e3 * f.relative_errors.mean()
+
+
+def test_a_fluid_is_told_from_a_solid(tmp_path):
+    t, rng = np.geomspace(0.02, 60, 60), np.random.default_rng(0)
+    solid, fluid = (relaxation(m, t) * (1 + 0.01 * rng.standard_normal(60)) for m in (SOLID, FLUID))
+    for G, name, truth in ((solid, "prony", SOLID), (fluid, "prony_fluid", FLUID)):
+        file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, G)
+        assert main(["relaxation", str(file), "--modes", "2", "--out", str(tmp_path / name)]) == 0
+        content = json.loads((tmp_path / name / "fit.json").read_text())
+        assert content["model"] == name and content["modes"] == 2 and (tmp_path / name / "fit.png").is_file()
+        for key, values in (("ratios", truth.ratios), ("relaxation_times", truth.relaxation_times)):
+            off = np.abs(np.array(content[key]) - np.asarray(values))
+            assert np.all(off < 4 * np.array(content["standard_errors"][key]))
+
+
+def test_a_ramp_that_no_column_has_is_an_option(tmp_path):
+    t = np.concatenate([np.geomspace(0.1, 40, 60)])
+    fine = np.unique(np.concatenate([np.linspace(0, 1, 400), t]))
+    stress = driven(SOLID, fine, np.minimum(fine, 1.0), "relaxation")
+    modulus = stress[np.searchsorted(fine, t)]
+    file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, modulus)
+    f = fits.fit(read(file, "relaxation", ramp=1.0, start=0.1), 2)
+    assert np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
+
+
+T = np.geomspace(0.1, 10, 12)
+
+
+def test_units_and_forms(tmp_path):
+    G = relaxation(SOLID, T)
+    file = write(tmp_path / "a.csv", "Time (min),Relaxation Modulus (kPa)", T / 60, G / 1e3)
+    a = read(file, "relaxation")
+    assert np.allclose(a.time[1:], T) and np.allclose(a.answer[1:], G) and np.all(a.driven == 1) and a.notes == ()
+    r, h, strain = 0.01, 0.004, 0.02
+    file = write(tmp_path / "b.csv", "time_s,angle_mrad,torque_uN.m", T, 0 * T + 1e3 * strain * h / r, G * strain * 1e6)
+    b = read(file, "relaxation", Sample(r, h))
+    # G = 2 M h / (pi r^4 theta), the formula of the rheometer's guide
+    modulus = 2 * G * strain * h / (np.pi * r**4 * strain * h / r)
+    assert np.allclose(b.answer[1:] / b.driven[1:], modulus)
+    file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.1, -G)
+    c = read(file, "relaxation", Sample(r, h))
+    assert np.allclose(c.answer[1:] / c.driven[1:], G * 1e-3 / (np.pi * r**2) / (0.1e-3 / h) / 3)
+    assert "G = E / 3" in c.notes[0]
+    text = "Result:\tStep strain\nPoint No.\tTime\tShear Strain\tShear Stress\n\t\t\t\n\t[s]\t[%]\t[Pa]\n"
+    rows = "".join(f"{k}\t{t:.4f}\t1,0\t{G / 100:.5f}\n".replace(".", ",") for k, (t, G) in enumerate(zip(T, G)))  # noqa: B905
+    (tmp_path / "d.txt").write_bytes((text + rows).encode("utf-16"))
+    d = read(tmp_path / "d.txt", "relaxation")
+    assert np.allclose(d.answer[1:] / d.driven[1:], G, rtol=1e-3) and np.isclose(d.driven[-1], 0.01)
+
+
+ROWS = "0.1,900\n1,700\n10,600\n100,500\n"
+BAD = {
+    "no header": ("1,2\n2,3\n", [], "no header names time_s"),
+    "the other test": ("time_s,creep_compliance_1/Pa\n" + ROWS, [], "a relaxation test needs"),
+    "few rows": ("time_s,relaxation_modulus_Pa\n1,2\n", [], "1 rows of numbers"),
+    "unit": ("time_s,relaxation_modulus [psi]\n" + ROWS, [], "unit 'psi' of modulus is not known"),
+    "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is no number"),
+    "order": ("time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n0.5,6\n2,5\n3,5\n", [], "follows"),
+    "negative": ("time_s,strain,stress_Pa\n0,1,900\n1,1,-700\n2,1,-6\n3,1,-5\n4,1,-5\n", [], "mend the signs"),
+    "no size": ("time_s,angle_rad,torque_N.m\n0,1,9\n1,1,7\n2,1,6\n3,1,6\n", [], "give --radius and --height"),
+    "no strain": ("time_s,strain,stress_Pa\n0,0,9\n1,0,7\n2,0,6\n3,0,5\n", [], "the strain is zero throughout"),
+    "ramp": (
+        "time_s,strain,stress_Pa\n0,1,9\n1,1,7\n2,1,6\n3,1,5\n",
+        ["--ramp", "1"],
+        "--ramp 1 is for a file without",
+    ),
+    "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable answers are left"),
+    "modes": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--modes", "9"], "--modes 9 is out of range"),
+    "radius": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--radius", "4"], "--radius 4 cannot be"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_unusable_files_get_one_sentence(name, tmp_path, capsys):
+    text, options, sentence = BAD[name]
+    (tmp_path / "t.csv").write_text(text)
+    assert main(["relaxation", str(tmp_path / "t.csv"), *options, "--out", str(tmp_path / "out")]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note")]
+    assert len(lines) == 1 and sentence in lines[0], lines
+
+
+def test_missing_files_and_damage_never_leave_a_traceback(tmp_path):
+    with pytest.raises(InputError, match="no such file; give the CSV file of a relaxation or creep test"):
+        read(tmp_path / "none.csv", "creep")
+    rng = np.random.default_rng(0)
+    good = ("time_s,strain,stress_Pa\n" + "".join(f"{t:.4g},0.01,{9 / t:.5g}\n" for t in T)).encode()
+    for _ in range(200):
+        data = bytearray(good)
+        for _ in range(rng.integers(1, 20)):
+            k = int(rng.integers(len(data)))
+            data[k : k + int(rng.integers(0, 4))] = bytes(rng.integers(0, 256, int(rng.integers(0, 4)), dtype=np.uint8))
+        (tmp_path / "t.csv").write_bytes(bytes(data))
+        try:
+            test = read(tmp_path / "t.csv", "relaxation")
+        except InputError as error:
+            assert "\n" not in str(error)
+        else:
+            assert np.all(np.isfinite(test.answer[test.used])) and np.all(np.diff(test.time) > 0)
+
+
+@pytest.mark.slow
+def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
+    folder = SHARED / "data" / "rheology" / "pyrheo"
+    if not folder.is_dir():
+        pytest.skip("the measured tests are not here")
+    creep, relaxed = (
+        read(folder / f"{name}_ps160_data.csv", kind)
+        for name, kind in (("creep", "creep"), ("stressrelaxation", "relaxation"))
+    )
+    f = fits.fit(creep)
+    assert f.kind.name == "prony_fluid" and f.relative_errors.mean() < 0.005  # of the compliance, over four decades
+    time = relaxed.time[relaxed.used]
+    both = (time > 0.3) & (time < 100)
+    predicted = time_response.relaxation_modulus(f.model, time[both])
+    error = np.abs(predicted / relaxed.answer[relaxed.used][both] - 1)
+    # Found: 4 %. Creep and relaxation are two loadings of the sample; how far it repeats itself nobody has measured.
+    assert np.median(error) < 0.1
