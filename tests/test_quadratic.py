@@ -411,3 +411,50 @@ def test_mesh_error_refuses_what_it_cannot_say():
         lj.simulate(scene, start=scene.mesh.points, mesh_error=True)
     with pytest.raises(lj.InputError, match="leaves an error of its own"):
         lj.simulate(replace(scene, solve=lj.Solve(newton_iterations=1)), mesh_error=True)
+
+
+@pytest.mark.slow
+def test_the_mesh_bias_of_a_fitted_number_corrects_it():
+    """Data of quadratic elements on a finer mesh, fitted with coarse linear ones: the bias says what they cause."""
+    from fitting.fits import scene_numbers
+    from fitting.readers.displacements import Displacements
+
+    def block(order: int, cells: int, mu: float) -> lj.Scene:
+        mesh = lj.shapes.box((0.02, 0.01, 0.01), (2 * cells, cells, cells))
+        mesh = lj.quadratic(mesh) if order == 2 else mesh
+        return lj.Scene(
+            mesh=mesh,
+            law=lj.laws.NeoHookean(mu=mu, bulk=2400.0),
+            fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+            body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -0.5])),
+            solve=lj.Solve(linear_solver="cg"),
+        )
+
+    truth, coarse = block(2, 4, 800.0), block(1, 4, 700.0)
+    corner = int(np.argmax(np.asarray(coarse.mesh.points) @ np.ones(3)))
+    same = int(
+        np.argmin(np.linalg.norm(np.asarray(truth.mesh.points) - np.asarray(coarse.mesh.points)[corner], axis=1))
+    )
+    moved = np.asarray(lj.simulate(truth).check().positions[-1] - truth.mesh.points)[same]
+    data = Displacements(
+        step=np.array([0]),
+        nodes=np.full((1, 4), corner),
+        weights=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        measured=moved[None],
+        sd=np.full((1, 3), 1e-6),
+    )
+    problem = scene_numbers.Problem((coarse,), (data,))
+    with pytest.warns(UserWarning, match="the mesh moves law.mu by"):
+        found = scene_numbers.fit_numbers(problem, ["law.mu"], mesh_error=True)
+    off, left = found.values[0] - 800.0, found.values[0] - found.mesh_bias[0] - 800.0
+    assert off < -20 and abs(left) < 0.3 * abs(off)
+
+
+def test_points_in_quadratic_elements_move_with_their_functions():
+    from fitting.readers.displacements import locate
+
+    at = np.array([[0.0031, 0.0042, 0.0027], [0.013, 0.008, 0.0011]])
+    nodes, weights, outside = locate(MESH, at)
+    field = np.asarray(MESH.points) ** 2 @ np.array([1.0, -2.0, 0.5])
+    assert np.allclose(np.sum(weights * field[nodes], axis=1), at**2 @ [1.0, -2.0, 0.5], atol=1e-16)
+    assert np.all(outside == 0)

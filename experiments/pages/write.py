@@ -14,11 +14,7 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     HERE.parent / "fitting" / "README.md": front.FITS,
     HERE.parent / "liverjax" / "README.md": front.SIMULATOR,
     HERE / "README.md": overview.PARTS,
-    HERE / "TABLES.md": tables.PARTS
-    | {"elements": elements.table}
-    | porosity.PARTS
-    | identification.PARTS
-    | stability.PARTS,
+    HERE / "TABLES.md": tables.PARTS | elements.PARTS | porosity.PARTS | identification.PARTS | stability.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
 }
 
