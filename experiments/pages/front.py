@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from experiments.pages import elements
 from experiments.pages.results import error_text, load, percent
 from experiments.pages.stability import Returned, returned
 
@@ -229,5 +230,11 @@ def extremes() -> str:
 
 
 PARTS = {"job": job, "choices": choices}
-SIMULATOR = {"simulation": simulation, "gradients": gradients, "runs": runs, "extremes": extremes}
+SIMULATOR = {
+    "simulation": simulation,
+    "gradients": gradients,
+    "runs": runs,
+    "extremes": extremes,
+    "elements": elements.sentences,
+}
 FITS = {"maps": maps, "together": together}

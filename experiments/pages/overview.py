@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import rigs
+from experiments.pages import elements, rigs
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
 from experiments.pages.stability import Returned, returned
@@ -393,6 +393,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     ),
     "stability_steps": ("the liver under its full weight at any step, with and without `robust`", _steps, ""),
     "stability_bulk": ("locking against K/mu", _bulk, ""),
+    "elements": (
+        "linear, quadratic and mixed elements: error, estimated error, run time",
+        elements.came_out,
+        "has linear tetrahedra alone, and no error of the mesh",
+    ),
     "stability_rigs": ("error of tension, indentation and creep against run time: mesh, elements", rigs.came_out, ""),
     "stability_cost": ("what does robustness at hand cost where it is not needed?", _cost, ""),
     "laws_table": ("every law: error of its terms beside time and compile time", _laws, ""),

@@ -1,6 +1,7 @@
 """Few numbers of one or more scenes from measured displacements: Gauss-Newton, standard errors."""
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
-from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.readers.displacements import Displacements, residuals
 from liverjax.core import status
@@ -46,6 +47,7 @@ def fit(
     start: Any,
     max_iterations: int = 20,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
+    mesh_error: bool = False,
 ) -> tuple[Estimate, Solution]:
     """Minimise the residuals over u.
 
@@ -55,6 +57,8 @@ def fit(
         natural_of: u -> the parameters to report (n,), of `names`.
         start: first u (n,).
         max_iterations, progress: as of `levenberg_marquardt_host`.
+        mesh_error: estimate what the meshes leave out, and how far that moves the parameters (`mesh_bias`); a warning
+            says where it is more than the standard error.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
 
@@ -76,7 +80,24 @@ def fit(
     converged = bool(found.converged) and all(c == status.CONVERGED for c in ended)
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
+    if mesh_error:
+        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, missing(problem, values_of(found.u))))
+        for sentence in bias_sentences(estimate):
+            warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
+
+
+def missing(problem: Problem, values: dict[str, Any]) -> np.ndarray:
+    """What the meshes leave out of the residuals (n,), with the scenes' numbers replaced by `values`."""
+    rows = []
+    for scene, data in zip(problem.scenes, problem.data, strict=True):
+        scene = lj.with_parameters(scene, values)
+        result = lj.simulate(scene, mesh_error=True)
+        assert result.mesh_error is not None
+        both = (residuals(data, scene, x) for x in (result.positions + result.mesh_error.positions, result.positions))
+        more, less = (np.asarray(r) for r in both)
+        rows.append(more - less)
+    return np.concatenate(rows)
 
 
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:

@@ -117,3 +117,35 @@ def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         covariance = root @ root.T
         errors = np.sqrt(np.diag(covariance))
         return errors, covariance / np.maximum(np.outer(errors, errors), 1e-300)
+
+
+#: Part of the numbers by which what the mesh leaves out may move them, all directions together, to first order.
+LARGEST_BIAS = 0.3
+
+
+def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
+    """What meshes move the numbers (P,): J^+ of what they leave out of the data, `missing` (n,) over the noise.
+
+    To first order: good while what is missing is below a quarter, and numbers are not nearly dependent. Subtract it
+    once to correct.
+    """
+    J, to_natural = np.asarray(found.jacobian), np.asarray(jax.jacfwd(natural_of)(found.u))
+    if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
+        return np.full(len(to_natural), np.nan)
+    return to_natural @ (np.linalg.pinv(J) @ missing)
+
+
+def bias_sentences(estimate: Estimate) -> list[str]:
+    """Where the mesh moves a number by more than its standard error, or by so much that nothing can be said."""
+    bias, values = estimate.mesh_bias, np.asarray(estimate.values)
+    if bias is None:
+        return []
+    lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)))
+    if len(lost):
+        names = ", ".join(estimate.names[k] for k in lost)
+        return [f"the mesh moves {names} by a third or more: the data do not say them on this mesh; refine it"]
+    more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
+    if not len(more):
+        return []
+    each = ", ".join(f"{estimate.names[k]} by {bias[k]:.2g}" for k in more)
+    return [f"the mesh moves {each}, more than the standard error: subtract mesh_bias, or refine the mesh"]

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from liverjax.core.errors import InputError
+from liverjax.mesh.basis import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.scenes.scene import Scene
 
@@ -22,8 +23,8 @@ class Displacements(NamedTuple):
     """n points, each seen at one step of the scene."""
 
     step: np.ndarray  # (n,) which step, from 0
-    nodes: np.ndarray  # (n, 4) of the element it is in
-    weights: np.ndarray  # (n, 4) its barycentric coordinates
+    nodes: np.ndarray  # (n, 4) of the element it is in; (n, 10) of a quadratic one
+    weights: np.ndarray  # of these nodes, the values of their functions there
     measured: np.ndarray  # (n, 3) [m]; 0 where not measured
     sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
 
@@ -128,8 +129,11 @@ def _at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarra
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The element each point is in, or nearest to being in: its nodes (n, 4), barycentric coordinates (n, 4), and how
-    far outside it is (n,), in sizes of the element; host side."""
+    """The element each point is in, or nearest to: its nodes, the values of their functions, how far the point is off.
+
+    Returns nodes (n, 4) and barycentric coordinates (n, 4), of quadratic elements 10 of both; and how far outside the
+    point is (n,), in sizes of the element; host side.
+    """
     X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     candidates = min(candidates, len(tets))
     _, near = cKDTree(X[tets].mean(axis=1)).query(points, k=candidates)
@@ -140,7 +144,11 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.
     best = np.argmax(bary.min(axis=-1), axis=1)
     row = np.arange(len(points))
     element, weights = near[row, best], bary[row, best]
-    return tets[element], weights, np.maximum(0.0, -weights.min(axis=-1))
+    outside = np.maximum(0.0, -weights.min(axis=-1))
+    if mesh.order == 1:
+        return tets[element], weights, outside
+    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
+    return nodes[element], functions(2, weights.T)[0].T, outside
 
 
 def _steps(path: Path, scene: Scene, time: np.ndarray | None, n: int) -> np.ndarray:

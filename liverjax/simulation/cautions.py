@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.scene import Scene
@@ -24,7 +25,7 @@ def cautions(scene: Scene, result: Result) -> list[str]:
         scene: `Scene`, not traced.
         result: what its run returned.
     """
-    return [*_of_mesh(scene.mesh), *_of_volumes(scene, result)]
+    return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_volumes(scene, result)]
 
 
 #: A mesh error below this part of the largest displacement is not worth another mesh.
@@ -62,6 +63,26 @@ def _of_mesh(mesh: TetMesh) -> list[str]:
             f"{quality[worst]:.2g}; regular: 1): do not trust stresses there, or remesh"
         )
     return said
+
+
+#: K/mu above which quadratic elements without pressures of their own lose a tenth or more (experiments/TABLES.md).
+_LOCKING = 100.0
+
+
+def _of_locking(scene: Scene) -> list[str]:
+    """Quadratic elements that lock although they need not."""
+    if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
+        return []
+    try:
+        ratio = float(np.max(np.asarray(scene.law.bulk_modulus()) / np.asarray(scene.law.shear_modulus())))
+    except InputError:  # a law need not state its moduli
+        return []
+    if ratio <= _LOCKING:
+        return []
+    return [
+        f"the bulk modulus is {ratio:.3g} times the shear modulus, where these elements are too stiff: write "
+        "volumetric = 'mixed' in [solve]"
+    ]
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:

@@ -18,11 +18,10 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation import checkpoints
-from liverjax.simulation.equations import equations, initial_state
+from liverjax.simulation.equations import equations, initial_state, unknowns
 from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import problem_of
 from liverjax.solvers import continuation
-from liverjax.solvers.block_matrix import flat
 
 MODES = ("reverse", "forward")
 #: The scene's positions at the beginning, beside the dotted names of `with_parameters`.
@@ -89,7 +88,7 @@ def _program(loss: Callable[[Result], jax.Array], store: str | int, mode: str) -
     return jax.jit(both)
 
 
-#: Numbers an element that one step's derivative works with, beside tangents; measured.
+#: Numbers a point of integration that one step's derivative works with, beside tangents; measured.
 _WORK = 440
 
 
@@ -100,13 +99,13 @@ def memory(scene: Scene, store: str | int = "all") -> int:
 
     def carry(scene):
         start = initial_state(scene)
-        method = problem_of(equations(scene, start, jnp.ones(())))
-        return start, continuation.nothing_kept(method, flat(start.x))
+        first = equations(scene, start, jnp.ones(()))
+        return start, continuation.nothing_kept(problem_of(first), unknowns(first, start.x))
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
     root = _bytes(scene.mesh.points)
     # Tangents of a step, and of the run's beginning.
-    work = 2 * tangent + _WORK * scene.mesh.number_of_elements * scene.mesh.points.dtype.itemsize
+    work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = checkpoints.lengths(steps, kept)
