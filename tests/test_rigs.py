@@ -312,6 +312,21 @@ def test_shapes_and_laws_beyond_the_table_are_told():
         assert [str(w.message).startswith("K/mu") for w in found] == [True] * told
 
 
+def test_the_axis_of_a_sector_is_held_across_both_planes():
+    """Else the oblique plane would meet nodes that are held along one of its normal's two axes: refused."""
+    scene = glued.tension(R, R, 1.0, [0.1]).scene
+    lj.check_scene(scene)
+    bottom, start, _, top = scene.fixed
+    with pytest.raises(lj.InputError, match="right angles"):
+        lj.check_scene(replace(scene, fixed=(bottom, start, top)))
+
+
+@pytest.mark.parametrize("cells", [None, R / 2])
+def test_scenes_of_rigs_pass_the_check(cells):
+    for rig in (glued.indentation(R, R, 0.004, 1.0, [1e-3], cells), glued.creep(R, R, 1.0, 1, 50.0, cells)):
+        lj.check_scene(rig.scene)
+
+
 def test_a_law_with_directions_needs_the_whole_cylinder():
     law = lj.laws.create("costa", c=100.0, b_ff=8.0, b_ss=4.0, b_nn=3.0, b_fs=5.0, b_fn=4.0, b_sn=2.0, bulk=1e4)
     with pytest.raises(lj.InputError, match="give the rig a cell_size"):

@@ -265,7 +265,9 @@ def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
     history[1:, 2] = lift
     times = dt * np.arange(len(lift) + 1)
     nodes = jnp.asarray(sample.under)
-    moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history))
+    # Along z alone: the planes of symmetry hold some of these nodes already, and none is to be prescribed twice.
+    moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history), axes="z")
+    sample = sample._replace(fixed=(*sample.fixed, lj.Fixed(nodes=nodes, axes="xy")))
     scene = _scene(sample, dt, len(lift), displaced=(moved,))
     return Rig(scene=scene, nodes=nodes, weights=jnp.full(len(nodes), sample.parts), whole=not sample.physics)
 
