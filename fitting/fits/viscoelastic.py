@@ -11,7 +11,7 @@ import numpy as np
 from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
-from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt, levenberg_marquardt_host
+from fitting.methods.least_squares import Solution, bfgs, from_starts, levenberg_marquardt_host
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import torsion
 from liverjax import laws
@@ -80,19 +80,23 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
     """
     check_modes(sweep, modes)
     dense = dense or generalised_maxwell.refuse_impossible(sweep)
-    minimise = levenberg_marquardt if optimizer == OPTIMIZERS[0] else bfgs
     starts = generalised_maxwell.starts(sweep, modes, dense)
-
-    def best(starts, *data):
-        found = jax.vmap(lambda u: minimise(generalised_maxwell.residuals, u, *data))(starts)
-        k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
-        return jax.tree.map(lambda leaf: leaf[k], found)
-
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
-    found, compiling, running = _timed(best, starts, *data)
+    if optimizer == OPTIMIZERS[0]:
+        begin = time.perf_counter()
+        found, compiling = from_starts(generalised_maxwell.residuals, starts, *data), 0.0
+        running = time.perf_counter() - begin
+    else:
+        found, compiling, running = _timed(_best_by_bfgs, starts, *data)
     model = generalised_maxwell.natural(found.u)
-    storage, loss = (np.asarray(v) for v in generalised_maxwell.moduli(model, jnp.asarray(sweep.angular_frequency)))
+    storage, loss = (np.asarray(v) for v in generalised_maxwell.moduli(model, sweep.angular_frequency))
     return _fit("closed-form", sweep, found, storage, loss, (), running, compiling, {"optimizer": optimizer})
+
+
+def _best_by_bfgs(starts: jax.Array, *data: Any) -> Solution:
+    found = jax.vmap(lambda u: bfgs(generalised_maxwell.residuals, u, *data))(starts)
+    k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[k], found)
 
 
 def _fit(method, sweep, found, storage, loss, extra, running, compiling, details) -> Fit:

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.stats
+import scipy.special
 
+from fitting.methods import host
 from fitting.methods.least_squares import Solution
 
 
@@ -34,7 +35,7 @@ class Estimate(NamedTuple):
     @property
     def quantile(self) -> float:
         """Of Student's t for a 95 % interval."""
-        return float(scipy.stats.t.ppf(0.975, max(1, self.components - len(self.names))))
+        return float(scipy.special.stdtrit(max(1, self.components - len(self.names)), 0.975))
 
 
 def estimated(
@@ -49,13 +50,16 @@ def estimated(
     Args:
         names: of the numbers to report.
         natural_of: u -> these numbers (P,).
-        found: minimum over u.
+        found: minimum over u; if it is NumPy's, `natural_of` is one for `host.with_jacobian`.
         components: how many of the residuals are measured; those that are not are 0 and count for nothing.
         deviations_given: as of `noise_factor`.
     """
     u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
     noise = noise_factor(r, components - len(u), deviations_given)
-    values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
+    if isinstance(found.u, np.ndarray):
+        values, to_natural = host.with_jacobian(natural_of, found.u)
+    else:
+        values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
     # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.

@@ -8,14 +8,16 @@ import numpy as np
 
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.rheometer import Sweep
 
 
-def parameter_vector(u: jax.Array) -> jax.Array:
+def parameter_vector(u: Array) -> Array:
     """G0, ratios, relaxation times (2N + 1,) of unconstrained parameters."""
     model = generalised_maxwell.natural(u)
-    return jnp.concatenate([model.shear_modulus[None], model.ratios, model.relaxation_times])
+    xp = arrays_of(*model)
+    return xp.concatenate([model.shear_modulus[..., None], model.ratios, model.relaxation_times], axis=-1)
 
 
 def parameter_names(modes: int) -> tuple[str, ...]:
