@@ -225,14 +225,59 @@ class Simulation(NamedTuple):
     density: float | None = None  # of the sample [kg/m^3]; None: moduli that the instrument corrected for inertia
 
 
-def simulated_moduli(
-    u: jax.Array, rig: torsion.Rig, law: laws.Law, omega: Any, torque: Any, drive: torsion.Drive, scheme: str, part: str
-) -> torsion.Moduli:
-    """`torsion.moduli` of unconstrained Maxwell parameters u, the law scaled to their G0."""
+#: Strain at the rim up to which the derivatives of the linear rig serve: they are off by less than the strain.
+LINEAR_STRAIN = 1e-2
+
+
+def _law_and_prony(u: jax.Array, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
+    """The sample of unconstrained Maxwell parameters u: the law scaled to their G0, and how it relaxes."""
     model = generalised_maxwell.natural(u)
-    scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
-    viscosity = Prony(ratios=model.ratios, relaxation_times=model.relaxation_times, scheme=scheme, part=part)
-    return torsion.moduli(rig, scaled, viscosity, omega, torque, drive)
+    viscosity = Prony(
+        ratios=model.ratios,
+        relaxation_times=model.relaxation_times,
+        scheme=simulation.scheme,
+        part=simulation.part,
+    )
+    return laws.scaled(law, model.shear_modulus / law.shear_modulus()), viscosity
+
+
+def _residuals(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, torsion.Moduli]:
+    """Simulated less measured moduli over their deviations (2n,), and what was simulated."""
+    rig, law, omega, torque, measured, scales = data
+    drive = torsion.Drive(steps=simulation.steps)
+    m = torsion.moduli(rig, *_law_and_prony(u, law, simulation), omega, torque, drive)
+    return (jnp.concatenate([m.storage, m.loss]) - measured) / scales, m
+
+
+def _with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
+    """Residuals, their derivative by u (2n, P), and what was simulated.
+
+    The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation: Gauss-Newton
+    goes to the same minimum with it, and the program is a third as large and runs a tenth of the time.
+    """
+    if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
+
+        def twice(u):
+            r, m = _residuals(u, simulation, *data)
+            return r, (r, m)
+
+        J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
+        return r, J, m
+    _, law, omega, _, _, scales = data
+
+    def linear(u):
+        G = torsion.linear_moduli(*_law_and_prony(u, law, simulation), omega, simulation.steps)
+        return jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales
+
+    r, m = _residuals(u, simulation, *data)
+    return r, jax.jacfwd(linear)(u), m
+
+
+def _rig(simulation: Simulation) -> torsion.Rig:
+    cell = simulation.cell_size
+    if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
+        cell = torsion.linear_cell_for(simulation.radius, simulation.height)
+    return torsion.make_rig(simulation.radius, simulation.height, cell, density=simulation.density)
 
 
 def through_torsion(
@@ -254,50 +299,36 @@ def through_torsion(
     from liverjax.physics.viscosity import check
 
     law = laws.typical(simulation.law)
-    rig = torsion.make_rig(simulation.radius, simulation.height, simulation.cell_size, density=simulation.density)
-    drive = torsion.Drive(steps=simulation.steps)
     check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
+    rig = _rig(simulation)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
     data = (rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales)
-
-    def residuals(u, rig, law, omega, torque, measured, scales):
-        m = simulated_moduli(u, rig, law, omega, torque, drive, simulation.scheme, simulation.part)
-        return (jnp.concatenate([m.storage, m.loss]) - measured) / scales, m
-
-    def evaluate(u, *data):
-        def twice(u):
-            r, m = residuals(u, *data)
-            return r, (r, m)
-
-        J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
-        return r, J, m
-
-    u0 = start.solution.u
-    begin = time.perf_counter()
+    u0 = jnp.asarray(start.solution.u)
     if optimizer == OPTIMIZERS[0]:
-        compiled = jax.jit(evaluate).lower(u0, *data).compile()
+        begin = time.perf_counter()
+        compiled = jax.jit(lambda u, *data: _with_jacobian(u, simulation, *data)).lower(u0, *data).compile()
         compiling = time.perf_counter() - begin
         seen = {}
 
         def evaluated(u):
-            r, J, seen[u.tobytes()] = compiled(u, *data)
+            r, J, seen[np.asarray(u).tobytes()] = compiled(u, *data)
             return r, J
 
-        found = levenberg_marquardt_host(lambda u: evaluated(np.asarray(u)), u0, progress=progress)
+        found = levenberg_marquardt_host(evaluated, u0, progress=progress)
         m = seen[np.asarray(found.u).tobytes()]
         running = time.perf_counter() - begin - compiling
     else:
-        (found, m), compiling, running = _timed(
-            lambda u, *data: (lambda s: (s, residuals(s.u, *data)[1]))(
-                bfgs(lambda u, *d: residuals(u, *d)[0], u, *data)
-            ),
-            u0,
-            *data,
-        )
+
+        def minimised(u, *data):
+            found = bfgs(lambda u, *data: _residuals(u, simulation, *data)[0], u, *data)
+            return found, _residuals(found.u, simulation, *data)[1]
+
+        (found, m), compiling, running = _timed(minimised, u0, *data)
+    found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.max(m.statistics.status))
-    found = found._replace(converged=jnp.asarray(bool(found.converged) and worst == status.CONVERGED))
+    found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     fit = _fit("torsion", sweep, found, storage, loss, advice, running, compiling, details)
@@ -307,6 +338,7 @@ def through_torsion(
 
 def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
     """What the simulation was and did, for the report."""
+    whole = simulation.part == "all"  # then the bias is the same at every frequency, and known
     return {
         "law": simulation.law,
         "radius_m": simulation.radius,
@@ -314,7 +346,7 @@ def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law,
         "density_kg_m3": simulation.density,
         "nodes": rig.mesh.number_of_nodes,
         "elements": rig.mesh.number_of_elements,
-        "geometry_factor": float(torsion.geometry_factor(rig, law)),
+        "geometry_factor": float(m.bias[0].real if whole else torsion.geometry_factor(rig, law)),
         "steps_per_cycle": simulation.steps,
         "scheme": simulation.scheme,
         "part": simulation.part,
