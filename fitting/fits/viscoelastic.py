@@ -241,7 +241,7 @@ def _law_and_prony(u: jax.Array, law: laws.Law, simulation: Simulation) -> tuple
     return laws.scaled(law, model.shear_modulus / law.shear_modulus()), viscosity
 
 
-def _residuals(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, torsion.Moduli]:
+def simulated_residuals(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, torsion.Moduli]:
     """Simulated less measured moduli over their deviations (2n,), and what was simulated."""
     rig, law, omega, torque, measured, scales = data
     drive = torsion.Drive(steps=simulation.steps)
@@ -249,7 +249,7 @@ def _residuals(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Ar
     return (jnp.concatenate([m.storage, m.loss]) - measured) / scales, m
 
 
-def _with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
+def with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
     """Residuals, their derivative by u (2n, P), and what was simulated.
 
     The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation: Gauss-Newton
@@ -258,7 +258,7 @@ def _with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[ja
     if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
 
         def twice(u):
-            r, m = _residuals(u, simulation, *data)
+            r, m = simulated_residuals(u, simulation, *data)
             return r, (r, m)
 
         J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
@@ -269,11 +269,12 @@ def _with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[ja
         G = torsion.linear_moduli(*_law_and_prony(u, law, simulation), omega, simulation.steps)
         return jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales
 
-    r, m = _residuals(u, simulation, *data)
+    r, m = simulated_residuals(u, simulation, *data)
     return r, jax.jacfwd(linear)(u), m
 
 
-def _rig(simulation: Simulation) -> torsion.Rig:
+def rig_of(simulation: Simulation) -> torsion.Rig:
+    """The sample of a simulation; its mesh is coarse where the bias of the mesh is known exactly."""
     cell = simulation.cell_size
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, simulation.height)
@@ -300,14 +301,14 @@ def through_torsion(
 
     law = laws.typical(simulation.law)
     check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
-    rig = _rig(simulation)
+    rig = rig_of(simulation)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
     data = (rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales)
     u0 = jnp.asarray(start.solution.u)
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
-        compiled = jax.jit(lambda u, *data: _with_jacobian(u, simulation, *data)).lower(u0, *data).compile()
+        compiled = jax.jit(lambda u, *data: with_jacobian(u, simulation, *data)).lower(u0, *data).compile()
         compiling = time.perf_counter() - begin
         seen = {}
 
@@ -321,8 +322,8 @@ def through_torsion(
     else:
 
         def minimised(u, *data):
-            found = bfgs(lambda u, *data: _residuals(u, simulation, *data)[0], u, *data)
-            return found, _residuals(found.u, simulation, *data)[1]
+            found = bfgs(lambda u, *data: simulated_residuals(u, simulation, *data)[0], u, *data)
+            return found, simulated_residuals(found.u, simulation, *data)[1]
 
         (found, m), compiling, running = _timed(minimised, u0, *data)
     found = Solution(*(np.asarray(field) for field in found))
