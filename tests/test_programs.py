@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -14,8 +15,13 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+import liverjax as lj
 from liverjax.commands.exit_codes import exit_code
+from liverjax.core import compiled as compiled_module
 from liverjax.core import programs
+from liverjax.core.compiled import _found, compiled
+from liverjax.core.struct import replace
+from liverjax.elements import mjed
 
 #: A program that takes longer to compile than to find, in a process as a command has it; its numbers are printed.
 WORK = """
@@ -171,6 +177,93 @@ def test_what_was_longest_not_used_goes_first(tmp_path):
     assert mine.exists()
     programs.bound(tmp_path, 350)
     assert len(_entries(tmp_path)) == 3
+
+
+@pytest.fixture
+def cube():
+    """A mesh, a law and positions."""
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    return mesh, lj.laws.typical("neo_hookean"), 1.1 * mesh.points
+
+
+def _whole(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*/whole_*-cache"))
+
+
+def test_a_whole_program_is_found_without_being_traced(switched, cube, monkeypatch):
+    (mesh, law, x), traced = cube, []
+    energy = type(law).strain_energy
+    monkeypatch.setattr(type(law), "strain_energy", lambda self, m: traced.append(1) or energy(self, m))
+    with programs.kept_on_disk():
+        first = compiled(mjed.energy, mesh, law, x)(mesh, law, x)
+        assert traced
+        (file,) = _whole(switched)
+        content = file.read_bytes()
+        found = _found(file)
+        assert found is not None and found(mesh, law, x).tobytes() == first.tobytes()
+        traced.clear()
+        assert compiled(mjed.energy, mesh, law, x)(mesh, law, x).tobytes() == first.tobytes()
+        assert not traced
+        harder = replace(law, mu=2 * law.mu)
+        expected = mjed.energy(mesh, harder, x)
+        assert np.isclose(compiled(mjed.energy, mesh, harder, x)(mesh, harder, x), expected, rtol=1e-14)
+        assert _whole(switched) == [file]  # other numbers: the same program
+        file.write_bytes(content[:100])
+        assert compiled(mjed.energy, mesh, law, x)(mesh, law, x).tobytes() == first.tobytes()
+        assert len(file.read_bytes()) > 0.9 * len(content)  # replaced
+    assert programs.folder() is None
+
+
+def test_what_decides_a_program_is_in_its_name(switched, cube, monkeypatch):
+    mesh, law, x = cube
+    names = [compiled_module._key(mjed.energy, (mesh, law, x))]
+    larger = lj.shapes.box((1.0, 1.0, 1.0), (2, 1, 1))
+    names.append(compiled_module._key(mjed.energy, (larger, law, larger.points)))
+    names.append(compiled_module._key(mjed.energy, (mesh, replace(law, volumetric="log"), x)))
+    names.append(compiled_module._key(mjed.energy, (mesh, lj.laws.typical("yeoh"), x)))
+    names.append(compiled_module._key(mjed.energy, (mesh, law, x.astype("float32"))))
+    names.append(compiled_module._key(partial(mjed.energy, terms="chapter"), (mesh, law, x)))
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    names.append(compiled_module._key(mjed.energy, (mesh, law, x)))
+    assert len(set(names)) == len(names)
+
+
+@lj.struct
+class Mine(lj.Law):
+    """W = mu/2 (Ibar1 - 3), in a file that no digest holds."""
+
+    mu: float = lj.param("Pa")
+    bulk: float = lj.param("Pa")
+    volumetric: str = lj.static("quadratic")
+
+    def isochoric_energy(self, I1, I2):
+        return self.mu / 2 * (I1 - 3)
+
+
+def test_a_law_of_ones_own_is_compiled_as_it_is_now(switched, cube):
+    mesh, law, x = cube
+    with programs.kept_on_disk():
+        mine = Mine(mu=law.mu, bulk=law.bulk)
+        energy = compiled(mjed.energy, mesh, mine, x)(mesh, mine, x)
+        assert np.isclose(energy, mjed.energy(mesh, law, x), rtol=1e-14)
+        assert not _whole(switched)
+
+
+#: A program that calls LAPACK, whose addresses JAX gives to XLA when it lowers a factorisation.
+FACTORISES = """
+import jax.numpy as jnp, liverjax
+from fitting.methods.least_squares import accept, begin
+from liverjax.core.compiled import compiled
+from liverjax.core.programs import kept_on_disk
+state, r, J = begin(jnp.ones(2), 3), jnp.arange(3.0), jnp.arange(6.0).reshape(3, 2) ** 2
+with kept_on_disk():
+    print(compiled(accept, state, r, J)(state, r, J).trial.tobytes().hex())
+"""
+
+
+def test_a_program_that_factorises_runs_from_disk(tmp_path):
+    first, second = (_ended(_started(["-c", FACTORISES], tmp_path)) for _ in range(2))
+    assert first == second and _whole(tmp_path)
 
 
 def test_other_warnings_are_shown(switched):

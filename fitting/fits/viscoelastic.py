@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ from fitting.readers.rheometer import Sweep
 from fitting.rigs import torsion
 from liverjax import laws
 from liverjax.core import status
+from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.physics.viscosity import Prony
 
@@ -241,16 +243,23 @@ def _law_and_prony(u: jax.Array, law: laws.Law, simulation: Simulation) -> tuple
     return laws.scaled(law, model.shear_modulus / law.shear_modulus()), viscosity
 
 
-def simulated_residuals(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, torsion.Moduli]:
-    """Simulated less measured moduli over their deviations (2n,), and what was simulated."""
+def simulated_residuals(u: jax.Array, data: tuple, simulation: Simulation) -> tuple[jax.Array, torsion.Moduli]:
+    """Simulated less measured moduli over their deviations (2n,), and what was simulated.
+
+    Args:
+        u: unconstrained Maxwell parameters.
+        data: rig, law, angular frequencies (n,) [rad/s], torque amplitudes (n,) [N m], measured moduli G' then G''
+            (2n,) [Pa] and their deviations.
+        simulation: law, recursion and resolution.
+    """
     rig, law, omega, torque, measured, scales = data
     drive = torsion.Drive(steps=simulation.steps)
     m = torsion.moduli(rig, *_law_and_prony(u, law, simulation), omega, torque, drive)
     return (jnp.concatenate([m.storage, m.loss]) - measured) / scales, m
 
 
-def with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
-    """Residuals, their derivative by u (2n, P), and what was simulated.
+def with_jacobian(u: jax.Array, data: tuple, simulation: Simulation) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
+    """Residuals, their derivative by u (2n, P), and what was simulated; arguments as of `simulated_residuals`.
 
     The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation: Gauss-Newton
     goes to the same minimum with it, and the program is a third as large and runs a tenth of the time.
@@ -258,7 +267,7 @@ def with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax
     if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
 
         def twice(u):
-            r, m = simulated_residuals(u, simulation, *data)
+            r, m = simulated_residuals(u, data, simulation)
             return r, (r, m)
 
         J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
@@ -269,7 +278,7 @@ def with_jacobian(u: jax.Array, simulation: Simulation, *data: Any) -> tuple[jax
         G = torsion.linear_moduli(*_law_and_prony(u, law, simulation), omega, simulation.steps)
         return jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales
 
-    r, m = simulated_residuals(u, simulation, *data)
+    r, m = simulated_residuals(u, data, simulation)
     return r, jax.jacfwd(linear)(u), m
 
 
@@ -308,12 +317,12 @@ def through_torsion(
     u0 = jnp.asarray(start.solution.u)
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
-        compiled = jax.jit(lambda u, *data: with_jacobian(u, simulation, *data)).lower(u0, *data).compile()
+        program = compiled(partial(with_jacobian, simulation=simulation), u0, data)
         compiling = time.perf_counter() - begin
         seen = {}
 
         def evaluated(u):
-            r, J, seen[np.asarray(u).tobytes()] = compiled(u, *data)
+            r, J, seen[np.asarray(u).tobytes()] = program(u, data)
             return r, J
 
         found = levenberg_marquardt_host(evaluated, u0, progress=progress)
@@ -322,8 +331,8 @@ def through_torsion(
     else:
 
         def minimised(u, *data):
-            found = bfgs(lambda u, *data: simulated_residuals(u, simulation, *data)[0], u, *data)
-            return found, simulated_residuals(found.u, simulation, *data)[1]
+            found = bfgs(lambda u, *data: simulated_residuals(u, data, simulation)[0], u, *data)
+            return found, simulated_residuals(found.u, data, simulation)[1]
 
         (found, m), compiling, running = _timed(minimised, u0, *data)
     found = Solution(*(np.asarray(field) for field in found))

@@ -21,6 +21,14 @@ LIMIT = 500_000_000
 WORTH_KEEPING = 0.05
 
 
+_in_use: list[Path] = []
+
+
+def folder() -> Path | None:
+    """Where programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
+    return _in_use[-1] if _in_use else None
+
+
 @contextmanager
 def kept_on_disk() -> Iterator[Path | None]:
     """Inside it, compiled programs are read from disk and written there; gives the folder, `None` without a cache.
@@ -28,20 +36,26 @@ def kept_on_disk() -> Iterator[Path | None]:
     There is no cache if `LIVERJAX_CACHE` is "off", if the folder cannot be written, or if the user has given JAX a
     folder already (`JAX_COMPILATION_CACHE_DIR`), which stays as it is. Entries that cannot be read are compiled anew.
     """
-    folder = _folder()
+    chosen = _folder()
     with warnings.catch_warnings():
         # A broken entry, a full disk, another process that removes old entries: each costs a compilation, no more.
         warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
         show = warnings.showwarning
 
         def shown(message: Warning | str, *details: object) -> None:
-            if folder is None or not _forgotten(folder, str(message)):
+            if chosen is None or not _forgotten(chosen, str(message)):
                 show(message, *details)  # type: ignore[arg-type]
 
         warnings.showwarning = shown  # type: ignore[assignment]
-        if folder is not None:
-            _switch_on(folder)
-        yield folder
+        if chosen is None:
+            yield None
+            return
+        _switch_on(chosen)
+        _in_use.append(chosen)
+        try:
+            yield chosen
+        finally:
+            _in_use.pop()
 
 
 def _switch_on(folder: Path) -> None:

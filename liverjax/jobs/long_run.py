@@ -14,6 +14,7 @@ import h5py
 import jax
 import numpy as np
 
+from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.core.versions import versions
 from liverjax.jobs import parts
@@ -102,7 +103,7 @@ def _run(scene: Scene, count: int, folder: Path | None, report: Callable[[int], 
 
 
 def _compiled(scene: Scene, state: Any, count: int) -> Callable:
-    return jax.jit(partial(simulate_part, count=count)).lower(scene, state, 1.0).compile()
+    return compiled(partial(simulate_part, count=count), scene, state, 1.0)
 
 
 def _content(result: Result, state: Any) -> dict[str, np.ndarray]:
