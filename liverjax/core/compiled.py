@@ -39,7 +39,7 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any
         arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept.
     """
     folder = programs.folder()
-    if folder is None:
+    if folder is None or jax.default_backend() != "cpu":  # elsewhere JAX's own cache serves, until it is measured
         return jax.jit(function).lower(*arguments).compile()
     try:
         file = folder / f"whole_{_name(function)}-{_key(function, arguments)}-cache"
