@@ -1,6 +1,6 @@
 """The torsion fit as it is, against the one with the derivative of the whole simulation on the finer mesh.
 
-``python -m experiments torsion_speed [--quick]`` (5 minutes) writes results/torsion_speed.json: for both shipped
+``python -m experiments torsion_speed [--quick]`` (10 minutes) writes results/torsion_speed.json: for both shipped
 sweeps the largest difference of a modulus at any frequency and of a parameter, in standard errors; compile and run
 time of both; for other plates the difference of the two meshes; the error of the Jacobian against strain.
 """

@@ -336,8 +336,8 @@ def with_jacobian(
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
     """Residuals, their derivative by u (rows, P), and what was simulated; arguments as of `simulated_residuals`.
 
-    The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation: Gauss-Newton
-    goes to the same minimum with it, and the program is a third as large and runs a tenth of the time.
+    The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation. Gauss-Newton
+    goes to the same minimum with it, in a small part of the time (experiments/benchmarks/torsion_speed.py).
     """
     if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
 
