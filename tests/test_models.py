@@ -278,6 +278,24 @@ def test_a_sweep_of_no_maxwell_solid_is_refused_for_every_model(tmp_path, capsys
 
 
 @pytest.mark.slow
+def test_no_start_of_scipy_is_below_the_fluid():
+    s, rng, best = maxwell_fluid(0.02), np.random.default_rng(0), np.inf
+    scales, data = np.concatenate(s.deviations), np.concatenate([s.storage, s.loss])
+    f = models.fluid(s, generalised_maxwell.spectrum(s))
+
+    def residuals(q):
+        strengths, times = np.exp(np.split(np.clip(q, -50, 50), 2))
+        x = 1j * s.angular_frequency[:, None] * times
+        G = (strengths * x / (1 + x)).sum(axis=1)
+        return (np.concatenate([G.real, G.imag]) - data) / scales
+
+    for _ in range(100):
+        start = np.concatenate([rng.uniform(3, 8, f.modes), rng.uniform(-5, 4, f.modes)])
+        best = min(best, scipy.optimize.least_squares(residuals, start, x_scale="jac").cost)
+    assert float(f.solution.cost) <= best * (1 + 1e-8)
+
+
+@pytest.mark.slow
 def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
     """Synthetic: two broad fractional steps and a plateau, 2 % noise; 8 or 9 free modes stop at 30 % here."""
     omega = np.geomspace(1e-12, 1e14, 160)
