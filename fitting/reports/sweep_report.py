@@ -180,7 +180,8 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     if doubtful is not None:
         for axes in (top, rest):
             axes.axvspan(1.02 * doubtful, 1.05 * f[-1], color=GREY, alpha=0.15, lw=0)
-        rest.text(1.03 * doubtful, 0.02, "instrument", fontsize=7, va="bottom", transform=rest.get_xaxis_transform())
+        place = {"ha": "right", "va": "bottom", "transform": rest.get_xaxis_transform()}
+        rest.text(1.05 * f[-1], 0.02, "instrument", fontsize=7, **place)
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
 
