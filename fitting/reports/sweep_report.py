@@ -6,7 +6,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import edges, models
@@ -156,7 +155,7 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
-    lines = [np.asarray(v) for v in moduli(closed.model, jnp.asarray(2 * np.pi * fine))]
+    lines = [np.asarray(v) for v in moduli(closed.model, 2 * np.pi * fine)]
     rows = (
         ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
         ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
@@ -181,7 +180,8 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     if doubtful is not None:
         for axes in (top, rest):
             axes.axvspan(1.02 * doubtful, 1.05 * f[-1], color=GREY, alpha=0.15, lw=0)
-        rest.text(1.03 * doubtful, 0.02, "instrument", fontsize=7, va="bottom", transform=rest.get_xaxis_transform())
+        place = {"ha": "right", "va": "bottom", "transform": rest.get_xaxis_transform()}
+        rest.text(1.05 * f[-1], 0.02, "instrument", fontsize=7, **place)
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
 
