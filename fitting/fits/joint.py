@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import generalised_maxwell
-from fitting.methods.estimate import Estimate, estimated
-from fitting.methods.least_squares import Solution, levenberg_marquardt_host
+from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
+from fitting.methods.least_squares import levenberg_marquardt_host
 from fitting.methods.uncertainty import parameter_names, parameter_vector
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import glued, torsion
@@ -131,33 +131,18 @@ def fit(
     converged = bool(found.converged) and all(c == status.CONVERGED for c in worst)
     estimate = estimated(names, parameter_vector, found, len(found.residuals))
     if any(test.mesh_error for test in tests):
-        estimate = estimate._replace(mesh_bias=_mesh_bias(tests, material(found.u)[:2], found))
-        _compare(estimate)
+        missing = _missing(tests, material(found.u)[:2])
+        estimate = estimate._replace(mesh_bias=mesh_bias(found, parameter_vector, missing))
+        for sentence in bias_sentences(estimate):
+            warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)
 
 
-def _mesh_bias(tests: Sequence[Test], material: tuple[Law, Prony], found: Solution) -> np.ndarray:
-    """What the meshes move the parameters (P,): J^+ of the estimated errors of the readings, over their noise.
-
-    To first order: good while the errors are below a quarter, and parameters are not nearly dependent.
-    """
-    missing = [
-        np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd
-        for test in tests
-    ]
-    J, to_natural = np.asarray(found.jacobian), np.asarray(jax.jacfwd(parameter_vector)(found.u))
-    if not np.all(np.isfinite(J)):
-        return np.full(len(to_natural), np.nan)
-    return to_natural @ (np.linalg.pinv(J) @ np.concatenate(missing))
-
-
-def _compare(estimate: Estimate) -> None:
-    """Warn where the mesh moves a parameter by more than its standard error."""
-    more = np.flatnonzero(~(np.abs(estimate.mesh_bias) <= estimate.standard_errors))
-    if len(more):
-        each = (f"{estimate.names[k]} by {estimate.mesh_bias[k]:.2g}" for k in more)
-        warnings.warn(
-            f"the mesh moves {', '.join(each)}, more than the standard error: subtract mesh_bias, or give the rigs "
-            "finer Cells",
-            stacklevel=3,
-        )
+def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
+    """What the meshes leave out of the readings, over their noise (n,)."""
+    return np.concatenate(
+        [
+            np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd
+            for test in tests
+        ]
+    )

@@ -178,13 +178,13 @@ def _cylinder(table: dict, scale: float) -> TetMesh:
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
-    lengths = (scale * _number(f"[mesh] {k}", table[k]) for k in ("radius", "height", "cell_size"))
+    radius, height, cell_size = (scale * _number(f"[mesh] {k}", table[k]) for k in ("radius", "height", "cell_size"))
     rim = scale * _number("[mesh] rim_cell", table["rim_cell"]) if "rim_cell" in table else None
     rings = scale * _numbers("[mesh] rings", table.get("rings", []))
     match = table.get("match_area", False)
     if not isinstance(match, bool):
         raise InputError(f"[mesh] match_area = {match!r} is not known: use true or false")
-    return shapes.cylinder(*lengths, rim, rings.tolist(), match)
+    return shapes.cylinder(radius, height, cell_size, rim, rings.tolist(), match)
 
 
 def _law(value: Any) -> Law:
