@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import generalised_maxwell, uncertainty
-from fitting.methods.estimate import Estimate
+from fitting.methods.estimate import Estimate, mesh_bias
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import Solution, bfgs, from_starts, levenberg_marquardt_host
@@ -433,10 +433,32 @@ def through_torsion(
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = Simulated("torsion", found, storage, loss, advice)
     fit = _fit(sweep, at, kind, (running, compiling), details)
+    if simulation.density is None and simulation.strain <= LINEAR_STRAIN and kind.prior is None:
+        fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = fit._replace(details=fit.details | of_the_model)
     return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
+
+
+def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
+    """What mesh and time steps of the simulation move the parameters, to first order (`mesh_bias`).
+
+    At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time.
+    """
+    law, omega, scales = data
+    scaled, prony = _law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
+    meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
+    exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
+    natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
+    found = fit.solution._replace(u=jnp.asarray(fit.solution.u))
+
+    def moved(missing: np.ndarray) -> np.ndarray:
+        return mesh_bias(found, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
+
+    return fit.uncertainty._replace(
+        mesh_bias=moved(meshless - (fit.storage + 1j * fit.loss)), time_step_bias=moved(exact - meshless)
+    )
 
 
 def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:

@@ -30,6 +30,7 @@ class Estimate(NamedTuple):
     codes: tuple[int, ...] = ()  # worst code of each simulation
     seconds: float = 0.0
     mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
+    time_step_bias: np.ndarray | None = None  # (P,) the same of its time steps
 
     @property
     def covariance(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from fitting.fits import edges, models
 from fitting.fits.viscoelastic import Fit
+from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
@@ -50,6 +51,8 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },
+        "mesh_bias": _bias(u, n, u.mesh_bias),
+        "time_step_bias": _bias(u, n, u.time_step_bias),
         **_own(fit),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
@@ -61,6 +64,20 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
         "run_time_s": fit.run_time,
         "compile_time_s": fit.compile_time,
         "details": fit.details,
+    }
+
+
+def _bias(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, Any] | None:
+    """By the names of `standard_errors`; null where it is not known."""
+    if moved is None:
+        return None
+    G0, ratios = u.values[0], u.values[1 : n + 1]
+    equilibrium = moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()
+    return {
+        "shear_modulus": moved[0],
+        "equilibrium_modulus": equilibrium,
+        "ratios": moved[1 : n + 1].tolist(),
+        "relaxation_times": moved[n + 1 :].tolist(),
     }
 
 

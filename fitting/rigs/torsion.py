@@ -409,7 +409,7 @@ def moduli(
     return jax.lax.map(lambda lane: one(*lane), lanes) if jax.default_backend() == "cpu" else jax.vmap(one)(*lanes)
 
 
-def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int) -> jax.Array:
+def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
     """What `moduli` approaches as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
 
     The rig is linear there, and its bias is divided out, so they hold neither mesh nor plates. They give the
@@ -420,9 +420,9 @@ def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int) -> jax.A
         law: scaled to G0, its modulus at rest.
         prony: how it relaxes.
         omega: angular frequencies (n,) [rad/s].
-        steps: time steps a cycle.
+        steps: time steps a cycle; None: those of continuous time.
     """
-    ratios = viscosity.complex_ratios(prony, omega, 2 * jnp.pi / (omega * steps))
+    ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
     return law.shear_modulus() * (1 - jnp.sum(ratios, axis=0))
 
 
