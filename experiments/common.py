@@ -19,6 +19,8 @@ import matplotlib.pyplot as plt
 
 from liverjax.core.versions import versions
 
+# Compile times are those of a machine that has compiled nothing yet.
+os.environ["LIVERJAX_CACHE"] = "off"
 #: Fewer cases and smaller ones, for a look at whether everything runs; published results stay as they are.
 QUICK = "--quick" in sys.argv[1:]
 ROOT = Path(__file__).parent.parent

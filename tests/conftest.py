@@ -66,6 +66,7 @@ def pytest_configure(config):
         config.option.markexpr = ""
     if not hasattr(config, "workerinput"):
         config.compiled = tempfile.mkdtemp()
+        os.environ["LIVERJAX_CACHE"] = "off"  # the user's own stays as it is
         os.environ["JAX_COMPILATION_CACHE_DIR"] = config.compiled
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
 

@@ -52,6 +52,14 @@ def test_no_material_is_accused(noise):
     assert sum(accused) <= 1
 
 
+@pytest.mark.parametrize(("slope", "breaks"), [(0.95, False), (1.3, True), (-0.1, True)])
+def test_the_bound_on_the_rise_is_the_loss_itself(slope, breaks):
+    """G'' of 100 Pa everywhere: G' may rise by 100 Pa an e-fold (a single mode at its time does), by no more."""
+    s = Sweep(OMEGA, 600 + slope * 100 * np.log(OMEGA), np.full(31, 100.0))
+    # Between two frequencies the loss may be higher than at either by half of their step: 12 % here.
+    assert bool(of_data(s).breaches) == breaks
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_inertia_of_the_instrument_is_named(sign):
     for seed in range(5):

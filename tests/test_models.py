@@ -275,3 +275,37 @@ def test_a_sweep_of_no_maxwell_solid_is_refused_for_every_model(tmp_path, capsys
     assert "are the two columns exchanged" in capsys.readouterr().err
     with pytest.raises(InputError):
         generalised_maxwell.refuse_impossible(read_sweep(file))
+
+
+@pytest.mark.slow
+def test_no_start_of_scipy_is_below_the_fluid():
+    s, rng, best = maxwell_fluid(0.02), np.random.default_rng(0), np.inf
+    scales, data = np.concatenate(s.deviations), np.concatenate([s.storage, s.loss])
+    f = models.fluid(s, generalised_maxwell.spectrum(s))
+
+    def residuals(q):
+        strengths, times = np.exp(np.split(np.clip(q, -50, 50), 2))
+        x = 1j * s.angular_frequency[:, None] * times
+        G = (strengths * x / (1 + x)).sum(axis=1)
+        return (np.concatenate([G.real, G.imag]) - data) / scales
+
+    for _ in range(100):
+        start = np.concatenate([rng.uniform(3, 8, f.modes), rng.uniform(-5, 4, f.modes)])
+        best = min(best, scipy.optimize.least_squares(residuals, start, x_scale="jac").cost)
+    assert float(f.solution.cost) <= best * (1 + 1e-8)
+
+
+@pytest.mark.slow
+def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
+    """Synthetic: two broad fractional steps and a plateau, 2 % noise; 8 or 9 free modes stop at 30 % here."""
+    omega = np.geomspace(1e-12, 1e14, 160)
+    slow, fast = (1j * omega * 1e8) ** 0.8, (1j * omega * 1e-5) ** 0.45
+    G = 2e3 + 1e6 * slow / (1 + slow) + 1e9 * fast / (1 + fast)
+    factor = 1 + 0.02 * np.random.default_rng(0).standard_normal((2, 160))
+    s = Sweep(omega, G.real * factor[0], G.imag * factor[1])
+    f = models.spectrum(s)
+    assert np.mean(f.relative_errors(s)) < 0.02 and f.details["conversion"]["largest_relative_error"] < 0.01
+    exact = np.concatenate([G.real, G.imag])
+    # The noise of 2 % is averaged over about seven moduli a parameter.
+    assert np.mean(np.abs(np.concatenate([f.storage, f.loss]) / exact - 1)) < 0.012
+    assert f.details["spectrum"]["decades_carried"] > 20

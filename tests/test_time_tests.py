@@ -3,6 +3,7 @@
 import json
 
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 import scipy.integrate
@@ -63,6 +64,17 @@ def test_creep_of_one_mode_is_the_textbook_one():
     assert np.allclose(time_response.creep_compliance(one, t), exact, rtol=1e-12)
     flows = Maxwell(jnp.array(G0), jnp.array([1.0]), jnp.array([tau]))
     assert np.allclose(time_response.creep_compliance(flows, t), (1 + t / tau) / G0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("x", [1e-9, 1e-5, 9e-4, 1.1e-3, 0.3, 40.0])
+def test_the_two_functions_of_a_step_keep_their_digits(x):
+    with mpmath.workdps(40):
+        z = mpmath.mpf(x)
+        exact = [(1 - mpmath.exp(-z)) / z, (z - 1 + mpmath.exp(-z)) / z**2]
+    found = time_response._phi(jnp.array(x))
+    # The second loses up to six digits just above the change to its series.
+    assert np.allclose([float(v) for v in found], [float(v) for v in exact], rtol=1e-9)
+    assert [float(v) for v in time_response._phi(jnp.array(0.0))] == [1.0, 0.5]
 
 
 def test_strain_of_a_driven_stress_is_that_of_steps_added_up():

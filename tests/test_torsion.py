@@ -1,11 +1,17 @@
 """The simulated rheometer: discrete and continuous formulas, orders, gradients, other programs, extremes."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import liverjax as lj
+from fitting.fits import viscoelastic
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.rheometer import Sweep
 from fitting.rigs import torsion
 from fitting.rigs.torsion import Drive
 from liverjax.core.struct import replace
@@ -113,6 +119,49 @@ def test_relaxing_the_isochoric_part_alone(rig, law, prony):
     )
     difference = np.abs(_complex(m) / _discrete(prony, OMEGA, 50) - 1).max()
     assert difference < 1e-6
+
+
+#: Radius and height [m]: of the README's data, of a small rig, of a tall and of a flat sample.
+PLATES = [(0.004, 0.0092), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((0.01, 0.004), (0.01, 0.041)))]
+
+
+@pytest.mark.parametrize(("radius", "height"), [*PLATES, pytest.param(0.02, 0.001, marks=pytest.mark.slow)])
+def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
+    """What is left after the correction is of the order of the strain, on any mesh."""
+    rig, strain = torsion.make_rig(radius, height, torsion.linear_cell_for(radius, height)), 1e-3
+    assert 70 <= rig.mesh.number_of_nodes <= 200
+    angle = strain * height / radius
+    m = torsion.moduli(rig, law, prony, OMEGA, angle, Drive(by="angle"))
+    exact = np.asarray(torsion.linear_moduli(law, prony, jnp.asarray(OMEGA), 50))
+    assert np.abs(_complex(m) / exact - 1).max() < 0.1 * strain
+    assert np.allclose(m.bias, torsion.geometry_factor(rig, law), rtol=1e-9)
+
+
+@pytest.mark.parametrize("part", ["all", pytest.param("isochoric", marks=pytest.mark.slow)])
+def test_the_linear_rig_has_the_derivatives_of_the_simulation(part):
+    """Along a random direction in all parameters, to the order of the strain; a fit needs no more."""
+    sweep = Sweep(OMEGA, np.array([320.0, 480.0, 580.0]), np.array([50.0, 110.0, 130.0]))
+    simulation = viscoelastic.Simulation(cell_size=0.004, part=part)
+    rig, law = viscoelastic.rig_of(simulation), lj.laws.typical("neo_hookean")
+    torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
+    measured = np.concatenate([sweep.storage, sweep.loss])
+    data = (rig, law, jnp.asarray(OMEGA), torque, measured, np.ones(6))
+    run = jax.jit(partial(viscoelastic.with_jacobian, simulation=simulation))
+    model = Maxwell(np.array(770.0), np.array([0.235, 0.333]), np.array([0.27, 0.03]))
+    u, direction = generalised_maxwell.unconstrained(model), np.random.default_rng(0).normal(size=5)
+    slope = np.asarray(run(u, data)[1]) @ direction
+    h = 1e-4  # truncation h^2, roundoff of the solved steps 1e-9 / h
+    up, down = (np.asarray(run(u + s * h * direction, data)[0]) for s in (1, -1))
+    assert np.abs((up - down) / (2 * h) - slope).max() < simulation.strain * np.abs(slope).max()
+
+
+def test_inertia_and_large_strain_keep_the_derivative_and_the_mesh_of_the_simulation(monkeypatch):
+    coarse = viscoelastic.rig_of(viscoelastic.Simulation()).mesh.number_of_nodes
+    for simulation in (viscoelastic.Simulation(density=1060.0), viscoelastic.Simulation(strain=0.05)):
+        assert viscoelastic.rig_of(simulation).mesh.number_of_nodes > 2 * coarse
+        monkeypatch.setattr(viscoelastic, "simulated_residuals", lambda u, *_: (u**2, None))
+        _, J, _ = viscoelastic.with_jacobian(jnp.arange(3.0), (), simulation)
+        assert np.allclose(J, np.diag([0.0, 2.0, 4.0]))
 
 
 LAWS_OWN = {"neo_hookean": {"bulk": 1.0}, "mooney_rivlin": {"c10": 1.0, "c01": 1.0}}

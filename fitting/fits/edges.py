@@ -8,7 +8,7 @@ from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, Fit
 from fitting.methods import consistency, generalised_maxwell, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
-from fitting.methods.least_squares import levenberg_marquardt
+from fitting.methods.least_squares import from_starts, levenberg_marquardt
 from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
@@ -74,7 +74,7 @@ def moved(fit: Fit) -> set[str]:
 
 
 def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None:
-    """New values minus old ones of a fit to the points kept; the program is that of all points, some without weight."""
+    """New values minus old ones of a fit to the points kept."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
     part = some(sweep, kept)
@@ -83,13 +83,14 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         found = fit.details["spectrum"]
         grid = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
         return {name: grid.equilibrium - value for name, value in old.items()}
-    scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         reference = springpots.reference_frequency(sweep)
         starts = springpots.starts(part)
         starts[-1, list(model.free)] = np.asarray(fit.solution.u)
         best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
+        # The program is that of all points, some without weight: it is there already.
+        scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         data = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, scales)
         u = viscoelastic.timed(best, starts, np.tile(model.switches, (len(starts), 1)), *data)[0].u
         return {n: float(v) - old[n] for n, v in zip(model.names, model.values(u, reference), strict=True)}
@@ -97,12 +98,11 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     fluid = fit.kind.name == FLUID.name
     starts = np.stack([generalised_maxwell.fluid_of(u) for u in starts]) if fluid else starts
     starts[-1] = np.asarray(fit.solution.u)
-    data = (sweep.angular_frequency, sweep.storage, sweep.loss, scales)
-    best = viscoelastic.best_of(levenberg_marquardt, viscoelastic.residuals_of(fit.kind))
-    G0, ratios, times = fit.kind.maxwell(viscoelastic.timed(best, starts, *data)[0].u)
-    numbers = np.concatenate([[G0], ratios, times])
+    data = (part.angular_frequency, part.storage, part.loss, np.concatenate(part.deviations))
+    model = fit.kind.maxwell(from_starts(viscoelastic.residuals_of(fit.kind), starts, *data).u)
+    numbers = np.concatenate([[model.shear_modulus], model.ratios, model.relaxation_times])
     new = dict(zip(fit.uncertainty.names, numbers.tolist(), strict=True))
-    new["equilibrium_modulus"] = float(G0 * (1 - ratios.sum()))
+    new["equilibrium_modulus"] = float(model.equilibrium_modulus)
     return {name: new[name] - value for name, value in old.items()}
 
 

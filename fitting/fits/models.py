@@ -153,7 +153,7 @@ def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
     for modes in range(1, largest + 1):
         solid = generalised_maxwell.starts(sweep, modes, dense)
         starts = np.stack([generalised_maxwell.fluid_of(u) for u in solid])
-        fit = viscoelastic.from_starts(sweep, starts, viscoelastic.FLUID)
+        fit = viscoelastic.modes_from(sweep, starts, viscoelastic.FLUID)
         better = chosen is None or information_criterion(fit) < information_criterion(chosen)
         if chosen is None or (better and identifiable(fit, sweep)):
             chosen, failures = fit, 0

@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import viscoelastic
@@ -128,8 +127,7 @@ def _one(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
     data = (test.time, test.driven, rows, test.answer[rows], scales)
     best = viscoelastic.best_of(levenberg_marquardt, _residuals(test.kind, kind.name))
     found, compiling, running = viscoelastic.timed(best, _starts(test, rows, modes, kind), *data)
-    G0, ratios, times = (np.asarray(v) for v in kind.maxwell(found.u))
-    model: Any = Maxwell(G0, ratios, times)  # type: ignore[arg-type]  # arrays of the host
+    model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
     spread = uncertainty.estimate(found, False, kind.maxwell)
     fitted = np.asarray(found.residuals) * scales + test.answer[rows]
     at = (test.time[rows], test.answer[rows], fitted, scales)
@@ -159,8 +157,7 @@ def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int
         A = np.column_stack([np.ones(len(rows)), np.exp(-test.time[rows][:, None] / times)])
         strengths, _ = generalised_maxwell.non_negative(A / apparent[:, None], np.ones(len(rows)))
         share = np.maximum(strengths / strengths.sum(), 0.01)
-        model = Maxwell(jnp.asarray(strengths.sum()), jnp.asarray(share[1:] / share.sum()), jnp.asarray(times))
-        u = np.asarray(generalised_maxwell.unconstrained(model))
+        u = generalised_maxwell.unconstrained(Maxwell(strengths.sum(), share[1:] / share.sum(), times))
         out.append(generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u)
     return np.stack(out)
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import generalised_maxwell, uncertainty
-from fitting.methods.estimate import Estimate
+from fitting.methods.estimate import Estimate, mesh_bias
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
-from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt, levenberg_marquardt_host
+from fitting.methods.host import Array
+from fitting.methods.least_squares import Solution, bfgs, from_starts, levenberg_marquardt_host
 from fitting.readers.rheometer import Sweep
 from fitting.rigs import torsion
 from liverjax import laws
 from liverjax.core import status
+from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.physics.viscosity import Prony
 
@@ -27,7 +29,7 @@ class Kind(NamedTuple):
     """What the numbers u of a fit mean: by default the Prony modes themselves."""
 
     name: str = "prony"
-    maxwell: Callable[[jax.Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
+    maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
     names: tuple[str, ...] = ()  # of its own parameters, where they are not the modes
     units: tuple[str, ...] = ()
     values: Callable[[jax.Array], jax.Array] | None = None  # u -> its own parameters (P,)
@@ -116,19 +118,23 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
     """
     check_modes(sweep, modes)
     dense = dense or generalised_maxwell.refuse_impossible(sweep)
-    return from_starts(sweep, generalised_maxwell.starts(sweep, modes, dense), Kind(), optimizer)
+    return modes_from(sweep, generalised_maxwell.starts(sweep, modes, dense), Kind(), optimizer)
 
 
-def from_starts(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = "levenberg-marquardt") -> Fit:
-    """The best minimum over `starts` (S, P) of Prony modes, of a solid or (by `kind`) of a fluid."""
-    minimise = levenberg_marquardt if optimizer == OPTIMIZERS[0] else bfgs
+def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer: str = OPTIMIZERS[0]) -> Fit:
+    """The best fit over `starts` (S, P) of Prony modes, of a solid or (by `kind`) of a fluid."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
-    found, compiling, running = timed(best_of(minimise, residuals_of(kind)), starts, *data)
+    if optimizer == OPTIMIZERS[0]:
+        begin = time.perf_counter()
+        found, compiling = from_starts(residuals_of(kind), starts, *data), 0.0
+        running = time.perf_counter() - begin
+    else:
+        found, compiling, running = timed(best_of(bfgs, residuals_of(kind)), starts, *data)
     return fitted(sweep, found, kind, running, compiling, {"optimizer": optimizer})
 
 
-def residuals_of(kind: Kind) -> Callable[..., jax.Array]:
-    """Residuals of Prony modes, of a solid or a fluid."""
+def residuals_of(kind: Kind) -> Callable[..., Array]:
+    """Residuals of Prony modes, of a solid or a fluid; of NumPy and of JAX."""
     return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
@@ -164,8 +170,8 @@ def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], 
     if not converged:
         reason = f"the fit did not converge in {int(found.iterations)} iterations; its best point is given"
         sentences = (f"{reason}: {advice[0]}", *sentences)
-    G0, ratios, times = (np.asarray(v) for v in kind.maxwell(jnp.asarray(found.u)))
-    model: Any = Maxwell(G0, ratios, times)  # type: ignore[arg-type]  # arrays of the host
+    modes = len(spread.values) // 2
+    model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
     details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
     return Fit(at.method, model, found, spread, converged, storage, loss, sentences, *seconds, details, kind, own)
 
@@ -288,18 +294,75 @@ class Simulation(NamedTuple):
     density: float | None = None  # of the sample [kg/m^3]; None: moduli that the instrument corrected for inertia
 
 
-def simulated_moduli(
-    model: Maxwell, rig: torsion.Rig, law: laws.Law, omega: Any, torque: Any, simulation: Simulation
-) -> torsion.Moduli:
-    """`torsion.moduli` of Prony modes, the law scaled to their G0."""
-    scaled = laws.scaled(law, model.shear_modulus / law.shear_modulus())
+#: Strain at the rim up to which the derivatives of the linear rig serve: they are off by less than the strain.
+LINEAR_STRAIN = 1e-2
+
+
+def _law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
+    """The sample of Prony modes: the law scaled to their G0, and how it relaxes."""
     viscosity = Prony(
         ratios=model.ratios,
         relaxation_times=model.relaxation_times,
         scheme=simulation.scheme,
         part=simulation.part,
     )
-    return torsion.moduli(rig, scaled, viscosity, omega, torque, torsion.Drive(steps=simulation.steps))
+    return laws.scaled(law, model.shear_modulus / law.shear_modulus()), viscosity
+
+
+def _and_prior(r: jax.Array, u: jax.Array, kind: Kind) -> jax.Array:
+    return r if kind.prior is None else jnp.concatenate([r, kind.prior(u)])
+
+
+def simulated_residuals(
+    u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
+) -> tuple[jax.Array, torsion.Moduli]:
+    """Simulated less measured moduli over their deviations (2n,), rows of a prior below, and what was simulated.
+
+    Args:
+        u: numbers of `kind`.
+        data: rig, law, angular frequencies (n,) [rad/s], torque amplitudes (n,) [N m], measured moduli G' then G''
+            (2n,) [Pa] and their deviations.
+        simulation: law, recursion and resolution.
+        kind: what u means; its Prony modes are simulated.
+    """
+    rig, law, omega, torque, measured, scales = data
+    drive = torsion.Drive(steps=simulation.steps)
+    m = torsion.moduli(rig, *_law_and_prony(kind.maxwell(u), law, simulation), omega, torque, drive)
+    return _and_prior((jnp.concatenate([m.storage, m.loss]) - measured) / scales, u, kind), m
+
+
+def with_jacobian(
+    u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
+) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
+    """Residuals, their derivative by u (rows, P), and what was simulated; arguments as of `simulated_residuals`.
+
+    The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation. Gauss-Newton
+    goes to the same minimum with it, in a small part of the time (experiments/benchmarks/torsion_speed.py).
+    """
+    if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
+
+        def twice(u):
+            r, m = simulated_residuals(u, data, simulation, kind)
+            return r, (r, m)
+
+        J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
+        return r, J, m
+    _, law, omega, _, _, scales = data
+
+    def linear(u):
+        G = torsion.linear_moduli(*_law_and_prony(kind.maxwell(u), law, simulation), omega, simulation.steps)
+        return _and_prior(jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales, u, kind)
+
+    r, m = simulated_residuals(u, data, simulation, kind)
+    return r, jax.jacfwd(linear)(u), m
+
+
+def rig_of(simulation: Simulation) -> torsion.Rig:
+    """The sample of a simulation; its mesh is coarse where the bias of the mesh is known exactly."""
+    cell = simulation.cell_size
+    if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
+        cell = torsion.linear_cell_for(simulation.radius, simulation.height)
+    return torsion.make_rig(simulation.radius, simulation.height, cell, density=simulation.density)
 
 
 #: What the closed form says of data and model, which the simulation leaves as it is: words of warnings, and details.
@@ -335,62 +398,72 @@ def through_torsion(
     from liverjax.physics.viscosity import check
 
     law = laws.typical(simulation.law)
-    rig = torsion.make_rig(simulation.radius, simulation.height, simulation.cell_size, density=simulation.density)
     check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
+    rig = rig_of(simulation)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
     data = (rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales)
-
-    def residuals(u, rig, law, omega, torque, measured, scales):
-        m = simulated_moduli(kind.maxwell(u), rig, law, omega, torque, simulation)
-        r = (jnp.concatenate([m.storage, m.loss]) - measured) / scales
-        return r if kind.prior is None else jnp.concatenate([r, kind.prior(u)]), m
-
-    def evaluate(u, *data):
-        def twice(u):
-            r, m = residuals(u, *data)
-            return r, (r, m)
-
-        J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
-        return r, J, m
-
-    u0, kind = start.solution.u, start.kind
-    begin = time.perf_counter()
+    u0, kind = jnp.asarray(start.solution.u), start.kind
     if optimizer == OPTIMIZERS[0]:
-        compiled = jax.jit(evaluate).lower(u0, *data).compile()
+        begin = time.perf_counter()
+        program = compiled(partial(with_jacobian, simulation=simulation, kind=kind), u0, data)
         compiling = time.perf_counter() - begin
         seen = {}
 
         def evaluated(u):
-            r, J, seen[u.tobytes()] = compiled(u, *data)
+            r, J, seen[np.asarray(u).tobytes()] = program(u, data)
             return r, J
 
-        found = levenberg_marquardt_host(lambda u: evaluated(np.asarray(u)), u0, progress=progress)
+        found = levenberg_marquardt_host(evaluated, u0, progress=progress)
         m = seen[np.asarray(found.u).tobytes()]
         running = time.perf_counter() - begin - compiling
     else:
-        (found, m), compiling, running = timed(
-            lambda u, *data: (lambda s: (s, residuals(s.u, *data)[1]))(
-                bfgs(lambda u, *d: residuals(u, *d)[0], u, *data)
-            ),
-            u0,
-            *data,
-        )
+
+        def minimised(u, *data):
+            found = bfgs(lambda u, *data: simulated_residuals(u, data, simulation, kind)[0], u, *data)
+            return found, simulated_residuals(found.u, data, simulation, kind)[1]
+
+        (found, m), compiling, running = timed(minimised, u0, *data)
+    if isinstance(start.solution.u, np.ndarray):  # what follows runs where the closed form did
+        found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.max(m.statistics.status))
-    found = found._replace(converged=jnp.asarray(bool(found.converged) and worst == status.CONVERGED))
+    found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = Simulated("torsion", found, storage, loss, advice)
     fit = _fit(sweep, at, kind, (running, compiling), details)
+    if simulation.density is None and simulation.strain <= LINEAR_STRAIN and kind.prior is None:
+        fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = fit._replace(details=fit.details | of_the_model)
     return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
 
 
+def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
+    """What mesh and time steps of the simulation move the parameters, to first order (`mesh_bias`).
+
+    At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time.
+    """
+    law, omega, scales = data
+    scaled, prony = _law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
+    meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
+    exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
+    natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
+    found = fit.solution._replace(u=jnp.asarray(fit.solution.u))
+
+    def moved(missing: np.ndarray) -> np.ndarray:
+        return mesh_bias(found, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
+
+    return fit.uncertainty._replace(
+        mesh_bias=moved(meshless - (fit.storage + 1j * fit.loss)), time_step_bias=moved(exact - meshless)
+    )
+
+
 def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
     """What the simulation was and did, for the report."""
+    whole = simulation.part == "all"  # then the bias is the same at every frequency, and known
     return {
         "law": simulation.law,
         "radius_m": simulation.radius,
@@ -398,7 +471,7 @@ def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law,
         "density_kg_m3": simulation.density,
         "nodes": rig.mesh.number_of_nodes,
         "elements": rig.mesh.number_of_elements,
-        "geometry_factor": float(torsion.geometry_factor(rig, law)),
+        "geometry_factor": float(m.bias[0].real if whole else torsion.geometry_factor(rig, law)),
         "steps_per_cycle": simulation.steps,
         "scheme": simulation.scheme,
         "part": simulation.part,

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.stats
+import scipy.special
 
+from fitting.methods import host
 from fitting.methods.least_squares import Solution
 
 #: Stands in a covariance for an error that has no bound; a square of it is still a number.
@@ -29,6 +30,7 @@ class Estimate(NamedTuple):
     codes: tuple[int, ...] = ()  # worst code of each simulation
     seconds: float = 0.0
     mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
+    time_step_bias: np.ndarray | None = None  # (P,) the same of its time steps
 
     @property
     def covariance(self) -> np.ndarray:
@@ -38,7 +40,7 @@ class Estimate(NamedTuple):
     @property
     def quantile(self) -> float:
         """Of Student's t for a 95 % interval."""
-        return float(scipy.stats.t.ppf(0.975, max(1, self.components - len(self.names))))
+        return float(scipy.special.stdtrit(max(1, self.components - len(self.names)), 0.975))
 
 
 def estimated(
@@ -54,7 +56,7 @@ def estimated(
     Args:
         names: of the numbers to report.
         natural_of: u -> these numbers (P,).
-        found: minimum over u.
+        found: minimum over u; if it is NumPy's, `natural_of` is one for `host.with_jacobian`.
         components: how many of the residuals are measured; those that are not are 0 and count for nothing.
         deviations_given: as of `noise_factor`.
         effective: where a prior holds u: the number of parameters that the data determine. The rows of the prior
@@ -64,7 +66,11 @@ def estimated(
     if effective is not None:
         r = r[:components]
     noise = noise_factor(r, components - (len(u) if effective is None else effective), deviations_given)
-    values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
+    if isinstance(found.u, np.ndarray):
+        values, to_natural = host.with_jacobian(natural_of, found.u)
+    else:
+        both = jax.jit(lambda u: (natural_of(u), jax.jacfwd(natural_of)(u)))  # one program instead of many small ones
+        values, to_natural = (np.asarray(v) for v in both(found.u))
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
     # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.

@@ -1,15 +1,15 @@
 """The generalised Maxwell model: closed-form moduli, an unconstrained parametrisation, starting points.
 
 G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), chapter section 5.2; g_i are ratios of G0 (Table 2 prints Pa).
+The formulas take arrays of NumPy and of JAX, with axes in front of those named here (see `fitting.methods.host`).
 """
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
+from fitting.methods.host import Array, arrays_of
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
 
@@ -17,73 +17,85 @@ from liverjax.core.errors import InputError
 class Maxwell(NamedTuple):
     """Parameters of a generalised Maxwell solid; relaxation times descend."""
 
-    shear_modulus: jax.Array  # G0, instantaneous [Pa]
-    ratios: jax.Array  # g_i (N,)
-    relaxation_times: jax.Array  # tau_i (N,) [s]
+    shear_modulus: Array  # G0, instantaneous [Pa]
+    ratios: Array  # g_i (N,)
+    relaxation_times: Array  # tau_i (N,) [s]
 
     @property
-    def equilibrium_modulus(self) -> jax.Array:
+    def equilibrium_modulus(self) -> Array:
         """G0 (1 - sum g_i) [Pa]."""
-        return self.shear_modulus * (1 - jnp.sum(self.ratios))
+        return self.shear_modulus * (1 - self.ratios.sum(axis=-1))
 
 
-def moduli(model: Maxwell, omega: jax.Array) -> tuple[jax.Array, jax.Array]:
+def moduli(model: Maxwell, omega: Array) -> tuple[Array, Array]:
     """G' and G'' [Pa] at angular frequencies omega (n,) [rad/s]."""
-    x = omega[:, None] * model.relaxation_times[None]
-    ratios = model.ratios[None]
-    loss = jnp.sum(ratios * x / (1 + x * x), axis=-1)
-    storage = 1 - jnp.sum(ratios / (1 + x * x), axis=-1)
-    return model.shear_modulus * storage, model.shear_modulus * loss
+    xp = arrays_of(model.ratios, omega)
+    x = omega[:, None] * model.relaxation_times[..., None, :]
+    ratios = model.ratios[..., None, :]
+    loss = xp.sum(ratios * x / (1 + x * x), axis=-1)
+    storage = 1 - xp.sum(ratios / (1 + x * x), axis=-1)
+    shear_modulus = xp.asarray(model.shear_modulus)[..., None]
+    return shear_modulus * storage, shear_modulus * loss
 
 
-def natural(u: jax.Array) -> Maxwell:
+def natural(u: Array) -> Maxwell:
     """Model of unconstrained parameters u (2N + 1,).
 
     u = log G0; logits of the ratios against the equilibrium part (softmax, so every ratio is positive and their sum
     below one); log of the longest time, then log of the gaps between log times (so they descend).
     """
-    n = (u.shape[0] - 1) // 2
-    share = jax.nn.softmax(jnp.append(u[1 : n + 1], 0.0))[:n]
-    log_times = u[n + 1] - jnp.append(0.0, jnp.cumsum(jnp.exp(u[n + 2 :])))
-    return Maxwell(jnp.exp(u[0]), share, jnp.exp(log_times))
+    n = (u.shape[-1] - 1) // 2
+    return Maxwell(arrays_of(u).exp(u[..., 0]), _shares(u[..., 1 : n + 1])[..., :n], _times(u[..., n + 1 :]))
 
 
-def unconstrained(model: Maxwell) -> jax.Array:
+def _shares(logits: Array) -> Array:
+    """Softmax of logits (N,) and of a last one that is 0, (N + 1,)."""
+    xp = arrays_of(logits)
+    logits = xp.concatenate([logits, xp.zeros((*logits.shape[:-1], 1), logits.dtype)], axis=-1)
+    share = xp.exp(logits - xp.max(logits.real, axis=-1, keepdims=True))  # the largest is exp(0)
+    return share / xp.sum(share, axis=-1, keepdims=True)
+
+
+def _times(u: Array) -> Array:
+    """Descending relaxation times (N,) of the log of the first and the logs of the gaps between their logs."""
+    xp = arrays_of(u)
+    gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(xp.exp(u[..., 1:]), axis=-1)], axis=-1)
+    return xp.exp(u[..., :1] - gaps)
+
+
+def unconstrained(model: Maxwell) -> Array:
     """Inverse of `natural`; relaxation times are sorted, ratios must be positive with a sum below one."""
-    order = jnp.argsort(-jnp.asarray(model.relaxation_times))
-    g, log_tau = jnp.asarray(model.ratios)[order], jnp.log(jnp.asarray(model.relaxation_times)[order])
-    gaps = jnp.log(jnp.maximum(-jnp.diff(log_tau), 1e-3))
-    return jnp.concatenate(
-        [jnp.log(jnp.atleast_1d(model.shear_modulus)), jnp.log(g / (1 - g.sum())), log_tau[:1], gaps]
-    )
+    xp = arrays_of(*model)
+    order = xp.argsort(-xp.asarray(model.relaxation_times))
+    g, log_tau = xp.asarray(model.ratios)[order], xp.log(xp.asarray(model.relaxation_times)[order])
+    gaps = xp.log(xp.maximum(-xp.diff(log_tau), 1e-3))
+    top = xp.log(xp.atleast_1d(model.shear_modulus))
+    return xp.concatenate([top, xp.log(g / (1 - g.sum())), log_tau[:1], gaps])
 
 
-def residuals(u: jax.Array, omega: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array) -> jax.Array:
+def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
     """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
-    return (jnp.concatenate(moduli(natural(u), omega)) - jnp.concatenate([storage, loss])) / scales
+    xp = arrays_of(u)
+    return (xp.concatenate(moduli(natural(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
 
-def natural_fluid(u: jax.Array) -> Maxwell:
+def natural_fluid(u: Array) -> Maxwell:
     """Model without an equilibrium modulus of u (2N,): as `natural`, the last mode in place of the equilibrium part."""
-    n = u.shape[0] // 2
-    share = jax.nn.softmax(jnp.append(u[1:n], 0.0))
-    log_times = u[n] - jnp.append(0.0, jnp.cumsum(jnp.exp(u[n + 1 :])))
-    return Maxwell(jnp.exp(u[0]), share, jnp.exp(log_times))
+    n = u.shape[-1] // 2
+    return Maxwell(arrays_of(u).exp(u[..., 0]), _shares(u[..., 1:n]), _times(u[..., n:]))
 
 
-def fluid_residuals(
-    u: jax.Array, omega: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array
-) -> jax.Array:
+def fluid_residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
     """As `residuals`, of a model without an equilibrium modulus."""
-    return (jnp.concatenate(moduli(natural_fluid(u), omega)) - jnp.concatenate([storage, loss])) / scales
+    xp = arrays_of(u)
+    return (xp.concatenate(moduli(natural_fluid(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
 
 def fluid_of(u: np.ndarray) -> np.ndarray:
     """u of `natural_fluid` (2N,) from u of `natural` (2N + 1,): the equilibrium part is left out."""
     n = (len(u) - 1) // 2
-    model = natural(jnp.asarray(u))
-    last = np.log(np.asarray(model.ratios[:-1])) - np.log(float(model.ratios[-1]))
-    return np.concatenate([u[:1], last, u[n + 1 :]])
+    ratios = natural(u).ratios
+    return np.concatenate([u[:1], np.log(ratios[:-1] / ratios[-1]), u[n + 1 :]])
 
 
 def largest_number_of_modes(sweep: Sweep) -> int:
@@ -183,4 +195,4 @@ def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
     total = strengths.sum()
     share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
     share = share / share.sum()
-    return np.asarray(unconstrained(Maxwell(jnp.asarray(total), jnp.asarray(share[1:]), jnp.asarray(times))))
+    return np.asarray(unconstrained(Maxwell(total, share[1:], times)))

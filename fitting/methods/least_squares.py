@@ -1,90 +1,103 @@
-"""Nonlinear least squares: Levenberg-Marquardt with a Jacobian by forward mode, and BFGS of jax.scipy beside it."""
+"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy beside it.
+
+One iteration serves all: its arrays may be JAX's or NumPy's, and may have axes in front, one entry a fit.
+"""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.scipy.optimize
+import numpy as np
+
+from fitting.methods import host
+from fitting.methods.host import Array
 
 
 class Solution(NamedTuple):
     """A minimum of cost = |r|^2 / 2, or the best point found."""
 
-    u: jax.Array
-    residuals: jax.Array
-    jacobian: jax.Array
-    cost: jax.Array
-    iterations: jax.Array
-    gradient: jax.Array  # largest cosine between the residuals and a column of the Jacobian
-    converged: jax.Array
+    u: Array
+    residuals: Array
+    jacobian: Array
+    cost: Array
+    iterations: Array
+    gradient: Array  # largest cosine between the residuals and a column of the Jacobian
+    converged: Array
 
 
 class State(NamedTuple):
     """Levenberg-Marquardt between two evaluations: the best point, and the trial to evaluate next."""
 
-    u: jax.Array
-    r: jax.Array
-    J: jax.Array
-    trial: jax.Array
-    predicted: jax.Array  # gain of cost that the trial promises
-    damping: jax.Array
-    growth: jax.Array
-    iterations: jax.Array
-    converged: jax.Array
-    stuck: jax.Array
+    u: Array
+    r: Array
+    J: Array
+    trial: Array
+    predicted: Array  # gain of cost that the trial promises
+    damping: Array
+    growth: Array
+    iterations: Array
+    converged: Array
+    stuck: Array
 
 
 #: Convergence: gain of the undamped step over the cost, and mean squared residual that counts as zero.
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
 
 
-def _steps(J: jax.Array, r: jax.Array, damping: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
     """Damped step, the gain of cost it promises, and that of the undamped step; one singular value decomposition."""
-    scale = jnp.maximum(jnp.linalg.norm(J, axis=0), 1e-300)
-    U, s, Vt = jnp.linalg.svd(J / scale[None], full_matrices=False)
-    beta = U.T @ r
-    weight = s / (s * s + damping)
-    gain = jnp.sum(beta * beta * s * weight * (1 - 0.5 * s * weight))
-    return -(Vt.T @ (weight * beta)) / scale, gain, 0.5 * jnp.sum(jnp.where(s > 1e-12 * s[0], beta * beta, 0.0))
+    xp = host.arrays_of(J)
+    scale = xp.maximum(xp.linalg.norm(J, axis=-2), 1e-300)
+    U, s, Vt = xp.linalg.svd(J / scale[..., None, :], full_matrices=False)
+    beta = xp.sum(U * r[..., :, None], axis=-2)
+    weight = s / (s * s + damping[..., None])
+    gain = xp.sum(beta * beta * s * weight * (1 - 0.5 * s * weight), axis=-1)
+    step = -xp.sum(Vt * (weight * beta)[..., :, None], axis=-2) / scale
+    return step, gain, 0.5 * xp.sum(xp.where(s > 1e-12 * s[..., :1], beta * beta, 0.0), axis=-1)
 
 
-def begin(u: jax.Array, n_residuals: int, damping: float = 1e-3) -> State:
-    """State whose first trial is u itself."""
-    dtype = u.dtype
-    infinite = jnp.full(n_residuals, jnp.inf, dtype)
-    no = jnp.array(False)
+def begin(u: Array, n_residuals: int, damping: float = 1e-3) -> State:
+    """State whose first trial is u (…, P) itself."""
+    xp, dtype, fits = host.arrays_of(u), u.dtype, u.shape[:-1]
+    no = xp.full(fits, False)
     return State(
         u=u,
-        r=infinite,
-        J=jnp.zeros((n_residuals, u.shape[0]), dtype),
+        r=xp.full((*fits, n_residuals), xp.inf, dtype),
+        J=xp.zeros((*fits, n_residuals, u.shape[-1]), dtype),
         trial=u,
-        predicted=jnp.asarray(jnp.inf, dtype),
-        damping=jnp.asarray(damping, dtype),
-        growth=jnp.asarray(2.0, dtype),
-        iterations=jnp.asarray(-1, jnp.int32),
+        predicted=xp.full(fits, xp.inf, dtype),
+        damping=xp.full(fits, damping, dtype),
+        growth=xp.full(fits, 2.0, dtype),
+        iterations=xp.full(fits, -1, xp.int32),
         converged=no,
         stuck=no,
     )
 
 
-def accept(s: State, r: jax.Array, J: jax.Array, gain: float = GAIN) -> State:
+def _cost(r: Array) -> Array:
+    return 0.5 * (r * r).sum(axis=-1)
+
+
+def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
     """Go to the trial if it is better, else raise the damping (Nielsen 1999); propose the next trial."""
+    xp = host.arrays_of(s.u)
     first = s.iterations < 0
-    cost, cost_new = 0.5 * s.r @ s.r, 0.5 * r @ r
+    cost, cost_new = _cost(s.r), _cost(r)
     # False for NaN; without its derivatives a point leads nowhere.
-    better = (cost_new < cost) & jnp.all(jnp.isfinite(J))
-    rho = jnp.where(first, 0.5, (cost - cost_new) / jnp.where(s.predicted > 0, s.predicted, 1.0))
-    easier = jnp.where(first, s.damping, s.damping * jnp.maximum(1 / 9, 1 - (2 * rho - 1) ** 3))
-    damping = jnp.where(better, jnp.maximum(easier, 1e-14), s.damping * s.growth)
-    u, r, J = (jnp.where(better, new, old) for new, old in ((s.trial, s.u), (r, s.r), (J, s.J)))
-    cost = jnp.minimum(cost, jnp.where(better, cost_new, cost))
+    better = (cost_new < cost) & xp.all(xp.isfinite(J), axis=(-2, -1))
+    rho = xp.where(first, 0.5, (cost - cost_new) / xp.where(s.predicted > 0, s.predicted, 1.0))
+    easier = xp.where(first, s.damping, s.damping * xp.maximum(1 / 9, 1 - (2 * rho - 1) ** 3))
+    damping = xp.where(better, xp.maximum(easier, 1e-14), s.damping * s.growth)
+    u, r = (xp.where(better[..., None], new, old) for new, old in ((s.trial, s.u), (r, s.r)))
+    J = xp.where(better[..., None, None], J, s.J)
+    cost = xp.minimum(cost, xp.where(better, cost_new, cost))
     step, predicted, left = _steps(J, r, damping)
     # No step, however short, lowers the cost: at roundoff that is as converged as the arithmetic allows.
     exhausted = damping > MAX_DAMPING
-    at_roundoff = jnp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[0]))
-    converged = (left <= gain * cost) | (cost <= ZERO * r.shape[0]) | (exhausted & at_roundoff)
+    at_roundoff = xp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[-1]))
+    converged = (left <= gain * cost) | (cost <= ZERO * r.shape[-1]) | (exhausted & at_roundoff)
     return State(
         u=u,
         r=r,
@@ -92,18 +105,19 @@ def accept(s: State, r: jax.Array, J: jax.Array, gain: float = GAIN) -> State:
         trial=u + step,
         predicted=predicted,
         damping=damping,
-        growth=jnp.where(better, 2.0, 2 * s.growth),
+        growth=xp.where(better, 2.0, 2 * s.growth),
         iterations=s.iterations + 1,
-        converged=converged & jnp.isfinite(cost),
-        stuck=exhausted | ~jnp.isfinite(cost) | ~jnp.isfinite(predicted),
+        converged=converged & xp.isfinite(cost),
+        stuck=exhausted | ~xp.isfinite(cost) | ~xp.isfinite(predicted),
     )
 
 
 def solution(s: State) -> Solution:
-    """Result of a state."""
-    norms = jnp.linalg.norm(s.J, axis=0) * jnp.linalg.norm(s.r)
-    cosine = jnp.max(jnp.abs(s.J.T @ s.r) / jnp.where(norms > 0, norms, 1.0))
-    return Solution(s.u, s.r, s.J, 0.5 * s.r @ s.r, s.iterations, cosine, s.converged)
+    """Result of a state of one fit."""
+    xp = host.arrays_of(s.u)
+    norms = xp.linalg.norm(s.J, axis=0) * xp.linalg.norm(s.r)
+    cosine = xp.max(xp.abs(s.J.T @ s.r) / xp.where(norms > 0, norms, 1.0))
+    return Solution(s.u, s.r, s.J, _cost(s.r), s.iterations, cosine, s.converged)
 
 
 def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, jax.Array]]:
@@ -136,6 +150,31 @@ def levenberg_marquardt(
     return solution(jax.lax.while_loop(go_on, step, begin(start, n_residuals)))
 
 
+def from_starts(residuals: Callable[..., Any], starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
+    """The best of the minima that `levenberg_marquardt` finds from starts (S, P), in NumPy: nothing is compiled.
+
+    Args:
+        residuals: of (u, *data), as `host.with_jacobian` asks for.
+        starts: where to begin.
+        data: as of `residuals`.
+        max_iterations: of each fit.
+    """
+    going: np.ndarray = np.arange(len(starts))
+    s: Any = None
+    with np.errstate(all="ignore"):  # a trial that overflows is a bad one
+        while s is None or len(going):
+            r, J = host.with_jacobian(residuals, starts if s is None else s.trial[going], *data)
+            if s is None:  # copies, for `begin` gives some fields the same array
+                s = State(*(field.copy() for field in begin(starts, r.shape[-1])))
+            new = accept(State(*(field[going] for field in s)), r, J)
+            for field, values in zip(s, new, strict=True):
+                field[going] = values
+            going = going[~new.converged & ~new.stuck & (new.iterations < max_iterations)]
+        cost = _cost(s.r)
+        best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
+        return solution(State(*(field[best] for field in s)))
+
+
 def levenberg_marquardt_host(
     evaluate: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     start: jax.Array,
@@ -146,13 +185,16 @@ def levenberg_marquardt_host(
 
     `progress` is told of every evaluation. It stops where a step would gain 1e-8 of the cost: 1e-3 standard errors.
     """
-    trial, s, step = start, None, jax.jit(partial(accept, gain=1e-8))
-    while s is None or not (bool(s.converged) or bool(s.stuck) or int(s.iterations) >= max_iterations):
-        r, J = evaluate(trial)
-        s = step(begin(start, r.shape[0], damping=1e-8) if s is None else s, r, J)
-        trial = s.trial
-        progress(int(s.iterations), float(0.5 * s.r @ s.r))
-    return solution(s)
+    trial: jax.Array = start
+    s: Any = None
+    with np.errstate(all="ignore"):  # a trial that overflows is a bad one
+        while s is None or not (bool(s.converged) or bool(s.stuck) or int(s.iterations) >= max_iterations):
+            r, J = (np.asarray(value) for value in evaluate(trial))
+            s = begin(np.asarray(start), len(r), damping=1e-8) if s is None else s
+            s = State(*(np.asarray(field) for field in accept(s, r, J, gain=1e-8)))
+            trial = jnp.asarray(s.trial)
+            progress(int(s.iterations), float(_cost(s.r)))
+        return jax.tree.map(jnp.asarray, solution(s))
 
 
 def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol: float = 1e-8) -> Solution:

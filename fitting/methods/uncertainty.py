@@ -1,6 +1,7 @@
 """How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -10,14 +11,16 @@ import numpy as np
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.rheometer import Sweep
 
 
-def parameter_vector(u: jax.Array) -> jax.Array:
-    """G0, ratios, relaxation times (2N + 1,) of unconstrained parameters."""
-    model = generalised_maxwell.natural(u)
-    return jnp.concatenate([model.shear_modulus[None], model.ratios, model.relaxation_times])
+def parameter_vector(u: Array, maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural) -> Array:
+    """G0, ratios, relaxation times (2N + 1,) of the Prony modes that `maxwell` makes of u."""
+    model = maxwell(u)
+    xp = arrays_of(*model)
+    return xp.concatenate([model.shear_modulus[..., None], model.ratios, model.relaxation_times], axis=-1)
 
 
 def parameter_names(modes: int) -> tuple[str, ...]:
@@ -29,7 +32,7 @@ def parameter_names(modes: int) -> tuple[str, ...]:
 def estimate(
     found: Solution,
     deviations_given: bool,
-    maxwell: Callable[[jax.Array], Maxwell] = generalised_maxwell.natural,
+    maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural,
     components: tuple[int, float | None] | None = None,
 ) -> Estimate:
     """Values, errors and correlation of G0, ratios and relaxation times at the minimum.
@@ -42,11 +45,8 @@ def estimate(
     """
     count, effective = components or (len(found.residuals), None)
 
-    def vector(u):
-        model = maxwell(u)
-        return jnp.concatenate([model.shear_modulus[None], model.ratios, model.relaxation_times])
-
-    modes = jax.eval_shape(maxwell, jnp.asarray(found.u)).ratios.shape[0]
+    modes = jax.eval_shape(maxwell, found.u).ratios.shape[0]
+    vector = partial(parameter_vector, maxwell=maxwell)
     return estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
 
 

@@ -163,9 +163,16 @@ def figure(found: Samples) -> Any:
     ):
         right.plot([], [], marker, color=colour, label=label)
     right.set(xscale="log", xlabel="value / mean [1]", yticks=range(len(known)), yticklabels=list(known))
+    shown = [t for t in (0.01, 0.03, 0.1, 0.2, 0.5, 0.8, 1, 1.25, 2, 5, 10, 30, 100) if _inside(t, right.get_xlim())]
+    right.minorticks_off()
+    right.set_xticks(shown, labels=[f"{t:g}" for t in shown])
     right.invert_yaxis()
     right.legend(fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.3)
     return fig
+
+
+def _inside(value: float, limits: tuple[float, float]) -> bool:
+    return limits[0] <= value <= limits[1]
 
 
 def _store(path: Path, found: Samples, content: dict[str, Any]) -> None:

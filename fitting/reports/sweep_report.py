@@ -6,11 +6,11 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import edges, models
 from fitting.fits.viscoelastic import Fit
+from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
@@ -51,6 +51,8 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },
+        "mesh_bias": _bias(u, n, u.mesh_bias),
+        "time_step_bias": _bias(u, n, u.time_step_bias),
         **_own(fit),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
@@ -62,6 +64,20 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
         "run_time_s": fit.run_time,
         "compile_time_s": fit.compile_time,
         "details": fit.details,
+    }
+
+
+def _bias(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, Any] | None:
+    """By the names of `standard_errors`; null where it is not known."""
+    if moved is None:
+        return None
+    G0, ratios = u.values[0], u.values[1 : n + 1]
+    equilibrium = moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()
+    return {
+        "shear_modulus": moved[0],
+        "equilibrium_modulus": equilibrium,
+        "ratios": moved[1 : n + 1].tolist(),
+        "relaxation_times": moved[n + 1 :].tolist(),
     }
 
 
@@ -156,7 +172,7 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
-    lines = [np.asarray(v) for v in moduli(closed.model, jnp.asarray(2 * np.pi * fine))]
+    lines = [np.asarray(v) for v in moduli(closed.model, 2 * np.pi * fine)]
     rows = (
         ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
         ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
@@ -181,7 +197,8 @@ def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     if doubtful is not None:
         for axes in (top, rest):
             axes.axvspan(1.02 * doubtful, 1.05 * f[-1], color=GREY, alpha=0.15, lw=0)
-        rest.text(1.03 * doubtful, 0.02, "instrument", fontsize=7, va="bottom", transform=rest.get_xaxis_transform())
+        place = {"ha": "right", "va": "bottom", "transform": rest.get_xaxis_transform()}
+        rest.text(1.05 * f[-1], 0.02, "instrument", fontsize=7, **place)
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
 

@@ -76,12 +76,22 @@ class Moduli(NamedTuple):
     loss: jax.Array  # G'' [Pa]
     strain: jax.Array  # amplitude at the rim, radius * angle / height
     defect: jax.Array  # |angle at the end - one period earlier| / amplitude: what is left of the transient
+    bias: jax.Array  # of the mesh, complex; `geometry_factor` where the whole stress relaxes
     statistics: newton.NewtonStatistics  # worst over the steps
 
 
 def cell_size_for(radius: float, height: float) -> float:
     """Default cell [m]: 100 to 400 nodes for any shape; geometry_factor removes the error that leaves if linear."""
     return max((math.pi * radius**2 * height / 100) ** (1 / 3), radius / 6, height / 12)
+
+
+def linear_cell_for(radius: float, height: float) -> float:
+    """Cell [m] of about 100 nodes: enough for small strain without inertia, where `bias` holds all of the mesh's error.
+
+    What is left is of the order of the strain: at 1e-3 the moduli are those of `cell_size_for` to 1e-5
+    (experiments/benchmarks/torsion_speed.py).
+    """
+    return max((math.pi * radius**2 * height / 30) ** (1 / 3), radius / 4, height / 8)
 
 
 def make_rig(
@@ -331,7 +341,9 @@ def _initial(rig, law, prony, omega, dt, drive, shape, arc):
             return viscosity.relaxing_stress(prony, law, deformation_gradient(mesh, _positions(rig, *_unpack(rig, q))))
 
         _, slope = jax.linearize(S, jnp.zeros_like(q))
-        S_shape = slope(jnp.real(shape * arc)) + 1j * slope(jnp.imag(shape * arc))
+        S_shape = slope(jnp.real(shape)) * arc
+        if jnp.iscomplexobj(shape):  # a real shape needs the slope once: it is a fifth of the program
+            S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, omega, dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
         history = viscosity.History(gamma, None if history.stress is None else jnp.real(S_shape))
@@ -390,11 +402,28 @@ def moduli(
         G = 2 * rig.height / (jnp.pi * rig.radius**4) * torque / angle / (bias if corrected else 1.0)
         defect = jnp.abs(run.angle[-1] - run.angle[-1 - drive.steps]) / jnp.abs(angle)
         worst = newton.NewtonStatistics(*(jnp.max(field) for field in run.statistics))
-        return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, worst)
+        return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, bias, worst)
 
     lanes = jnp.atleast_1d(omega), jnp.atleast_1d(amplitude)
     # One lane after another stays in a CPU's cache (1.7 times faster for the Jacobian); a GPU wants them side by side.
     return jax.lax.map(lambda lane: one(*lane), lanes) if jax.default_backend() == "cpu" else jax.vmap(one)(*lanes)
+
+
+def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
+    """What `moduli` approaches as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
+
+    The rig is linear there, and its bias is divided out, so they hold neither mesh nor plates. They give the
+    derivatives of `moduli` by the parameters to the order of the strain, without a derivative of the simulation. They
+    have no inertia.
+
+    Args:
+        law: scaled to G0, its modulus at rest.
+        prony: how it relaxes.
+        omega: angular frequencies (n,) [rad/s].
+        steps: time steps a cycle; None: those of continuous time.
+    """
+    ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
+    return law.shear_modulus() * (1 - jnp.sum(ratios, axis=0))
 
 
 def strain_sweep(

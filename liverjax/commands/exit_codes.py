@@ -6,11 +6,14 @@ import sys
 import warnings
 from collections.abc import Callable
 
+from liverjax.core import programs
 from liverjax.core.errors import InputError
 
 
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
     """Run a command; return its exit code, 2 for unusable input and 130 for Ctrl-C.
+
+    What the command compiles is kept on disk for the next one, see `liverjax.core.programs`.
 
     Args:
         run: runs the command with its options and returns 0 or 1.
@@ -20,7 +23,8 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         try:
-            return run(options)
+            with programs.kept_on_disk():
+                return run(options)
         except InputError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2

@@ -14,6 +14,7 @@ import h5py
 import jax
 import numpy as np
 
+from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.core.versions import versions
 from liverjax.jobs import parts
@@ -50,7 +51,8 @@ def run(
         out: file of the results, which the caller writes before it removes `parts.beside(out)`.
         every: steps a part.
         resume: go on with the parts that are there.
-        report: as of `simulate`; called for steps found on disk as well.
+        report: called with the number of every finished step, those found on disk too, at the end of each part: JAX
+            keeps no program on disk that calls back while it runs.
 
     Raises:
         InputError: parts that are there without `resume`, of another scene, or in use by another process.
@@ -79,14 +81,11 @@ def _run(scene: Scene, count: int, folder: Path | None, report: Callable[[int], 
     state, results, computed, run_time = initial_state(scene), [], 0, 0.0
     finished = [file is not None and file.exists() for file in files]
     begin = time.perf_counter()
-    program: Any = None if all(finished) else _compiled(scene, state, count, report)
+    program: Any = None if all(finished) else _compiled(scene, state, count)
     compile_time = time.perf_counter() - begin
     for first, file in zip(firsts, files, strict=True):
         if file is not None and file.exists():
             result, state = _read(file, state)
-            if report is not None:
-                for step in range(len(result.times)):
-                    report(first + step)
         else:
             begin = time.perf_counter()
             result, state = jax.block_until_ready(program(scene, state, float(first)))
@@ -96,12 +95,15 @@ def _run(scene: Scene, count: int, folder: Path | None, report: Callable[[int], 
             if file is not None:
                 parts.write(file, _content(result, state))
         results.append(result)
+        if report is not None:
+            for step in range(len(result.times)):
+                report(first + step)
     whole = jax.tree.map(lambda *rows: np.concatenate(rows), *results)
     return Ran(whole, computed, run_time, compile_time)
 
 
-def _compiled(scene: Scene, state: Any, count: int, report: Callable[[int], None] | None) -> Callable:
-    return jax.jit(partial(simulate_part, count=count, report=report)).lower(scene, state, 1.0).compile()
+def _compiled(scene: Scene, state: Any, count: int) -> Callable:
+    return compiled(partial(simulate_part, count=count), scene, state, 1.0)
 
 
 def _content(result: Result, state: Any) -> dict[str, np.ndarray]:

@@ -1,0 +1,144 @@
+"""A function compiled for given arguments, found on disk without being traced where the programs are kept.
+
+JAX's own cache spares the compilation alone: it has to trace a program before it can find it, which takes seconds
+for a large one. Here the arguments' structure and shapes are the key, within the folder of `liverjax.core.programs`.
+"""
+
+import dataclasses
+import hashlib
+import math
+import os
+import pickle
+import uuid
+import zlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import programs
+from liverjax.core.files import whole
+
+#: Packages whose sources the folder's name holds: nothing of another may decide what a program is.
+OWN = ("liverjax.", "fitting.")
+
+
+class _Unknown(Exception):
+    """Something that the key cannot hold: a law of the user's own, a program that calls back."""
+
+
+def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """`function` compiled for arguments like these, on one device; called with such arguments it only runs.
+
+    Args:
+        function: at the top of a module, or `functools.partial` of one whose keywords are fixed when compiled.
+        arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept.
+    """
+    folder = programs.folder()
+    if folder is None or jax.default_backend() != "cpu":  # elsewhere JAX's own cache serves, until it is measured
+        return jax.jit(function).lower(*arguments).compile()
+    try:
+        file = folder / f"whole_{_name(function)}-{_key(function, arguments)}-cache"
+    except _Unknown:
+        return jax.jit(function).lower(*arguments).compile()
+    return _found(file) or _made(file, function, arguments)
+
+
+def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
+    """Compile on flat lists, whose structure can be written down, and keep the program if that is possible."""
+    structure = jax.tree.structure(arguments)
+    shape: list[Any] = []
+
+    def flat(*leaves: Any) -> list[Any]:
+        out = function(*jax.tree.unflatten(structure, leaves))
+        shape[:] = [jax.tree.structure(out)]
+        return jax.tree.leaves(out)
+
+    # JAX's own cache must not find it nor keep it: a program that was read from disk cannot be written again.
+    flat.__name__ = f"program_{uuid.uuid4().hex}"
+    keep_from = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", math.inf)
+    try:
+        program = jax.jit(flat).lower(*jax.tree.leaves(arguments)).compile()
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", keep_from)
+    try:
+        from jax.experimental import serialize_executable
+
+        example = jax.tree.unflatten(shape[0], range(shape[0].num_leaves))
+        content = zlib.compress(pickle.dumps((*serialize_executable.serialize(program), example)), 1)
+        with whole(file, f".{os.getpid()}.part") as beside:
+            beside.write_bytes(content)
+    except Exception:  # calls back, a full disk, another release of JAX: it is compiled, and that is what is needed
+        pass
+    return partial(_called, program, shape[0])
+
+
+def _found(file: Path) -> Callable[..., Any] | None:
+    """The program in a file; `None` where there is none that can be read."""
+    if not file.exists():
+        return None
+    try:
+        from jax.experimental import serialize_executable
+
+        # XLA finds LAPACK where SciPy has it, and JAX tells it where at the first factorisation that is lowered.
+        jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.result_type(float)))
+        kept, given, taken, example = pickle.loads(zlib.decompress(file.read_bytes()))
+        program = serialize_executable.deserialize_and_load(kept, given, taken, execution_devices=jax.devices()[:1])
+        return partial(_called, program, jax.tree.structure(example))
+    except Exception:  # broken, or of another release: compiled anew and written in its place
+        return None
+
+
+def _called(program: Callable[..., Any], structure: Any, *arguments: Any) -> Any:
+    return jax.tree.unflatten(structure, program(*jax.tree.leaves(arguments)))
+
+
+def _name(function: Callable[..., Any]) -> str:
+    return _top(function.func if isinstance(function, partial) else function)
+
+
+def _top(function: Any) -> str:
+    """Name of a function at the top of a module, which the sources tell all of; one made in another is unknown."""
+    module, name = function.__module__, function.__qualname__
+    if not module.startswith(OWN) or not name.isidentifier():
+        raise _Unknown
+    return f"{module}.{name}"
+
+
+def _key(function: Callable[..., Any], arguments: tuple) -> str:
+    """Digest of all that decides what the program is, but for the sources."""
+    fixed = function.keywords if isinstance(function, partial) else {}
+    if isinstance(function, partial) and function.args:
+        raise _Unknown
+    config = {k: str(v) for k, v in jax.config.values.items() if "cache" not in k and "log" not in k}
+    said = [_said(fixed, static=True), _said(arguments), sorted(config.items()), os.environ.get("XLA_FLAGS")]
+    return hashlib.sha256(repr((jax.default_backend(), said)).encode()).hexdigest()
+
+
+def _said(thing: Any, static: bool = False) -> Any:
+    """What a program depends on: types, static values, and of all other numbers the shapes."""
+    if thing is None or isinstance(thing, (str, bool)):
+        return repr(thing)
+    if isinstance(thing, FunctionType) and static:
+        return _top(thing)
+    if isinstance(thing, (int, float)):
+        return repr(thing) if static else type(thing).__name__
+    if isinstance(thing, (np.ndarray, np.generic, jax.Array)) and not static:
+        return (str(thing.dtype), thing.shape, bool(getattr(thing, "weak_type", False)))
+    kind = f"{type(thing).__module__}.{type(thing).__qualname__}"
+    if isinstance(thing, dict):
+        return [(_said(key, True), _said(value, static)) for key, value in thing.items()]
+    if not (kind.startswith(OWN) or kind in ("builtins.tuple", "builtins.list")):
+        raise _Unknown
+    if dataclasses.is_dataclass(thing):
+        fields = [(f.name, f.metadata.get("static", False)) for f in dataclasses.fields(thing)]
+        return kind, [(name, _said(getattr(thing, name), static or fixed)) for name, fixed in fields]
+    if isinstance(thing, (tuple, list)):
+        return kind, [_said(value, static) for value in thing]
+    raise _Unknown

@@ -1,0 +1,155 @@
+"""Compiled programs kept on disk, so that a machine compiles a program once: JAX's own cache, in a folder of its own.
+
+The folder is one of the user's cache directory. Its name has the releases, the sources and the processor, so no other
+release, checkout or machine trusts what is in it. `LIVERJAX_CACHE` names another folder, or is "off".
+"""
+
+import hashlib
+import os
+import platform
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+SWITCH = "LIVERJAX_CACHE"
+#: Bytes on disk above which the next command removes what was longest not used; one program takes 10 kB to 1 MB.
+LIMIT = 500_000_000
+#: Seconds: what compiles faster is not kept. Finding a program takes a few milliseconds.
+WORTH_KEEPING = 0.05
+
+
+_in_use: list[Path] = []
+
+
+def folder() -> Path | None:
+    """Where programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
+    return _in_use[-1] if _in_use else None
+
+
+@contextmanager
+def kept_on_disk() -> Iterator[Path | None]:
+    """Inside it, compiled programs are read from disk and written there; gives the folder, `None` without a cache.
+
+    There is no cache if `LIVERJAX_CACHE` is "off", if the folder cannot be written, or if the user has given JAX a
+    folder already (`JAX_COMPILATION_CACHE_DIR`), which stays as it is. Entries that cannot be read are compiled anew.
+    """
+    chosen = _folder()
+    with warnings.catch_warnings():
+        # A broken entry, a full disk, another process that removes old entries: each costs a compilation, no more.
+        warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
+        show = warnings.showwarning
+
+        def shown(message: Warning | str, *details: object) -> None:
+            if chosen is None or not _forgotten(chosen, str(message)):
+                show(message, *details)  # type: ignore[arg-type]
+
+        warnings.showwarning = shown  # type: ignore[assignment]
+        if chosen is None:
+            yield None
+            return
+        _switch_on(chosen)
+        _in_use.append(chosen)
+        try:
+            yield chosen
+        finally:
+            _in_use.pop()
+
+
+def _switch_on(folder: Path) -> None:
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
+    # JAX itself sets the second to 1.
+    if "JAX_LOGGING_LEVEL" not in os.environ and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
+        # XLA writes an error for every CPU program that it reads: it takes two of its own tuning flags for features
+        # that the processor lacks. The folder is this processor's own.
+        jax.config.update("jax_logging_level", "CRITICAL")
+
+
+def _folder() -> Path | None:
+    """The folder for these releases, sources and this processor, made where it was not; `None` without a cache."""
+    chosen = os.environ.get(SWITCH, "")
+    if chosen.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return None
+    try:
+        root = Path(chosen).expanduser() if chosen else _user_cache() / "liverjax"
+        folder = root / _name()
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+            return None
+        bound(root)
+    except (OSError, RuntimeError):  # RuntimeError: a user without a home
+        return None
+    return folder.absolute()
+
+
+def _user_cache() -> Path:
+    """Where programs of this user keep what can be made again, as the platform has it."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return given if given.is_absolute() else Path.home() / ".cache"  # a relative one counts for nothing: XDG's rule
+
+
+def _name() -> str:
+    """Releases in words; sources and processor as a digest."""
+    import liverjax
+
+    package = Path(liverjax.__file__).parent
+    digest = hashlib.sha256(_processor().encode())
+    for file in sorted([*package.rglob("*.py"), *(package.parent / "fitting").rglob("*.py")]):
+        digest.update(file.relative_to(package.parent).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    return f"{liverjax.__version__}-jax{version('jax')}-jaxlib{version('jaxlib')}-{digest.hexdigest()[:16]}"
+
+
+def _processor() -> str:
+    """Kind of the processor and what it can do: a program compiled for one may not run on another."""
+    said = f"{platform.system()} {platform.machine()} {platform.processor()}\n"
+    try:
+        first = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]
+    except OSError:
+        return said
+    wanted = ("model name", "flags", "features", "cpu implementer", "cpu part", "isa")
+    return said + "\n".join(line for line in first.splitlines() if line.lower().startswith(wanted))
+
+
+def _forgotten(folder: Path, message: str) -> bool:
+    """Whether a warning is about the cache; the entries that it names are removed, or JAX would keep a broken one."""
+    if "persistent compilation cache" not in message:
+        return False
+    if "reading" in message:
+        program = message.partition("entry for '")[2].partition("'")[0]
+        for entry in folder.glob(f"{program}-*-cache") if program.isidentifier() else ():
+            _remove(entry)
+    return True
+
+
+def bound(root: Path, limit: int = LIMIT) -> None:
+    """Remove what was longest not used, until the programs of all releases take less than `limit` bytes."""
+    entries = []
+    for entry in root.glob("*/*-cache"):
+        try:
+            found = entry.stat()
+        except OSError:  # another process was faster
+            continue
+        # When a file was last read is not noted everywhere: then it counts when it was written.
+        entries.append((max(found.st_atime, found.st_mtime), found.st_size, entry))
+    left = sum(size for _, size, _ in entries)
+    for _, size, entry in sorted(entries):
+        if left <= limit:
+            break
+        _remove(entry)
+        left -= size
+
+
+def _remove(entry: Path) -> None:
+    try:
+        entry.unlink()
+    except OSError:  # gone already, or in use (on Windows): the next command tries again
+        return
