@@ -16,11 +16,12 @@ def test_numpy_and_jax_run_the_same_formula_and_its_derivative():
     rng = np.random.default_rng(0)
     omega, u = 2 * np.pi * np.logspace(-2, 2, 9), rng.normal(0, 1, (3, 7))
     data = (omega, np.full(9, 300.0), np.full(9, 60.0), np.linspace(20, 90, 18))
-    r, J = host.with_jacobian(generalised_maxwell.residuals, u, *data)
-    for k in range(3):
-        expected = with_jacobian(generalised_maxwell.residuals)(jnp.asarray(u[k]), *map(jnp.asarray, data))
-        assert np.allclose(r[k], expected[0], rtol=1e-13, atol=1e-13)
-        assert np.allclose(J[k], expected[1], rtol=1e-12, atol=1e-13)
+    for residuals, v in ((generalised_maxwell.residuals, u), (generalised_maxwell.fluid_residuals, u[:, 1:])):
+        r, J = host.with_jacobian(residuals, v, *data)
+        for k in range(3):
+            expected = with_jacobian(residuals)(jnp.asarray(v[k]), *map(jnp.asarray, data))
+            assert np.allclose(r[k], expected[0], rtol=1e-13, atol=1e-13)
+            assert np.allclose(J[k], expected[1], rtol=1e-12, atol=1e-13)
     values, slope = host.with_jacobian(uncertainty.parameter_vector, u[0])
     assert np.allclose(slope, jax.jacfwd(uncertainty.parameter_vector)(jnp.asarray(u[0])), rtol=1e-12, atol=1e-300)
     assert type(values) is np.ndarray

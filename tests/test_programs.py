@@ -223,6 +223,9 @@ def test_what_decides_a_program_is_in_its_name(switched, cube, monkeypatch):
     names.append(compiled_module._key(mjed.energy, (mesh, lj.laws.typical("yeoh"), x)))
     names.append(compiled_module._key(mjed.energy, (mesh, law, x.astype("float32"))))
     names.append(compiled_module._key(partial(mjed.energy, terms="chapter"), (mesh, law, x)))
+    names += [compiled_module._key(partial(mjed.energy, one=f), (mesh, law, x)) for f in (mjed.energy, exit_code)]
+    with pytest.raises(compiled_module._Unknown):  # what a function made in another holds, no source tells
+        compiled_module._key(partial(mjed.energy, one=lambda: mesh), (mesh, law, x))
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
     names.append(compiled_module._key(mjed.energy, (mesh, law, x)))
     assert len(set(names)) == len(names)

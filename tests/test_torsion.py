@@ -1,6 +1,7 @@
 """The simulated rheometer: discrete and continuous formulas, orders, gradients, other programs, extremes."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -162,6 +163,26 @@ def test_inertia_and_large_strain_keep_the_derivative_and_the_mesh_of_the_simula
         monkeypatch.setattr(viscoelastic, "simulated_residuals", lambda u, *_: (u**2, None))
         _, J, _ = viscoelastic.with_jacobian(jnp.arange(3.0), (), simulation)
         assert np.allclose(J, np.diag([0.0, 2.0, 4.0]))
+
+
+def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatch, law):
+    """Where the simulation is the linear rig itself, both derivatives are the same: of a fluid held by a prior."""
+    kind = viscoelastic.FLUID._replace(prior=lambda u: 3 * u[1:] ** 2)
+    u, omega = jnp.array([6.0, 0.3, -1.0, 0.7]), jnp.asarray(OMEGA)
+    data = (None, law, omega, None, jnp.linspace(300, 100, 6), jnp.full(6, 7.0))
+
+    def moduli(rig, law, prony, omega, torque, drive):
+        G = torsion.linear_moduli(law, prony, omega, drive.steps)
+        return SimpleNamespace(storage=jnp.real(G), loss=jnp.imag(G))
+
+    monkeypatch.setattr(torsion, "moduli", moduli)
+    simulation = viscoelastic.Simulation()
+    r, J, _ = viscoelastic.with_jacobian(u, data, simulation, kind)
+    G = _discrete(viscoelastic._law_and_prony(kind.maxwell(u), law, simulation)[1], OMEGA, simulation.steps)
+    expected = np.concatenate([G.real, G.imag]) * np.exp(6.0) / 770 - np.linspace(300, 100, 6)
+    assert np.allclose(r[:6], expected / 7, rtol=1e-9) and np.allclose(r[6:], 3 * u[1:] ** 2)
+    whole = jax.jacfwd(lambda u: viscoelastic.simulated_residuals(u, data, simulation, kind)[0])(u)
+    assert J.shape == (9, 4) and np.allclose(J, whole, rtol=1e-12, atol=1e-12)
 
 
 LAWS_OWN = {"neo_hookean": {"bulk": 1.0}, "mooney_rivlin": {"c10": 1.0, "c01": 1.0}}

@@ -99,10 +99,10 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     starts = np.stack([generalised_maxwell.fluid_of(u) for u in starts]) if fluid else starts
     starts[-1] = np.asarray(fit.solution.u)
     data = (part.angular_frequency, part.storage, part.loss, np.concatenate(part.deviations))
-    model = fit.kind.maxwell(from_starts(viscoelastic.residuals_of(fit.kind), starts, *data).u)
-    numbers = np.concatenate([[model.shear_modulus], model.ratios, model.relaxation_times])
+    modes = fit.kind.maxwell(from_starts(viscoelastic.residuals_of(fit.kind), starts, *data).u)
+    numbers = np.concatenate([[modes.shear_modulus], modes.ratios, modes.relaxation_times])
     new = dict(zip(fit.uncertainty.names, numbers.tolist(), strict=True))
-    new["equilibrium_modulus"] = float(model.equilibrium_modulus)
+    new["equilibrium_modulus"] = float(modes.equilibrium_modulus)
     return {name: new[name] - value for name, value in old.items()}
 
 
