@@ -313,6 +313,17 @@ def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
     assert warned(f, "discretisation moves it by")
 
 
+def test_the_biases_are_what_simulated_and_closed_form_differ_by(coarse_torsion):
+    """Same data, same model: only mesh, time steps and finite strain differ, and the last is below 1e-5 here."""
+    _, closed, f = coarse_torsion
+    u = f.uncertainty
+    moved = u.values - closed.uncertainty.values
+    assert np.abs(u.time_step_bias / u.values).max() > 1e-4
+    # First order in moves of a thousandth; finite strain moves a parameter by up to 1e-4 of its error.
+    left = np.abs(moved - u.mesh_bias - u.time_step_bias)
+    assert np.all(left < 0.05 * np.abs(u.time_step_bias) + 1e-3 * u.standard_errors)
+
+
 @pytest.mark.slow
 def test_chapter_recursion_biases_the_fit():
     s = sweep(omega=OMEGA[::3])

@@ -16,6 +16,7 @@ MOVED = {
     "liverjax.long_run": "liverjax.jobs.long_run",
     "liverjax.mjed": "liverjax.elements.mjed",
     "liverjax.output": "liverjax.jobs.output",
+    "liverjax.physics.averaged_volume": "liverjax.physics.volumes.averaged",
     "liverjax.porosity": "liverjax.physics.porosity",
     "liverjax.reference": "liverjax.elements.reference",
     "liverjax.regions": "liverjax.scenes.regions",

@@ -110,7 +110,7 @@ class VolumeStress:
 
     #: Whether pressures depend on where the step ends: then they are unknowns of the mixed system.
     coupled: ClassVar[bool] = True
-    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.mixed_volume`), not solved for on the way.
+    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`), not solved for on the way.
     unknown: ClassVar[bool] = False
 
     def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:

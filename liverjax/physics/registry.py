@@ -4,15 +4,15 @@ from typing import Any
 
 from liverjax.laws.base import Law, isochoric_part
 from liverjax.physics import porosity
-from liverjax.physics.averaged_volume import AveragedVolume
 from liverjax.physics.base import Physics
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.inertia import Inertia
 from liverjax.physics.loads import Loads
-from liverjax.physics.mixed_volume import MixedVolume
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Viscoelasticity
+from liverjax.physics.volumes.averaged import AveragedVolume
+from liverjax.physics.volumes.mixed import MixedVolume
 
 #: Physics with a table of their own in scene files: a new one is a line here.
 NAMED: tuple[type[Physics], ...] = (

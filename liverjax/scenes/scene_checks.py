@@ -10,8 +10,8 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import boundary, porosity, viscosity
 from liverjax.physics.base import Physics
-from liverjax.physics.mixed_volume import check as check_mixed_law
 from liverjax.physics.sliding_support import SlidingSupport
+from liverjax.physics.volumes.mixed import check as check_mixed_law
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Body, Scene
 

@@ -1,0 +1,1 @@
+"""Volume changes held on average over neighbouring elements, against locking."""
