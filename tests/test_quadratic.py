@@ -26,6 +26,8 @@ from liverjax.simulation.run import prepared, simulate_part
 from liverjax.solvers.block_matrix import flat
 from liverjax.tensors.matrices import Invariants, deformation_gradient, determinant, pack
 
+pytestmark = pytest.mark.quick_to_compile
+
 LAW = lj.laws.NeoHookean(mu=800.0, bulk=4000.0)
 
 
