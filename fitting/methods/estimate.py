@@ -69,8 +69,7 @@ def estimated(
     if isinstance(found.u, np.ndarray):
         values, to_natural = host.with_jacobian(natural_of, found.u)
     else:
-        both = jax.jit(lambda u: (natural_of(u), jax.jacfwd(natural_of)(u)))  # one program instead of many small ones
-        values, to_natural = (np.asarray(v) for v in both(found.u))
+        values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
     # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
