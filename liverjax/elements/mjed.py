@@ -125,8 +125,8 @@ def element_matrices(
     K = element_stiffness(mesh, law, x, regularised, terms)
     entries = [K[a, b][r][c] for a, b, r, c in _ENTRIES]
     # A product with a constant writes the other 99 entries: stacked one by one they triple the time to compile.
-    entries = jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
-    return entries if mesh.order == 1 else of_nodes(mesh.order, entries)
+    corners = jnp.stack(jnp.broadcast_arrays(*entries), axis=-1) @ jnp.asarray(_EXPANSION, x.dtype)
+    return corners if mesh.order == 1 else of_nodes(mesh.order, corners)
 
 
 def of_nodes(order: int, corners: jax.Array) -> jax.Array:

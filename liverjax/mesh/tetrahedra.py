@@ -92,8 +92,8 @@ class TetMesh:
         (y_k - y_0) D_k.
         """
         if self.order == 1:
-            values = [[column[n] for column in columns] for n in self.element_nodes]
-            return [tuple(a - b for a, b in zip(corner, values[0], strict=True)) for corner in values[1:]]
+            first, *others = [[column[n] for column in columns] for n in self.element_nodes]
+            return [tuple(a - b for a, b in zip(corner, first, strict=True)) for corner in others]
         nodes = jnp.stack(self.element_nodes)
         values = self._oriented(jnp.stack([column[nodes] for column in columns], axis=1))
         y = jnp.tensordot(self._slopes(), values, axes=(1, 0)).reshape(3, -1, *values.shape[1:])

@@ -192,8 +192,8 @@ def _held(scene: Scene) -> None:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    nodes, n = [np.asarray(a) for a in scene.mesh.element_nodes], scene.mesh.number_of_nodes
-    rows, columns = np.tile(nodes[0], len(nodes)), np.concatenate(nodes)
+    each, n = [np.asarray(a) for a in scene.mesh.element_nodes], scene.mesh.number_of_nodes
+    rows, columns = np.tile(each[0], len(each)), np.concatenate(each)
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
     mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
     fixed = np.argwhere(mask == 0)

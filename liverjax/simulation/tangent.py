@@ -212,7 +212,7 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
         added = [point_matrix.prolonged(e.mesh, c) for c in below]
         return tuple(a + b for a, b in zip(fine(columns), added, strict=True))
 
-    if e.mixed is None:
+    if e.mixed is None or not isinstance(K.matrix, PointMatrix):
         return lambda r: _flat(e, levels(block_matrix.columns(r)))
     volume, A, n = e.mixed, K.matrix, 3 * e.mesh.number_of_nodes
     schur = volume.unit**2 * volume.schur(e.mesh)
@@ -241,7 +241,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 
     def apply(v: jax.Array) -> jax.Array:
         motion, balance = e.free.columns(block_matrix.columns(v[:n])), None
-        if e.mixed is not None:
+        if e.mixed is not None and isinstance(A, PointMatrix):
             force, balance = mixed_system.with_pressures(e.mesh, e.mixed, A, (motion, v[n:]))
         elif isinstance(A, BlockMatrix):
             force = block_matrix.product(A, motion)
