@@ -50,7 +50,7 @@ def table() -> str:
         "| elements | K/mu | number | unknowns of positions | Newton | linear | run |",
         "|---|---|---|---|---|---|---|",
     ]
-    for r in data["iterations"]:
+    for r in data.get("iterations", []):
         rows.append(
             f"| {r['form']} | {r['ratio']:g} | {r['elements']:,} | {r['unknowns']:,} | {r['newton']} | {r['linear']} "
             f"| {r['run_s']:.2g} s |"
