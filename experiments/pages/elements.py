@@ -23,7 +23,9 @@ def table() -> str:
     (data,) = load("elements")
     rows = [
         "Static answers, two load steps (the liver: one); the estimate is one linearised solve a step in the next",
-        "richer elements. Effectivity: what it adds, over what is missing. Corrected: the error with it added.",
+        "richer elements. Effectivity: what it adds, over what is missing. Corrected: the error with it added. The",
+        "truth of Cook's membrane is that of mixed elements on 20 x 20 cells with their own estimate added: mixed rows",
+        "are judged by their own kind. The run times are of a busy machine: take their ratios.",
         "",
         "| body, K/mu | elements | number | error | effectivity | corrected | run |",
         "|---|---|---|---|---|---|---|",
@@ -38,10 +40,10 @@ def table() -> str:
     rows += ["", "The liver phantom at rest under 2 m/s2, largest displacement; its converged value is not known:", ""]
     rows += ["| elements | number | value | the estimate adds | run |", "|---|---|---|---|---|"]
     for r in livers:
-        rows.append(
-            f"| {r['form']} | {r['elements']:,} | {1e3 * r['value']:.2f} mm | {1e3 * r['change']:+.2g} mm "
-            f"{'' if r['found'] else ', with corners inside out'} | {r['run_s']:.2g} s |"
-        )
+        adds = f"{1e3 * r['change']:+.2g} mm" + ("" if r["found"] else ", with corners inside out")
+        rows.append(f"| {r['form']} | {r['elements']:,} | {1e3 * r['value']:.2f} mm | {adds} | {r['run_s']:.2g} s |")
+    if not data.get("iterations"):
+        return "\n".join(rows)
     rows += [
         "",
         "A cube whose top moves aside by a hundredth, one step to 1e-8: linear iterations of all Newton iterations:",
@@ -49,7 +51,7 @@ def table() -> str:
         "| elements | K/mu | number | unknowns of positions | Newton | linear | run |",
         "|---|---|---|---|---|---|---|",
     ]
-    for r in data.get("iterations", []):
+    for r in data["iterations"]:
         rows.append(
             f"| {r['form']} | {r['ratio']:g} | {r['elements']:,} | {r['unknowns']:,} | {r['newton']} | {r['linear']} "
             f"| {r['run_s']:.2g} s |"
@@ -82,3 +84,6 @@ def sentences() -> str:
     low, high = (f(r["effectivity"] for r in known) for f in (min, max))
     said.append(f"Where errors are above 0.5 %, the estimate is {low:.2g} to {high:.2g} of them.")
     return " ".join(said)
+
+
+PARTS = {"elements": table}
