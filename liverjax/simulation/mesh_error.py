@@ -84,8 +84,7 @@ def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshEr
             f"result.positions has {positions.shape[1]} nodes, the scene {scene.mesh.number_of_nodes}: give the scene "
             "of the run"
         )
-    if scene.solve.newton == "one_step":
-        raise InputError("solve.newton = 'one_step' leaves an error of its own: estimate that of a converged run")
+    refuse(scene)
     rich = enriched(scene)
     # Linear elements lock: their error is that against elements which do not.
     volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
@@ -93,6 +92,16 @@ def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshEr
     rich = replace(rich, law=rich.mesh.at_points(rich.law), solve=solve)
     rich = replace(rich, solve=replace(solve, volumetric=automatic.volumetric(rich)))
     return _estimate(scene, rich, positions, reactions)
+
+
+def refuse(scene: Scene) -> None:
+    """Refuse a scene whose error is not the mesh's alone.
+
+    Raises:
+        InputError: a scheme of one linear solve a step.
+    """
+    if scene.solve.newton == "one_step":
+        raise InputError("solve.newton = 'one_step' leaves an error of its own: estimate that of a converged run")
 
 
 @jax.jit

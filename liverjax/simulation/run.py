@@ -16,7 +16,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
 from liverjax.simulation import automatic, checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs, unknowns
-from liverjax.simulation.mesh_error import MeshError, estimate
+from liverjax.simulation.mesh_error import MeshError, estimate, refuse
 from liverjax.simulation.step import problem_of, step
 from liverjax.solvers import continuation
 from liverjax.solvers.problem import StepStatistics
@@ -135,11 +135,13 @@ def simulate(
         start = jnp.array(start, scene.mesh.points.dtype)
         if start.shape != scene.mesh.points.shape:
             raise InputError(f"start has shape {start.shape}: give positions of shape {scene.mesh.points.shape}")
+    if mesh_error:
+        refuse(scene)
+        if start is not None:
+            raise InputError("mesh_error = True is for runs from the reference positions: leave start out")
     result = _run(scene, start, report, checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
         return result
-    if start is not None:
-        raise InputError("mesh_error = True is for runs from the reference positions: leave start out")
     return replace(result, mesh_error=estimate(scene, result.positions, result.reactions))
 
 
