@@ -505,6 +505,7 @@ def _pulled(scene: lj.Scene) -> float:
     return float(_force(scene.mesh)(result.positions, result.reactions))
 
 
+@pytest.mark.core
 def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
     """A linear problem: one linear solve is all, but for its tolerance of 1e-2."""
     scene = _pull(1, 2)
