@@ -1,5 +1,6 @@
 """Quadratic tetrahedra: the same physics at their points, exact where they must be, of the order they promise."""
 
+import re
 from math import factorial
 
 import jax
@@ -21,6 +22,7 @@ from liverjax.physics.sliding_support import on_plane
 from liverjax.physics.volumes import mixed
 from liverjax.scenes.enriched import enriched
 from liverjax.simulation import tangent
+from liverjax.simulation.cautions import mesh_sentence
 from liverjax.simulation.equations import equations, forces, initial_state, positions, residual, unknowns
 from liverjax.simulation.run import prepared, simulate_part
 from liverjax.solvers.block_matrix import flat
@@ -515,6 +517,7 @@ def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
     other = _pulled(richer)
     assert bool(result.mesh_error.found.all()) and change < -0.05 * value
     assert abs(value + change - other) < 0.02 * abs(change)
+    assert re.search("nodes are up to .* m off.*take order = 2 in", mesh_sentence(scene, result))
 
 
 @pytest.mark.slow

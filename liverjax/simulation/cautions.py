@@ -33,20 +33,21 @@ _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """One line: the largest displacement of the last step, what the mesh leaves out of it, and the remedy."""
+    """One line: what the mesh leaves out of the positions at the last step, and the remedy."""
     assert result.mesh_error is not None
-    x, error = np.asarray(result.positions[-1]), np.asarray(result.mesh_error.positions[-1])
-    u = x - np.asarray(scene.mesh.points)
-    size = np.linalg.norm(u, axis=1)
-    worst = int(np.argmax(size))
-    change = float(u[worst] @ error[worst] / max(size[worst], 1e-300))
-    said = f"mesh error (estimate, last step): largest displacement {size[worst]:.4g} m, {change:+.2g} m without a mesh"
+    u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
+    size = float(np.linalg.norm(u, axis=1).max())
+    error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
+    part = 100 * error / max(size, 1e-300)
+    said = (
+        f"mesh error (estimate, last step): nodes are up to {error:.2g} m off, {part:.2g} % of the largest "
+        f"displacement ({size:.3g} m)"
+    )
     if not np.all(np.asarray(result.mesh_error.found)):
-        return f"{said}; at some steps the estimate leads to no state: the mesh is too coarse to say"
-    if abs(change) <= _SMALL * size[worst]:
+        return f"{said}; at some steps it turns elements inside out: the mesh is too coarse to say more"
+    if error <= _SMALL * size:
         return said
-    remedy = "order = 2 in [mesh], or a finer mesh" if scene.mesh.order == 1 else "a finer mesh"
-    return f"{said} ({100 * change / size[worst]:+.0f} %): take {remedy}"
+    return f"{said}: take {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"
 
 
 def _of_mesh(mesh: TetMesh) -> list[str]:
