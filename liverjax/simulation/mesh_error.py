@@ -37,6 +37,7 @@ from liverjax.simulation.equations import (
     residual,
     unknowns,
 )
+from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
 #: Of linear elements and of quadratic ones: tolerance of the linear solve, part of the error that du counts for, and
@@ -62,11 +63,6 @@ class MeshError:
             result: `Result` of the run.
         """
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
-
-    @property
-    def largest(self) -> jax.Array:
-        """Largest error of a position at every step (T,) [m]."""
-        return jnp.max(jnp.linalg.norm(self.positions, axis=-1), axis=-1)
 
 
 def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshError:
@@ -132,7 +128,11 @@ def _step(scene: Scene, rich: Scene, sizes: Sizes, state: State, given: Any) -> 
     end = forces(e, jnp.where(sound, q + dq, q), one)
     found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
     moved = positions(e, q + dq, one)[: len(x)] - x
-    return advanced(e, End(end.x, end.F, end.pressure)), (moved, _on_nodes(scene.mesh, reaction) - reactions, found)
+    return advanced(e, End(end.x, end.F, end.pressure)), (
+        moved,
+        _on_nodes(scene.mesh, rich.mesh, reaction) - reactions,
+        found,
+    )
 
 
 def padded(rich: TetMesh, x: jax.Array) -> jax.Array:
@@ -142,10 +142,8 @@ def padded(rich: TetMesh, x: jax.Array) -> jax.Array:
     return jnp.concatenate([x, jnp.zeros((rich.number_of_nodes - len(x), 3), x.dtype)])
 
 
-def _on_nodes(mesh: TetMesh, force: jax.Array) -> jax.Array:
+def _on_nodes(mesh: TetMesh, rich: TetMesh, force: jax.Array) -> jax.Array:
     """Forces of the richer functions as the run's nodes feel them (V, 3)."""
     if mesh.order == 2:
         return force[: mesh.number_of_nodes]
-    low, high = mesh.pattern.edges
-    half = 0.5 * force[mesh.number_of_nodes :]
-    return force[: mesh.number_of_nodes].at[low].add(half).at[high].add(half)
+    return jnp.stack([restricted(rich, column) for column in force.T], axis=-1)

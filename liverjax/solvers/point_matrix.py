@@ -16,6 +16,7 @@ from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import gathered, interpolated, summed
+from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers import block_matrix
 from liverjax.solvers.block_matrix import Block, BlockMatrix
@@ -124,7 +125,6 @@ def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
 
 def prolonged(mesh: TetMesh, column: jax.Array) -> jax.Array:
     """A field that is linear in every element: (V,) of the vertices to all nodes."""
-    low, high = mesh.pattern.edges
-    parts = [column, 0.5 * (column[low] + column[high])]
-    more = mesh.number_of_nodes - sum(len(p) for p in parts)
-    return jnp.concatenate(parts if more == 0 else [*parts, jnp.zeros(more, column.dtype)])
+    nodes = on_middles(mesh, column)
+    more = mesh.number_of_nodes - len(nodes)
+    return nodes if more == 0 else jnp.concatenate([nodes, jnp.zeros(more, column.dtype)])
