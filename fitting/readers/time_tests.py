@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.rheometer import MODULUS_UNITS, split_line, text_of, to_number
+from fitting.readers.sweep_columns import MODULUS_UNITS
+from fitting.readers.text_tables import split_line, text_of, to_number
 from liverjax.core.errors import InputError
 
 _PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}

@@ -1,0 +1,109 @@
+"""A measured frequency sweep, and the parts of it that can be used."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fitting.readers import raw_torque
+from liverjax.core.errors import InputError
+
+#: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
+FEWEST = 3
+
+
+class Sweep(NamedTuple):
+    """A frequency sweep in SI units, sorted by frequency."""
+
+    angular_frequency: np.ndarray  # (n,) [rad/s]
+    storage: np.ndarray  # (n,) G' [Pa]
+    loss: np.ndarray  # (n,) G'' [Pa]
+    storage_sd: np.ndarray | None = None  # (n,) standard deviations [Pa]
+    loss_sd: np.ndarray | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()  # what the reader changed or chose, sentences
+    raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], where the file has them
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out for the instrument's sake
+
+    @property
+    def deviations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Scales of the residuals [Pa]: the given deviations, or the moduli themselves (relative errors)."""
+        return (
+            self.storage if self.storage_sd is None else self.storage_sd,
+            self.loss if self.loss_sd is None else self.loss_sd,
+        )
+
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time [s] that the frequencies resolve."""
+        return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
+
+
+def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
+    """The points from `low` to `high` [Hz]; a note names how many are left out.
+
+    Raises:
+        InputError: fewer than `FEWEST` frequencies are left.
+    """
+    hertz = sweep.angular_frequency / (2 * np.pi)
+    kept = np.ones(len(hertz), bool)
+    for limit, side, name in ((low, -1, "min"), (high, 1, "max")):
+        if limit is None:
+            continue
+        if not (np.isfinite(limit) and limit > 0):
+            raise InputError(f"--{name}-frequency {limit:g} is no frequency in Hz: give a positive number")
+        kept &= side * hertz <= side * limit * (1 + side * 1e-9)
+    if kept.all():
+        return sweep
+    if len(np.unique(hertz[kept])) < FEWEST:
+        raise InputError(
+            f"{sweep.source or 'sweep'}: --min-frequency and --max-frequency leave {kept.sum()} of {len(kept)} points "
+            f"(the file has {hertz[0]:.3g} to {hertz[-1]:.3g} Hz): leave {FEWEST} or more"
+        )
+    ends = " and ".join(
+        f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
+    )
+    note = f"{(~kept).sum()} of {len(kept)} points {ends} are left out as asked for"
+    return some(sweep, kept)._replace(notes=(*sweep.notes, note))
+
+
+def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
+    """The points where `kept` (n,) is true."""
+    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
+    columns: dict[str, Any] = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
+    raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
+    return sweep._replace(**columns, raw=raw)
+
+
+def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
+    """The points whose modulus exceeds what is not known of the instrument's inertia; the others become `grey`.
+
+    Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m].
+    """
+    if not sweep.raw:
+        return sweep
+    geometry = np.pi * radius**4 / (2 * height) if radius and height else None
+    G = sweep.storage + 1j * sweep.loss
+    found = raw_torque.share(sweep.angular_frequency, G, sweep.raw, geometry)
+    if found is None:
+        return sweep
+    unknown = raw_torque.UNCERTAINTY * found.modulus
+    lost = unknown > np.abs(G)
+    k = int(np.argmax(found.modulus / np.abs(G)))
+    note = (
+        f"the raw torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2; at "
+        f"{sweep.angular_frequency[k] / (2 * np.pi):.3g} Hz it carries {found.modulus[k] / np.abs(G[k]):.3g} times the "
+        "torque of the sample"
+    )
+    if not lost.any():
+        return sweep._replace(notes=(*sweep.notes, note))
+    if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
+        raise InputError(
+            f"{sweep.source}: {note}: nearly all of the sweep is the instrument's; measure at lower frequencies"
+        )
+    lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
+    share = f"{100 * raw_torque.UNCERTAINTY:g} % of the inertia, which calibrations leave open"
+    left = (
+        f"{lost.sum()} of {len(lost)} points from {lowest:.4g} Hz on are left out: the sample carries less than {share}"
+    )
+    grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
+    return some(sweep, ~lost)._replace(notes=(*sweep.notes, note, left), grey=grey)

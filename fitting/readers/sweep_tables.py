@@ -1,0 +1,181 @@
+"""Tables of frequency sweeps in the lines of a file: where each begins, and its rows of numbers."""
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers import raw_torque
+from fitting.readers.sweep_columns import MODULUS_UNITS, NEEDED, Column, header_columns
+from fitting.readers.text_tables import find_delimiter, split_cells, to_number
+from liverjax.core.errors import InputError
+
+
+class Table(NamedTuple):
+    """A table of a file, before its units are converted."""
+
+    name: str  # what the file calls it, may be empty
+    columns: list[Column]
+    rows: list[list[float]]  # in the order of the columns
+    numbers: list[int]  # of the lines in the file
+    raw: dict[str, np.ndarray]  # what the instrument measured, one value a row
+
+    @property
+    def frequencies(self) -> int:
+        """How many different ones it holds."""
+        place = next(j for j, c in enumerate(self.columns) if c.quantity == "frequency")
+        return len({row[place] for row in self.rows})
+
+
+def choose_table(path: str, tables: list[Table], wanted: str | None) -> tuple[int, list[str]]:
+    """Place of the table to read, and a note where there are several."""
+    names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
+    if wanted is not None:
+        k = _named(path, tables, names, wanted)
+        return k, [f"table {names[k]} of {len(tables)} is used"] if len(tables) > 1 else []
+    counts = [t.frequencies for t in tables]
+    k = counts.index(max(counts))
+    if len(tables) == 1:
+        return k, []
+    why = f"{'the first' if counts.count(counts[k]) > 1 else 'the one'} with most frequencies, {counts[k]}"
+    listed = f"the file holds {len(tables)} tables: {', '.join(names)}"
+    return k, [f"{listed}; table {names[k]} is used, {why}; choose another with --table NUMBER or NAME"]
+
+
+def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
+    """Place of the table with this number, this name, or alone with this in its name."""
+    if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
+        return int(wanted) - 1
+    sought = wanted.strip().lower()
+    matches = [k for k, t in enumerate(tables) if sought == t.name.lower()]
+    matches = matches or [k for k, t in enumerate(tables) if sought and sought in t.name.lower()]
+    if len(matches) == 1:
+        return matches[0]
+    found = f"is in the names of {len(matches)} tables" if matches else "is no table of the file"
+    offered = ", ".join(names[k] for k in matches) if matches else ", ".join(names)
+    raise InputError(f"{path}: --table {wanted} {found}; give the number or the whole name of one: {offered}")
+
+
+def tables_of(path: str, lines: list[str]) -> list[Table]:
+    """Every table that holds numbers; `InputError` saying what is missing where there is none."""
+    for uncomment in (False, True):  # np.savetxt writes its header as a comment
+        tables, headers = _search(path, [line.lstrip("# ") for line in lines] if uncomment else lines)
+        if tables:
+            return tables
+        if headers:
+            break
+    if headers:
+        raise InputError(
+            f"{path}: line {headers[0]}: there are no numbers below the header; give two frequencies or more"
+        )
+    named = [
+        {c.quantity for c in header_columns(split_cells(line, find_delimiter(line)))} & set(NEEDED) for line in lines
+    ]
+    best = max(range(len(lines)), key=lambda k: len(named[k]))
+    shown = lines[best].strip()[:80]
+    if not named[best]:
+        shown = next((s.strip() for s in lines if s.strip() and not s.lstrip().startswith("#")), "only comments")[:80]
+        raise InputError(
+            f"{path}: no header names frequency_Hz, storage_modulus_Pa and loss_modulus_Pa (the first line is "
+            f"{shown!r}); add that header, separated by commas, or export the sweep as CSV"
+        )
+    missing = next(q for q in NEEDED if q not in named[best])
+    raise InputError(f"{path}: no column for {missing} in the header {shown!r}; add {NEEDED[missing]}")
+
+
+def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
+    """Tables with numbers, and the line numbers of all complete headers."""
+    tables, headers, k, free = [], [], 0, 0  # `free`: from where on lines belong to no table
+    while k < len(lines):
+        line = lines[k]
+        k += 1
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        delimiter = find_delimiter(line)
+        cells = split_cells(line, delimiter)
+        columns = header_columns(cells)
+        if not set(NEEDED) <= {c.quantity for c in columns}:
+            continue
+        headers.append(k)
+        name = _title(lines[free : k - 1])
+        columns, k = _with_unit_row(columns, lines, k, delimiter)
+        above = k
+        rows, numbers, k = _rows(path, columns, lines, k, delimiter, len(cells))
+        if rows:
+            units = [split_cells(line, delimiter) for line in lines[headers[-1] : above]]
+            raw = _raw(cells, units, [split_cells(lines[n - 1], delimiter) for n in numbers], delimiter)
+            tables.append(Table(name, columns, rows, numbers, raw))
+        free = k
+    return tables, headers
+
+
+def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
+    """Raw torque, angle and phase in SI, of the rows of a table; a column with a gap is none."""
+    found = {}
+    for quantity, (place, factor) in raw_torque.columns(cells, unit_rows[-1] if unit_rows else []).items():
+        values = [to_number(row[place], delimiter) if place < len(row) else None for row in rows]
+        if all(v is not None and np.isfinite(v) for v in values):
+            found[quantity] = factor * np.array(values, float)
+    return found
+
+
+def _title(above: list[str]) -> str:
+    """What the lines above a header call its table: TRIOS's step, RheoCompass's result, else the nearest line."""
+    cells = [[c.strip("#\"' ") for c in line.split("\t")] for line in above]
+    cells = [[c for c in row if c] for row in cells]
+    for row in reversed(cells):
+        if len(row) > 1 and row[0].lower().rstrip(":") in ("step name", "result", "test"):
+            return row[1]
+    steps = [k for k, row in enumerate(cells) if row and row[0].lower() == "[step]"]
+    titles = [row[0] for row in (cells[steps[-1] + 1 :] if steps else cells[::-1]) if row]
+    return titles[0][:60] if titles else ""
+
+
+def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: str) -> tuple[list[Column], int]:
+    """Instruments put units in a line of their own, within the next two."""
+    for ahead in range(k, min(k + 2, len(lines))):
+        cells = split_cells(lines[ahead], delimiter)
+        units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
+        moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss")]
+        if any(moduli):
+            return [c._replace(unit=units.get(c.place) or c.unit) for c in columns], ahead + 1
+        if any(re.match(r"[-+]?\d", cell) for cell in cells):
+            break
+    return columns, k
+
+
+def _rows(path, columns, lines, k, delimiter, width):
+    """Rows of numbers below a header, their line numbers, and where to go on."""
+    needed = [c for c in columns if c.quantity in NEEDED]
+    rows, numbers = [], []
+    while k < len(lines):
+        line = lines[k]
+        if line.lstrip().startswith("#") or not line.strip(f"{delimiter} \t"):
+            k += 1
+            if rows and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
+                break  # the next table of an instrument's export
+            continue
+        cells = split_cells(line, delimiter)
+        values = [to_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
+        here = [cells[c.place] for c in columns if c in needed and c.place < len(cells)]
+        blank = not any(re.match(r"[-+]?\.?\d|nan|inf", cell.lower()) for cell in here)
+        if blank and (not rows or line.startswith("[") or delimiter == "\t"):
+            break  # a title taken for a header, or the end of this table
+        k += 1
+        for column, value in zip(columns, values, strict=True):
+            if value is None:
+                shown = repr(cells[column.place]) if column.place < len(cells) else "missing"
+                raise InputError(
+                    f"{path}: line {k}: {column.name} = {shown} is not a number; correct or remove the line"
+                )
+        if len([c for c in cells if c]) > width:
+            raise InputError(
+                f"{path}: line {k}: {len(cells)} cells under {width} headings; write decimals with a point"
+            )
+        rows.append(values)
+        numbers.append(k)
+    return rows, numbers, k
+
+
+def _complete(line: str) -> bool:
+    return set(NEEDED) <= {c.quantity for c in header_columns(split_cells(line, find_delimiter(line)))}
