@@ -25,6 +25,7 @@ from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.files import read_mesh, write_mesh
 from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.refinement import refined
 from liverjax.mesh.tetrahedra import TetMesh, check_mesh, tet_mesh
 from liverjax.physics import boundary, viscosity
 from liverjax.physics.boundary import Displaced, Fixed, Traction
@@ -66,6 +67,7 @@ __all__ = [
     "quadratic",
     "read_mesh",
     "reference",
+    "refined",
     "shapes",
     "simulate",
     "simulate_batch",

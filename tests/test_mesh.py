@@ -39,6 +39,24 @@ def test_volumes():
         assert np.isclose(lj.shapes.cylinder(0.01, 0.004, size).volumes.sum(), area * 0.004, rtol=1e-13)
 
 
+def test_refined_meshes_fill_the_same_body():
+    """Eight elements for one, conforming, the same volume; a held face stays held, and the order is kept."""
+    mesh = SHAPES["box"]()
+    fine = lj.refined(mesh)
+    lj.check_mesh(fine)
+    assert fine.number_of_elements == 8 * mesh.number_of_elements
+    assert np.isclose(fine.volumes.sum(), 6.0, rtol=1e-14) and fine.volumes.min() > 0
+    for name, nodes in fine.node_sets.items():
+        axis, side = "xyz".index(name[0]), {"min": 0.0, "max": [1.0, 2.0, 3.0]["xyz".index(name[0])]}[name[2:]]
+        on_face = np.flatnonzero(np.isclose(np.asarray(fine.points)[:, axis], side))
+        assert sorted(np.asarray(nodes)) == sorted(on_face)
+    quadratic = lj.quadratic(mesh)
+    np.testing.assert_array_equal(fine.points, quadratic.points)
+    twice = lj.refined(quadratic)
+    assert twice.order == 2
+    np.testing.assert_array_equal(twice.points, lj.quadratic(fine).points)
+
+
 def test_affine_field_has_its_gradient():
     mesh = SHAPES["cylinder"]()
     A = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.05, 0.0, 1.2]])

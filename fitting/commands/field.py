@@ -111,6 +111,9 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
             "or the scene misses something (mesh, supports, loads)",
             file=sys.stderr,
         )
+    moved = field.bias_sentence(found)
+    if moved is not None:
+        print(f"warning: {moved}", file=sys.stderr)
     if options.sphere:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
         print(field_report.table_of_numbers(sphere))

@@ -21,8 +21,9 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse.linalg
 
-from fitting.fits.scene_numbers import Problem, misfit
+from fitting.fits.scene_numbers import Problem, misfit, missing_or_none
 from fitting.methods import prior as smooth
+from fitting.methods.estimate import LARGEST_BIAS
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
@@ -44,6 +45,7 @@ class Field(NamedTuple):
     modulus: np.ndarray  # of the elements (E,)
     sd: np.ndarray  # of m at the nodes (V,), data seen
     prior_sd: np.ndarray  # (V,), before
+    mesh_bias: np.ndarray | None  # part of m (V,) that the meshes cause: subtract it to correct; None: not known
     deviation: float  # the prior's, chosen
     length: float  # [m] of correlation
     chi2: float
@@ -112,7 +114,7 @@ class _Search:
         return half + 0.5 * float(z @ z), deviation * smooth.to_whitened(self.p, g) + z
 
     def iterated(self, z: np.ndarray) -> None:
-        """Told of by L-BFGS after every iteration."""
+        """Called by L-BFGS after each iteration."""
         self.z = z.copy()
         self.write()
         self.progress(self.k, self.chi2 / self.problem.components)
@@ -155,6 +157,7 @@ def estimate(
     file: Path | None = None,
     resume: bool = False,
     progress: Callable[[int, float], None] = lambda weight, chi2: None,
+    mesh_error: bool = True,
 ) -> Field:
     """The field of `name` that explains the data.
 
@@ -167,6 +170,7 @@ def estimate(
         file: HDF5 file to which every iteration's point is written; None: nowhere.
         resume: begin from that file if it is there.
         progress: told of every iteration: number of the weight, chi^2 over the number of components.
+        mesh_error: estimate what the meshes leave out, and how far that moves the field (`mesh_bias`).
 
     Raises:
         InputError: see `start_of`; `file` of another fit.
@@ -181,7 +185,8 @@ def estimate(
     deviation = DEVIATIONS[search.k]
     m = deviation * smooth.to_nodes(p, search.z)
     search.cost(search.z)
-    values, vectors = _known(search, deviation, m, modes)
+    asked = _Asked.at(search, deviation, m)
+    values, vectors = _known(asked, len(m), modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
     return Field(
         name=name,
@@ -189,6 +194,7 @@ def estimate(
         modulus=np.asarray(values_at(problem, name, base, jnp.asarray(m))[name]),
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
+        mesh_bias=_bias(search, asked, m, values, vectors) if mesh_error else None,
         deviation=deviation,
         length=length,
         chi2=search.chi2,
@@ -230,25 +236,75 @@ def _weights(search: _Search, max_iterations: int) -> None:
         search.z = search.z * DEVIATIONS[search.k - 1] / DEVIATIONS[search.k]
 
 
-def _known(search: _Search, deviation: float, m: np.ndarray, modes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (V, k)."""
-    problem, name, p = search.problem, search.name, search.p
+class _Asked(NamedTuple):
+    """The runs linearised at the field that was found: products by J and its transpose, in whitened z."""
 
-    @jax.jit
-    def residuals(m, problem, base):
-        return misfit(problem, values_at(problem, name, base, m))[0]
+    p: smooth.Prior
+    deviation: float
+    push: Callable
+    pull: Callable
 
-    r, push = jax.linearize(lambda m: residuals(m, problem, search.base), jnp.asarray(m))
-    pull = jax.linear_transpose(push, jnp.asarray(m))
-    push, pull = jax.jit(push), jax.jit(pull)
+    @classmethod
+    def at(cls, search: _Search, deviation: float, m: np.ndarray) -> "_Asked":
+        """At the nodal field m (V,)."""
+        name = search.name
 
-    def product(z):
-        dm = jnp.asarray(deviation * smooth.to_nodes(p, z.ravel()))
-        return deviation * smooth.to_whitened(p, np.asarray(pull(push(dm))[0]))
+        @jax.jit
+        def residuals(m, problem, base):
+            return misfit(problem, values_at(problem, name, base, m))[0]
 
-    n = len(m)
-    k = min(modes, n - 2, len(r))
-    operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=product, dtype=float)
+        _, push = jax.linearize(lambda m: residuals(m, search.problem, search.base), jnp.asarray(m))
+        pull = jax.jit(jax.linear_transpose(push, jnp.asarray(m)))
+        return cls(search.p, deviation, jax.jit(push), pull)
+
+    def gradient(self, r: np.ndarray | jax.Array) -> np.ndarray:
+        """J^T r (V,) of residuals (n,)."""
+        return self.deviation * smooth.to_whitened(self.p, np.asarray(self.pull(jnp.asarray(r))[0]))
+
+    def product(self, z: np.ndarray) -> np.ndarray:
+        """J^T J z (V,)."""
+        dm = jnp.asarray(self.deviation * smooth.to_nodes(self.p, z.ravel()))
+        return self.gradient(self.push(dm))
+
+
+def _known(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
+    k = min(modes, n - 2, jax.eval_shape(asked.push, jnp.zeros(n)).size)
+    operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=asked.product, dtype=float)
     # Directions of eigenvalue far below 1 are the prior's: no digit of them matters.
     values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+
+
+def _bias(search: _Search, asked: _Asked, m: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
+    """What the meshes move the field m (V,): (I + J^T J)^-1 J^T of what they leave out of the residuals."""
+    left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, jnp.asarray(m)))
+    if left_out is None or not np.all(np.isfinite(left_out)):
+        return None
+    n, shrink = len(m), values / (1 + values)
+
+    def solved(z: np.ndarray) -> np.ndarray:
+        return z - vectors @ (shrink * (vectors.T @ z))
+
+    hessian, inverse = (
+        scipy.sparse.linalg.LinearOperator((n, n), matvec=f, dtype=float)
+        for f in (lambda z: z + asked.product(z), solved)
+    )
+    # A correction of first order: a hundredth of it is far below its own error.
+    z, _ = scipy.sparse.linalg.cg(hessian, asked.gradient(left_out), rtol=1e-2, maxiter=30, M=inverse)
+    return asked.deviation * smooth.to_nodes(asked.p, z)
+
+
+def bias_sentence(found: Field) -> str | None:
+    """Where the mesh moves the map by more than its standard deviation; None: nowhere, or not known."""
+    if found.mesh_bias is None:
+        return None
+    largest, beyond = np.abs(found.mesh_bias).max(), np.abs(found.mesh_bias) > found.sd
+    if largest > LARGEST_BIAS:
+        return f"the mesh moves the map by a third or more ({largest:.0%}): too much to be corrected; refine the mesh"
+    if not beyond.any():
+        return None
+    return (
+        f"the mesh moves the map by up to {largest:.0%}, and by more than the standard deviation at "
+        f"{beyond.mean():.0%} of the nodes: subtract mesh_bias from its logarithm, or refine the mesh"
+    )

@@ -23,6 +23,7 @@ def of_numbers(found: Estimate) -> dict[str, Any]:
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
         "standard_errors": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
+        "mesh_bias": None if found.mesh_bias is None else dict(zip(found.names, found.mesh_bias.tolist(), strict=True)),
         "correlation": found.correlation.tolist(),
         "chi2_per_component": found.chi2 / found.components,
         "noise_factor": found.noise,
@@ -42,6 +43,7 @@ def of_field(found: Field) -> dict[str, Any]:
         "largest": float(found.modulus.max()),
         "prior_deviation": found.deviation,
         "correlation_length_m": found.length,
+        "largest_mesh_bias_of_ln": None if found.mesh_bias is None else float(np.abs(found.mesh_bias).max()),
         "chi2_per_component": found.chi2 / found.components,
         "discrepancy_reached": found.reached,
         "components": found.components,
@@ -58,6 +60,8 @@ def write(out: Path, mesh: TetMesh, content: dict[str, Any], found: Field | None
     if found is None:
         return
     at_nodes = {"factor": np.exp(found.log_factor), "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
+    if found.mesh_bias is not None:
+        at_nodes["mesh_bias_of_ln"] = found.mesh_bias
     write_mesh(out / "field.vtu", mesh, at_nodes)
     with h5py.File(out / "field.h5", "w") as f:
         f["modulus"], f["reference"], f["tetrahedra"] = found.modulus, mesh.points, mesh.tetrahedra
@@ -104,9 +108,10 @@ def picture(mesh: TetMesh, found: Field) -> Any:
 def table_of_numbers(found: Estimate) -> str:
     """Names, values, standard errors, for the terminal."""
     width = max(map(len, found.names))
-    rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}"]
-    for name, value, error in zip(found.names, found.values, found.standard_errors, strict=True):
-        rows.append(f"{name:{width}}  {value:11.5g}  {error:14.3g}")
+    rows = [f"{'parameter':{width}}  {'value':>11}  {'standard error':>14}  {'mesh bias':>11}"]
+    bias = ["not known"] * len(found.names) if found.mesh_bias is None else [f"{b:.3g}" for b in found.mesh_bias]
+    for name, value, error, b in zip(found.names, found.values, found.standard_errors, bias, strict=True):
+        rows.append(f"{name:{width}}  {value:11.5g}  {error:14.3g}  {b:>11}")
     rows.append(f"chi2 per component {found.chi2 / found.components:.3f} of {found.components}, {found.seconds:.1f} s")
     return "\n".join(rows)
 

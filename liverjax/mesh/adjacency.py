@@ -11,8 +11,9 @@ from liverjax.core.struct import param, static, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
-#: Nodes a patch, and the most patches: the coarse matrix is dense, with 12 unknowns a patch.
-PATCH_SIZE, MOST_PATCHES = 80, 32
+#: Nodes a patch up to so many patches; nodes a patch of larger meshes, so that iterations do not grow with the mesh;
+#: the most patches: the coarse matrix is dense, with 12 unknowns a patch.
+PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
 
 @struct
@@ -75,7 +76,8 @@ def pattern(tetrahedra: Any, points: jax.Array) -> Pattern:
 def patches(points: np.ndarray) -> np.ndarray:
     """Number of the patch of every node (V,): boxes halved at the median of their longest side; host side."""
     groups = [np.arange(len(points))]
-    while len(groups) < min(-(-len(points) // PATCH_SIZE), MOST_PATCHES):
+    few = min(-(-len(points) // PATCH_SIZE), FEW_PATCHES)
+    while len(groups) < max(few, min(len(points) // LARGE_PATCH, MOST_PATCHES)):
         nodes = groups.pop(max(range(len(groups)), key=lambda k: len(groups[k])))
         axis = int(np.argmax(np.ptp(points[nodes], axis=0)))
         order = nodes[np.argsort(points[nodes, axis], kind="stable")]
