@@ -417,6 +417,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         elements.came_out,
         "has linear tetrahedra alone, and no error of the mesh",
     ),
+    "liver_mesh": ("how far is the phantom's answer known: two meshes, two orders?", elements.phantom, ""),
     "stability_rigs": ("error of tension, indentation and creep against run time: mesh, elements", rigs.came_out, ""),
     "stability_cost": ("what does robustness at hand cost where it is not needed?", _cost, ""),
     "laws_table": ("every law: error of its terms beside time and compile time", _laws, ""),
