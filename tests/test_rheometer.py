@@ -360,16 +360,58 @@ def test_moduli_of_tension_are_thirds_and_said(tmp_path):
     assert read_sweep(_write(tmp_path, short)).loss.tolist() == [60, 70]
 
 
-def test_a_workbook_is_called_one(tmp_path):
+def _workbook(path, sheets):
+    """A minimal .xlsx: the parts that ECMA-376 asks for, texts inline."""
+    import zipfile
+    from xml.sax.saxutils import escape
+
+    main, package = "http://schemas.openxmlformats.org/spreadsheetml/2006/main", "http://schemas.openxmlformats.org"
+    links = f"{package}/officeDocument/2006/relationships"
+
+    def cell(value):
+        if isinstance(value, str):
+            return f'<c t="inlineStr"><is><t>{escape(value)}</t></is></c>'
+        return f"<c><v>{value!r}</v></c>"
+
+    def listed(numbers, kind, target):
+        each = (f'<Relationship Id="r{k}" Type="{links}/{kind}" Target="{target.format(k)}"/>' for k in numbers)
+        return f'<Relationships xmlns="{package}/package/2006/relationships">{"".join(each)}</Relationships>'
+
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("_rels/.rels", listed([1], "officeDocument", "xl/workbook.xml"))
+        names = "".join(f'<sheet name="{n}" sheetId="{k}" r:id="r{k}"/>' for k, n in enumerate(sheets, 1))
+        book = f'<workbook xmlns="{main}" xmlns:r="{links}"><sheets>{names}</sheets></workbook>'
+        file.writestr("xl/workbook.xml", book)
+        file.writestr("xl/_rels/workbook.xml.rels", listed(range(1, len(sheets) + 1), "worksheet", "sheet{}.xml"))
+        for k, rows in enumerate(sheets.values(), 1):
+            data = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in rows)
+            file.writestr(f"xl/sheet{k}.xml", f'<worksheet xmlns="{main}"><sheetData>{data}</sheetData></worksheet>')
+    return path
+
+
+def test_a_workbook_is_read_sheet_by_sheet(tmp_path):
+    rows = [[0.1 * 10**k, 300.5 * (k + 1), 30.25 * (k + 1)] for k in range(4)]
+    head = [["Angular frequency", "Storage modulus", "Loss modulus"], ["rad/s", "kPa", "kPa"]]
+    details = [["Filename", "sample"], ["Operator", "a\tb"]]
+    path = _workbook(tmp_path / "t.xlsx", {"Details": details, "Sweep - 1": head + rows[:3], "Sweep - 2": head + rows})
+    found = read_sweep(path)
+    np.testing.assert_array_equal(found.storage, 1e3 * np.array(rows)[:, 1])
+    assert any("table 2 'Sweep - 2' is used" in note for note in found.notes)
+    assert read_sweep(path, table="Sweep - 1").loss.tolist() == [30250, 60500, 90750]
+
+
+def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
+    import sys
     import zipfile
 
     with zipfile.ZipFile(tmp_path / "new.xlsx", "w") as file:
         file.writestr("xl/workbook.xml", "<workbook/>")
     old = _write(tmp_path, bytes.fromhex("d0cf11e0a1b11ae1") + bytes(504), "old.xls")
     for path in (tmp_path / "new.xlsx", old):
-        with pytest.raises(
-            InputError, match=r"is a spreadsheet workbook.*export the sheet of the frequency sweep as CSV"
-        ):
+        with pytest.raises(InputError, match=r"cannot be read .*export the sheet of the frequency sweep as CSV"):
             read_sweep(path)
         with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of the curves as CSV"):
             read_curves([path])
+    monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
+    with pytest.raises(InputError, match="pip install python-calamine"):
+        read_sweep(old)

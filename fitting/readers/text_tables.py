@@ -10,7 +10,7 @@ from liverjax.core.errors import InputError
 
 
 def text_of(path: Path, what: str = "a frequency sweep") -> str:
-    """Content of a text file of any encoding; `InputError` asking for the CSV file of `what`."""
+    """Content of a text file of any encoding, or of a workbook; `InputError` asking for the CSV file of `what`."""
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder: give the CSV file of {what}")
@@ -21,7 +21,8 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
         raise InputError(f"{path}: {error.strerror}; give the CSV file of {what}") from None
     if not data.strip():
         raise InputError(f"{path} is empty: export the sweep again")
-    workbook.refuse(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
+    if workbook.is_one(data):
+        return workbook.text(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
     text = _decoded(path, data)
     if text.lstrip().startswith("{"):
         found = trios_json.tables(text)

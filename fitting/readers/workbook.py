@@ -1,6 +1,8 @@
-"""Spreadsheets are not read: the sentence that says so, and what to export."""
+"""Spreadsheets (.xls, .xlsx, .xlsb, .ods) as lines of text: every sheet is a table with tabs between the cells."""
 
+import io
 from pathlib import Path
+from typing import Any
 
 from liverjax.core.errors import InputError
 
@@ -8,7 +10,47 @@ from liverjax.core.errors import InputError
 OLD, ZIP = bytes.fromhex("d0cf11e0a1b11ae1"), b"PK\x03\x04"
 
 
+def is_one(data: bytes) -> bool:
+    """Whether the bytes are a workbook."""
+    return data.startswith(OLD) or (data.startswith(ZIP) and (b"xl/" in data or b"opendocument.spreadsheet" in data))
+
+
+def text(path: Path, data: bytes, wanted: str) -> str:
+    """The sheets of a workbook, one after the other, as an instrument's text export has its steps.
+
+    Args:
+        path: named in errors.
+        data: content of the file.
+        wanted: what to export as CSV where the workbook cannot be read, e.g. "the sheet of the sweep".
+
+    Raises:
+        InputError: the reader of workbooks is not installed, or the workbook is damaged.
+    """
+    try:
+        import python_calamine
+    except ImportError:
+        raise InputError(
+            f"{path} is a spreadsheet workbook, which needs python-calamine: pip install python-calamine, or export "
+            f"{wanted} as CSV"
+        ) from None
+    try:
+        book = python_calamine.CalamineWorkbook.from_filelike(io.BytesIO(data))
+        sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
+    except Exception as error:  # the reader has an exception for each format, and raises others on damaged bytes
+        raise InputError(
+            f"{path} is a spreadsheet workbook that cannot be read ({_line(error)}): save it again, or export {wanted} "
+            "as CSV"
+        ) from None
+    parts = [["[step]", name, *("\t".join(map(_line, row)) for row in rows), ""] for name, rows in sheets.items()]
+    return "\n".join(line for part in parts for line in part)
+
+
 def refuse(path: Path, data: bytes, wanted: str) -> None:
-    """`InputError` where the bytes are a workbook (.xls, .xlsx, .ods), saying to export `wanted` as text."""
-    if data.startswith(OLD) or (data.startswith(ZIP) and (b"xl/" in data or b"opendocument.spreadsheet" in data)):
+    """`InputError` where the bytes are a workbook and only text will do, saying to export `wanted` as CSV."""
+    if is_one(data):
         raise InputError(f"{path} is a spreadsheet workbook, not text: open it, export {wanted} as CSV, and give that")
+
+
+def _line(cell: Any) -> str:
+    """A cell without the characters that end a cell or a line; numbers with all their digits."""
+    return " ".join(str(cell).split())
