@@ -29,6 +29,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the answers before it")
     command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="of the sample [m], for torque and force")
+    command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
     command.add_argument(
         "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
     )
@@ -43,6 +44,12 @@ def _modes(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
 
 
+def check_samples(count: int | None) -> None:
+    """Refuse a number of draws that says nothing, or that no disk needs."""
+    if count is not None and not 100 <= count <= 100000:
+        raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
+
+
 def run(options: argparse.Namespace) -> int:
     """Fit the test; 1 if the fit did not converge."""
     from fitting.fits import time_tests as fits
@@ -54,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and not 0 < value <= 0.2:
             raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
+    check_samples(options.samples)
     out = options.out or Path(options.kind)
     sample = reader.Sample(options.radius, options.height)
     test = reader.read(options.file, options.kind, sample, options.ramp, options.min_time)
@@ -61,13 +69,22 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.fit(test, options.modes)
-    time_report.write(out, test, found)
+    posterior = None
+    if options.samples:
+        from fitting.fits.posterior import of_time_test
+
+        posterior = of_time_test(found, test, options.samples)
+    content = time_report.write(out, test, found, posterior)
     print(time_report.table(test, found))
+    if posterior is not None:
+        from fitting.reports import posterior_report
+
+        print(posterior_report.table(posterior))
     if options.cards:
         from fitting.commands.sweep import write_cards
 
         write_cards(out, found.model)
-    for sentence in found.warnings:
+    for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {out}/fit.json, fit.png")
     return 0 if found.converged else 1

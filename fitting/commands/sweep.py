@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 from fitting.commands.exit_codes import EXIT_CODES
 from fitting.commands.progress import cost_bar
+from fitting.commands.relaxation import check_samples
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
 
 if TYPE_CHECKING:
-    from fitting.fits.viscoelastic import Fit
+    from fitting.fits.posterior import Posterior
+    from fitting.fits.viscoelastic import Fit, Simulation
     from fitting.methods.generalised_maxwell import Maxwell, Spectrum
     from fitting.readers.rheometer import Sweep
 
@@ -57,6 +59,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
     command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
+    command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
     command.add_argument(
         "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
     )
@@ -96,14 +99,19 @@ def run(options: argparse.Namespace) -> int:
     profile = None
     if options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
-    sweep_report.write(options.out, sweep, fits, profile)
+    posterior = _posterior(options, sweep, fits[-1])
+    content = sweep_report.write(options.out, sweep, fits, profile, posterior)
     print(sweep_report.table(sweep, fits))
+    if posterior is not None:
+        from fitting.reports import posterior_report
+
+        print(posterior_report.table(posterior))
     if options.cards:
         write_cards(options.out, fits[-1].model)
     for name, (low, high) in (profile or {}).items():
         ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
         print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
-    for sentence in fits[-1].warnings:
+    for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")
     return 0 if fits[-1].converged else 1
@@ -137,6 +145,9 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--modes {options.modes} is of --model prony: leave it out for --model {options.model}")
     if options.profile and options.model != "prony":
         raise InputError(f"--profile is of --model prony; leave it out for --model {options.model}")
+    check_samples(options.samples)
+    if options.samples and options.model == "spectrum":
+        raise InputError("--samples is of models of a few numbers; leave it out for --model spectrum")
     laws.find(options.law)
 
 
@@ -145,6 +156,7 @@ def _check_samples(options: argparse.Namespace) -> None:
     for name, asked, instead in (
         ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
         ("--profile", options.profile, "leave it out, or give one file"),
+        ("--samples", options.samples is not None, "leave it out, or give one file"),
         ("--model spectrum", options.model == "spectrum", "give --model prony, fractional or auto"),
     ):
         if asked:
@@ -179,14 +191,34 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
     closed = edges.honest(_closed(options, sweep, dense), sweep, dense)
     if options.method == "closed-form":
         return [closed]
-    simulation = viscoelastic.Simulation(
-        radius=options.radius or viscoelastic.Simulation().radius,
-        height=options.height or viscoelastic.Simulation().height,
+    simulation = _simulation(options)
+    bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
+    with bar:
+        return [closed, viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)]
+
+
+def _simulation(options: argparse.Namespace) -> "Simulation":
+    from fitting.fits.viscoelastic import Simulation
+
+    return Simulation(
+        radius=options.radius or Simulation().radius,
+        height=options.height or Simulation().height,
         law=options.law,
         scheme=options.scheme,
         steps=options.steps,
         density=options.density,
     )
-    bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
-    with bar:
-        return [closed, viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)]
+
+
+def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Posterior | None":
+    """Samples of the posterior of the last fit, where they are asked for and its numbers are few."""
+    from fitting.fits import posterior
+
+    if not options.samples:
+        return None
+    if fit.kind.prior is not None:
+        print("note: --samples is of models of a few numbers; the spectrum has its standard errors", file=sys.stderr)
+        return None
+    if fit.method == "torsion":
+        return posterior.of_simulation(fit, sweep, _simulation(options), options.samples)
+    return posterior.of_sweep(fit, sweep, options.samples)

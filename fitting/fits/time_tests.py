@@ -123,15 +123,22 @@ def identifiable(fit: TimeFit, test: TimeTest) -> bool:
 
 
 def _one(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
-    scales = _scales(test, rows)
-    data = (test.time, test.driven, rows, test.answer[rows], scales)
-    best = viscoelastic.best_of(levenberg_marquardt, _residuals(test.kind, kind.name))
+    function, data = residuals_of(test, kind)
+    scales = data[-1]
+    best = viscoelastic.best_of(levenberg_marquardt, function)
     found, compiling, running = viscoelastic.timed(best, _starts(test, rows, modes, kind), *data)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
     spread = uncertainty.estimate(found, False, kind.maxwell)
     fitted = np.asarray(found.residuals) * scales + test.answer[rows]
     at = (test.time[rows], test.answer[rows], fitted, scales)
     return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, compiling, {})
+
+
+def residuals_of(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
+    """Residuals (m,) of u and of the data that come second, for Prony modes of a solid or a fluid."""
+    rows = thinned(test)
+    data = (test.time, test.driven, rows, test.answer[rows], _scales(test, rows))
+    return _residuals(test.kind, kind.name), data
 
 
 def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:

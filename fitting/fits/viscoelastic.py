@@ -298,7 +298,7 @@ class Simulation(NamedTuple):
 LINEAR_STRAIN = 1e-2
 
 
-def _law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
+def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
     """The sample of Prony modes: the law scaled to their G0, and how it relaxes."""
     viscosity = Prony(
         ratios=model.ratios,
@@ -327,7 +327,7 @@ def simulated_residuals(
     """
     rig, law, omega, torque, measured, scales = data
     drive = torsion.Drive(steps=simulation.steps)
-    m = torsion.moduli(rig, *_law_and_prony(kind.maxwell(u), law, simulation), omega, torque, drive)
+    m = torsion.moduli(rig, *law_and_prony(kind.maxwell(u), law, simulation), omega, torque, drive)
     return _and_prior((jnp.concatenate([m.storage, m.loss]) - measured) / scales, u, kind), m
 
 
@@ -350,7 +350,7 @@ def with_jacobian(
     _, law, omega, _, _, scales = data
 
     def linear(u):
-        G = torsion.linear_moduli(*_law_and_prony(kind.maxwell(u), law, simulation), omega, simulation.steps)
+        G = torsion.linear_moduli(*law_and_prony(kind.maxwell(u), law, simulation), omega, simulation.steps)
         return _and_prior(jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales, u, kind)
 
     r, m = simulated_residuals(u, data, simulation, kind)
@@ -363,6 +363,14 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, simulation.height)
     return torsion.make_rig(simulation.radius, simulation.height, cell, density=simulation.density)
+
+
+def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
+    """Rig, law, angular frequencies, torques, measured moduli and deviations, as of `simulated_residuals`."""
+    rig = rig_of(simulation)
+    torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
+    measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
+    return rig, laws.typical(simulation.law), jnp.asarray(sweep.angular_frequency), torque, measured, scales
 
 
 #: What the closed form says of data and model, which the simulation leaves as it is: words of warnings, and details.
@@ -397,12 +405,9 @@ def through_torsion(
     """
     from liverjax.physics.viscosity import check
 
-    law = laws.typical(simulation.law)
+    data = simulation_data(sweep, simulation)
+    rig, law, *_, scales = data
     check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
-    rig = rig_of(simulation)
-    torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
-    measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
-    data = (rig, law, jnp.asarray(sweep.angular_frequency), torque, measured, scales)
     u0, kind = jnp.asarray(start.solution.u), start.kind
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
@@ -447,7 +452,7 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time.
     """
     law, omega, scales = data
-    scaled, prony = _law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
+    scaled, prony = law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
     meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
     exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
     natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from fitting.fits import edges, models
+from fitting.fits.posterior import Posterior
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
+from fitting.reports import posterior_report
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
 
@@ -104,8 +106,13 @@ def _own(fit: Fit) -> dict[str, Any]:
     return {"parameters": {n: {"value": v, "standard_error": e, "unit": unit} for n, v, e, unit in rows}}
 
 
-def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | None) -> dict[str, Any]:
-    """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others stand beside it); returns the JSON."""
+def write(
+    out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | None, posterior: Posterior | None = None
+) -> dict[str, Any]:
+    """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others stand beside it); returns the JSON.
+
+    With a posterior its summary is in the JSON and its draws in posterior.csv.
+    """
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
@@ -114,6 +121,10 @@ def write(out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | No
         content["closed_form"] = summary(fits[0], sweep)
     if profile is not None:  # of the closed form, whichever method leads
         content.get("closed_form", content)["profile_intervals_95"] = profile
+    if posterior is not None:
+        content["posterior"] = posterior_report.summary(posterior)
+        content["warnings"] += posterior.warnings()
+        posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(content)
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(sweep, fits), out / "fit.png")

@@ -6,20 +6,26 @@ from typing import Any
 
 import numpy as np
 
+from fitting.fits.posterior import Posterior
 from fitting.fits.time_tests import TimeFit
 from fitting.methods import time_response
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.time_tests import TimeTest
+from fitting.reports import posterior_report
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
 
 
-def write(out: Path, test: TimeTest, fit: TimeFit) -> dict[str, Any]:
-    """Write both files; returns the JSON, whose names are those of a sweep's."""
+def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> dict[str, Any]:
+    """Write both files, and the draws of a posterior; returns the JSON, whose names are those of a sweep's."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors
+    sampled: dict[str, Any] = {}
+    if posterior is not None:
+        sampled = {"posterior": posterior_report.summary(posterior)}
+        posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(
         {
             "method": test.kind,
@@ -42,13 +48,14 @@ def write(out: Path, test: TimeTest, fit: TimeFit) -> dict[str, Any]:
             "noise_factor": u.noise,
             "mean_relative_error": float(errors.mean()),
             "max_relative_error": float(errors.max()),
-            "warnings": list(fit.warnings),
+            "warnings": [*fit.warnings, *(posterior.warnings() if posterior else [])],
             "run_time_s": fit.run_time,
             "compile_time_s": fit.compile_time,
             "details": fit.details,
             "data": test.source,
             "notes": list(test.notes),
             "versions": versions(),
+            **sampled,
         }
     )
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -1,0 +1,289 @@
+"""Samples of the posterior of a fit: what the data and a stated prior leave possible, not only its curvature.
+
+The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. Without
+deviations its prior is 1 / s. With deviations it is 1 / s above 1: they are believed, and only ever enlarged.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.special
+
+from fitting.fits import time_tests, viscoelastic
+from fitting.fits.time_tests import TimeFit
+from fitting.fits.viscoelastic import FLUID, Fit, Kind, Simulation
+from fitting.methods import generalised_maxwell, springpots
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.sampling import tempering
+from fitting.methods.sampling.diagnostics import r_hat
+from fitting.methods.sampling.tempering import Chains, Density
+from fitting.methods.springpots import FRACTIONAL, Fractional
+from fitting.methods.uncertainty import parameter_names
+from fitting.readers.rheometer import Sweep
+from fitting.readers.time_tests import TimeTest
+from fitting.rigs import torsion
+from liverjax.core.compiled import compiled
+
+#: The prior of relaxation times ends this factor beyond the times that the data resolve.
+BEYOND = 10.0
+#: The prior of the moduli of a fractional model ends this factor beyond the measured ones.
+MODULI_BEYOND = 1e3
+PRIORS = {
+    "prony": "G0 log-uniform from the smallest measured modulus to 1000 times the largest; relaxation times "
+    "log-uniform from a tenth of the shortest to ten times the longest that the data resolve; ratios uniform, together "
+    "with the equilibrium part, among all that add up to one",
+    "fractional": "moduli at the middle of the band log-uniform within a factor of 1000 of the measured ones; "
+    "exponents uniform",
+}
+
+
+class Posterior(NamedTuple):
+    """Draws of the reported numbers."""
+
+    names: tuple[str, ...]
+    draws: np.ndarray  # (chains, N, K)
+    r_hat: np.ndarray  # (K,)
+    chains: Chains  # the same draws in the coordinates of the fit, and how they were found
+    prior: str  # in words
+    seconds: float
+    simulated: dict[str, float] | None = None  # of draws that were simulated: how many, and the largest difference
+
+    def warnings(self) -> list[str]:
+        """Sentences where the draws are not enough."""
+        worst = int(np.argmax(self.r_hat))
+        out = []
+        if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
+            out.append(
+                f"the posterior is that of the linear rig; in {SIMULATED} simulated draws its log density is off by up "
+                f"to {self.simulated['largest_difference']:.2g}: trust its intervals to that only"
+            )
+        if self.r_hat[worst] < AGREED:
+            return out
+        return [
+            *out,
+            f"the chains of the posterior do not agree on {self.names[worst]} (R-hat {self.r_hat[worst]:.3g}): give "
+            "more --samples, fewer modes or another --model",
+        ]
+
+
+#: R-hat below which the chains agree.
+AGREED = 1.01
+
+
+class Target(NamedTuple):
+    """A posterior density of u, and what is reported of it."""
+
+    residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors over their scales
+    prior: "Modes | Springpots"
+    deviations_given: bool
+
+    def log_likelihood(self, u: np.ndarray) -> np.ndarray:
+        """Of u (W, P), up to a constant, with the size of the errors integrated out."""
+        with np.errstate(all="ignore"):  # an overflow is a point without likelihood
+            r = self.residuals(u)
+            return log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
+
+
+def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
+    """Log of the integral of s^-m exp(-square / 2 s^2) ds / s over all s, or over s >= 1 where deviations are given."""
+    half = 0.5 * np.maximum(square, 1e-26 * count)  # an exact fit has no posterior but a point
+    out = -0.5 * count * np.log(half)
+    return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
+
+
+def target(
+    kind: Kind,
+    residuals: Callable[[np.ndarray], np.ndarray],
+    resolved: tuple[float, float],
+    size: np.ndarray,
+    given: bool,
+) -> Target:
+    """The posterior of a model.
+
+    Args:
+        kind: what u means: Prony modes or a fractional model.
+        residuals: u (W, P) -> (W, m) over their scales.
+        resolved: shortest and longest relaxation time [s] that the data resolve.
+        size: measured moduli (n,) [Pa].
+        given: the deviations are.
+    """
+    smallest, largest = float(size.min()), float(size.max())
+    if kind.values is None:
+        times = (np.log(resolved[0] / BEYOND), np.log(resolved[1] * BEYOND))
+        modulus = (np.log(smallest), np.log(largest * MODULI_BEYOND))
+        return Target(residuals, Modes(kind.name == FLUID.name, modulus, times), given)
+    (model,) = (m for m in FRACTIONAL if m.name == kind.name)
+    moduli = np.log(smallest / MODULI_BEYOND), np.log(largest * MODULI_BEYOND)
+    return Target(residuals, Springpots(model, moduli, kind.values), given)
+
+
+class Modes(NamedTuple):
+    """Prior and numbers of Prony modes, in the coordinates of `generalised_maxwell.natural` or `natural_fluid`."""
+
+    fluid: bool
+    modulus: tuple[float, float]  # ends of log G0
+    times: tuple[float, float]  # ends of the logs of times
+    words: str = PRIORS["prony"]
+
+    def log_prior(self, u: np.ndarray) -> np.ndarray:
+        """Of u (W, P), up to a constant."""
+        with np.errstate(all="ignore"):
+            model = self._model(u)
+            rest = np.zeros((len(u), 0)) if self.fluid else 1 - model.ratios.sum(axis=-1, keepdims=True)
+            shares = np.concatenate([model.ratios, rest], axis=-1)
+            log_time = np.log(model.relaxation_times)
+            inside = (log_time[:, -1] > self.times[0]) & (log_time[:, 0] < self.times[1])
+            inside &= (u[:, 0] > self.modulus[0]) & (u[:, 0] < self.modulus[1])
+            # The slopes of ratios by their logits (softmax), and of log times by the logs of their gaps.
+            gaps = u[:, u.shape[-1] - model.ratios.shape[-1] + 1 :]
+            found = np.log(shares).sum(axis=-1) + gaps.sum(axis=-1)
+        return np.where(inside & np.isfinite(found), found, -np.inf)
+
+    def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
+        """u (count, parameters) of the prior."""
+        modes = parameters // 2
+        share = rng.standard_exponential((count, modes + (not self.fluid)))  # their ratios are uniform on the simplex
+        log_time = -np.sort(-rng.uniform(*self.times, (count, modes)), axis=1)
+        top = rng.uniform(*self.modulus, (count, 1))
+        gaps = np.log(-np.diff(log_time, axis=1))
+        return np.concatenate([top, np.log(share[:, :-1] / share[:, -1:]), log_time[:, :1], gaps], axis=1)
+
+    def _model(self, u: np.ndarray) -> Maxwell:
+        return (generalised_maxwell.natural_fluid if self.fluid else generalised_maxwell.natural)(u)
+
+    def names(self, parameters: int) -> tuple[str, ...]:
+        """Of the reported numbers, for so many coordinates."""
+        first, *others = parameter_names(parameters // 2)
+        return (first, *others) if self.fluid else (first, "equilibrium_modulus", *others)
+
+    def numbers(self, u: np.ndarray) -> np.ndarray:
+        """Moduli, ratios and times (n, K) of u (n, P)."""
+        model = self._model(u)
+        moduli = [model.shear_modulus] if self.fluid else [model.shear_modulus, model.equilibrium_modulus]
+        return np.concatenate([np.stack(moduli, axis=-1), model.ratios, model.relaxation_times], axis=-1)
+
+
+class Springpots(NamedTuple):
+    """Prior and numbers of a fractional model; u are its free places of `springpots`: log moduli and logits."""
+
+    model: Fractional
+    moduli: tuple[float, float]  # ends of their logs
+    values: Callable  # of one u, of JAX
+    words: str = PRIORS["fractional"]
+
+    @property
+    def _moduli(self) -> np.ndarray:
+        """Which of the free numbers are moduli; the others are logits of exponents."""
+        return np.array([k % 2 == 0 for k in self.model.free])
+
+    def log_prior(self, u: np.ndarray) -> np.ndarray:
+        """Of u (W, P), up to a constant."""
+        moduli, exponents = u[:, self._moduli], u[:, ~self._moduli]
+        inside = np.all((moduli > self.moduli[0]) & (moduli < self.moduli[1]), axis=-1)
+        slopes = -np.logaddexp(0, exponents) - np.logaddexp(0, -exponents)
+        return np.where(inside, slopes.sum(axis=-1), -np.inf)
+
+    def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
+        """u (count, parameters) of the prior."""
+        moduli = rng.uniform(*self.moduli, (count, parameters))
+        return np.where(self._moduli, moduli, scipy.special.logit(rng.random((count, parameters))))
+
+    def names(self, parameters: int) -> tuple[str, ...]:
+        """Of the reported numbers."""
+        return self.model.names
+
+    def numbers(self, u: np.ndarray) -> np.ndarray:
+        """The model's own numbers (n, K) of u (n, P)."""
+        return np.asarray(jax.jit(jax.vmap(self.values))(u))
+
+
+def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
+    """Independent chains of `count` draws of the posterior.
+
+    Args:
+        at: the density.
+        parameters: P, length of u.
+        count: draws of each chain.
+        seed: of the generators; the same seed gives the same draws.
+    """
+    begin, prior = time.perf_counter(), at.prior
+    density = Density(at.log_likelihood, prior.log_prior, lambda rng, n: prior.from_prior(rng, n, parameters))
+    chains = tempering.run(density, count, seed)
+    draws = prior.numbers(chains.draws.reshape(-1, parameters)).reshape(*chains.draws.shape[:2], -1)
+    known = np.array([r_hat(draws[..., k]) for k in range(draws.shape[-1])])
+    return Posterior(prior.names(parameters), draws, known, chains, prior.words, time.perf_counter() - begin)
+
+
+def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
+    """Of a fit in closed form, of Prony modes or of a fractional model."""
+    data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
+    if fit.kind.values is None:
+        function = viscoelastic.residuals_of(fit.kind)
+        return sample(_sweep_target(fit.kind, sweep, lambda u: function(u, *data)), len(fit.solution.u), count, seed)
+    (model,) = (m for m in FRACTIONAL if m.name == fit.kind.name)
+    x = data[0] / springpots.reference_frequency(sweep)
+
+    @jax.jit
+    @jax.vmap
+    def residuals(u):
+        return springpots.residuals(springpots.full(model, u), model.switches, x, *data[1:])
+
+    own = _sweep_target(fit.kind, sweep, lambda u: np.asarray(residuals(u)))
+    return sample(own, len(fit.solution.u), count, seed)
+
+
+def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> Target:
+    size = np.hypot(sweep.storage, sweep.loss)
+    return target(kind, residuals, sweep.resolved, size, sweep.storage_sd is not None)
+
+
+#: Draws that are simulated, and the difference of their log density above which a warning says so.
+SIMULATED, DIFFERENT = 12, 0.1
+
+
+def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
+    """Of a fit of Prony modes through the torsion simulation.
+
+    The density is that of the linear rig, with its recursion in time, times what the simulation adds to it at the
+    minimum (complex, one factor a frequency). Some draws are then simulated: `Posterior.simulated` has the largest
+    difference of their log density, so that the short cut is checked where it is used.
+    """
+    data, scales = viscoelastic.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
+    law, omega, measured = data[1], data[2], data[4]
+
+    @jax.jit
+    @jax.vmap
+    def linear(u):
+        sample = viscoelastic.law_and_prony(fit.kind.maxwell(u), law, simulation)
+        return torsion.linear_moduli(*sample, omega, simulation.steps)
+
+    added = (fit.storage + 1j * fit.loss) / np.asarray(linear(fit.solution.u[None]))[0]
+
+    def residuals(u: np.ndarray) -> np.ndarray:
+        G = added * np.asarray(linear(u))
+        return (np.concatenate([G.real, G.imag], axis=-1) - measured) / scales
+
+    own = _sweep_target(fit.kind, sweep, residuals)
+    found = sample(own, len(fit.solution.u), count, seed)
+    begin = time.perf_counter()
+    draws = found.chains.draws.reshape(-1, len(fit.solution.u))
+    some = draws[np.linspace(0, len(draws) - 1, SIMULATED).astype(int)]
+    program = compiled(partial(viscoelastic.with_jacobian, simulation=simulation, kind=fit.kind), some[0], data)
+    exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in some])
+    likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
+    apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
+    checked = {"draws": float(SIMULATED), "largest_difference": apart}
+    return found._replace(simulated=checked, seconds=found.seconds + time.perf_counter() - begin)
+
+
+def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
+    """Of a relaxation or creep test in closed form."""
+    one, data = time_tests.residuals_of(test, fit.kind)
+    residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))
+    size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
+    own = target(fit.kind, lambda u: np.asarray(residuals(u)), test.resolved, size, False)
+    return sample(own, len(fit.solution.u), count, seed)

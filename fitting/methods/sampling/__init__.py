@@ -1,0 +1,1 @@
+"""Samples of a posterior, and whether they are enough."""

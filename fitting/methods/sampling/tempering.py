@@ -1,0 +1,154 @@
+"""Samples of a posterior by tempering: particles of the prior, led to the posterior in steps.
+
+The likelihood is raised to a power that grows from 0 to 1. Each step resamples the particles by the weights that it
+gives them, and moves them by differential evolution until they have forgotten where they were (Del Moral, Doucet and
+Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18, 435). Runs begin at the
+prior, so that they agree only if they have found all of the posterior, tails and further maxima included. A density of
+many points at once is all that it needs: no derivative, nothing to tune or to compile.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.special
+
+#: Independent runs, and particles of each at least.
+CHAINS, FEWEST = 4, 500
+#: Part of the particles that a step of the power leaves effective.
+EFFECTIVE = 0.5
+#: Correlation with the places before a step at which these are forgotten, then that at the end; most moves of a step.
+FORGOTTEN, FORGOTTEN_LAST, MOST = 0.6, 0.2, 30
+#: Part of the moves that go the whole difference of two particles, which leads from one maximum to another.
+LONG = 0.1
+
+
+class Density(NamedTuple):
+    """A posterior; the functions take u (W, P)."""
+
+    log_likelihood: Callable[[np.ndarray], np.ndarray]  # -> (W,), up to a constant
+    log_prior: Callable[[np.ndarray], np.ndarray]  # -> (W,), minus infinity outside of its support
+    from_prior: Callable[[np.random.Generator, int], np.ndarray]  # (generator, W) -> (W, P)
+
+
+class Chains(NamedTuple):
+    """Draws of independent runs."""
+
+    draws: np.ndarray  # (CHAINS, N, P)
+    log_evidence: np.ndarray  # (CHAINS,) log of the mean likelihood over the prior
+    steps: int  # of the power, of all runs
+    moves: int  # of each particle, of all runs
+    acceptance: float  # at the end
+    remembered: float  # largest correlation of the draws with the places before the last moves
+
+
+class _Particles(NamedTuple):
+    u: np.ndarray  # (N, P)
+    likelihood: np.ndarray  # (N,) log
+    prior: np.ndarray  # (N,) log
+
+    def at(self, places: np.ndarray) -> "_Particles":
+        return _Particles(*(field[places] for field in self))
+
+
+def run(density: Density, count: int, seed: int = 0) -> Chains:
+    """`CHAINS` runs of `count` draws.
+
+    Args:
+        density: the posterior.
+        count: draws that each run keeps.
+        seed: of the generators; the same seed gives the same draws.
+    """
+    found = [_run(density, max(FEWEST, count + count % 2), np.random.default_rng([seed, k])) for k in range(CHAINS)]
+    draws, evidence, steps, moves, accepted, remembered = zip(*found, strict=True)
+    kept = np.stack([u[:count] for u in draws])
+    return Chains(kept, np.array(evidence), sum(steps), sum(moves), float(np.mean(accepted)), max(remembered))
+
+
+def _run(density: Density, count: int, rng: np.random.Generator) -> tuple[np.ndarray, float, int, int, float, float]:
+    u = density.from_prior(rng, count)
+    now = _Particles(u, _finite(density.log_likelihood(u)), density.log_prior(u))
+    power, evidence, steps, moves = 0.0, 0.0, 0, 0
+    accepted = remembered = 0.0
+    while power < 1:
+        rise = _rise(now.likelihood, 1 - power)
+        log_weights = rise * now.likelihood
+        evidence += float(scipy.special.logsumexp(log_weights) - np.log(count))
+        now = now.at(rng.permutation(_resampled(log_weights, rng)))
+        power = 1.0 if rise >= 1 - power else power + rise
+        limit = FORGOTTEN_LAST if power == 1 else FORGOTTEN
+        now, own, accepted, remembered = _moved(density, now, power, limit, rng)
+        steps, moves = steps + 1, moves + own
+    return now.u[rng.permutation(count)], evidence, steps, moves, accepted, remembered
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(values), -np.inf, values)
+
+
+def _rise(likelihood: np.ndarray, left: float) -> float:
+    """How much the power may grow, by bisection on the effective number of particles."""
+
+    def effective(rise: float) -> float:
+        w = np.exp(rise * (likelihood - likelihood.max()))
+        return float(w.sum() ** 2 / np.sum(w * w) / len(w))
+
+    if effective(left) >= EFFECTIVE:
+        return left
+    low, high = 0.0, left
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if effective(middle) > EFFECTIVE else (low, middle)
+    return high
+
+
+def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Places of the particles that go on (systematic resampling)."""
+    w = np.cumsum(np.exp(log_weights - log_weights.max()))
+    ticks = (np.arange(len(w)) + rng.random()) / len(w) * w[-1]
+    return np.minimum(np.searchsorted(w, ticks), len(w) - 1)
+
+
+def _moved(
+    density: Density, start: _Particles, power: float, limit: float, rng: np.random.Generator
+) -> tuple[_Particles, int, float, float]:
+    """The particles after moves that leave the tempered density as it is; moves, acceptance, what is remembered."""
+    half = len(start.u) // 2
+    halves = slice(0, half), slice(half, 2 * half)
+    now = _Particles(*(field.copy() for field in start))
+    accepted, remembered, moves = 0.0, 1.0, 0
+    while moves < MOST and remembered >= limit:
+        parts = [_half_moved(density, now, power, pair, rng) for pair in (halves, halves[::-1])]
+        accepted, moves = float(np.mean(parts)), moves + 1
+        remembered = _correlation(start.u, now.u)
+    return now, moves, accepted, remembered
+
+
+def _half_moved(
+    density: Density, now: _Particles, power: float, halves: tuple[slice, slice], rng: np.random.Generator
+) -> float:
+    """Move the first half in place by differences of the second; the part that was accepted.
+
+    These differences do not depend on the particles that they move, so the density stays as it is.
+    """
+    own, other = now.u[halves[0]], now.u[halves[1]]
+    half, size = own.shape
+    first = rng.integers(half, size=half)
+    second = (first + rng.integers(1, half, size=half)) % half
+    usual = 2.38 / np.sqrt(2 * size) * np.exp(rng.uniform(-1.5, 0.3, half))
+    reach = np.where(rng.random(half) < LONG, 1.0, usual)[:, None]
+    trial = own + reach * (other[first] - other[second]) + 1e-6 * rng.standard_normal(own.shape)
+    prior, likelihood = density.log_prior(trial), _finite(density.log_likelihood(trial))
+    with np.errstate(invalid="ignore"):  # a place without likelihood is not gone to
+        gain = power * (likelihood - now.likelihood[halves[0]]) + prior - now.prior[halves[0]]
+    take = np.log(rng.random(half)) < np.where(np.isnan(gain), -np.inf, gain)
+    for field, value in zip(now, (trial, likelihood, prior), strict=True):
+        field[halves[0]][take] = value[take]
+    return float(take.mean())
+
+
+def _correlation(before: np.ndarray, after: np.ndarray) -> float:
+    """Largest correlation of a coordinate with what it was."""
+    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
+    size = np.sqrt(np.sum(a * a, axis=0) * np.sum(b * b, axis=0))
+    return float(np.max(np.sum(a * b, axis=0) / np.maximum(size, 1e-300)))

@@ -1,0 +1,235 @@
+"""Samples of the posterior: of densities that are known, of a fit against quadrature, and calibrated by simulation."""
+
+import json
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+import scipy.stats
+from conftest import ROOT
+
+from fitting.__main__ import main
+from fitting.fits import posterior, viscoelastic
+from fitting.methods import generalised_maxwell, springpots, uncertainty
+from fitting.methods.least_squares import levenberg_marquardt
+from fitting.methods.sampling import tempering
+from fitting.methods.sampling.diagnostics import r_hat
+from fitting.methods.sampling.tempering import Density
+from fitting.readers.rheometer import Sweep
+
+pytestmark = pytest.mark.quick_to_compile
+
+LION = ROOT / "data" / "lions_mane_frequency_sweep.csv"
+PORCINE = ROOT / "data" / "porcine_liver_frequency_sweep.csv"
+OMEGA = np.geomspace(0.1, 100, 11)
+
+
+def two_peaks(u: np.ndarray) -> np.ndarray:
+    """Three tenths of the mass around (-4, …), seven tenths around (4, …), a hundred times narrower than the prior."""
+    narrow = [-0.5 * np.sum((u - c) ** 2, axis=-1) / 0.1**2 - 2 * np.log(0.1 * np.sqrt(2 * np.pi)) for c in (-4, 4)]
+    return np.logaddexp(np.log(0.3) + narrow[0], np.log(0.7) + narrow[1])
+
+
+def test_two_far_peaks_keep_their_masses_and_the_evidence_is_known():
+    flat = Density(
+        two_peaks,
+        lambda u: np.where(np.all(np.abs(u) < 10, axis=-1), 0.0, -np.inf),
+        lambda rng, n: rng.uniform(-10, 10, (n, 2)),
+    )
+    found = tempering.run(flat, 1000)
+    right = found.draws[..., 0] > 0
+    # 4000 draws of 0.7, resampled some five times: 0.02 is what the mass may be off by.
+    assert right.mean() == pytest.approx(0.7, abs=0.06)
+    assert found.log_evidence.mean() == pytest.approx(-2 * np.log(20), abs=0.15)
+    assert found.draws[right].mean() == pytest.approx(4, abs=0.01)
+    assert found.draws[right].std() == pytest.approx(0.1, rel=0.05)
+
+
+#: arviz_stats 0.8.0, rhat(method="rank"), of the draws below.
+ARVIZ = (1.04440297, 1.03997086)
+
+
+def test_r_hat_is_that_of_arviz():
+    rng = np.random.default_rng(3)
+    draws = rng.standard_normal((4, 400)).cumsum(axis=1) / 30 + rng.standard_normal((4, 400))
+    assert r_hat(draws) == pytest.approx(ARVIZ[0], rel=1e-8)
+    assert r_hat(rng.standard_cauchy((4, 401)) * np.array([1, 1, 1, 3])[:, None]) == pytest.approx(ARVIZ[1], rel=1e-8)
+
+
+def test_a_given_size_of_errors_is_only_ever_enlarged():
+    """The closed form of the integral over the size of the errors against quadrature."""
+    for m, square in ((20, 3.0), (20, 25.0), (62, 300.0)):
+        grids = [np.linspace(low, 6, 400001) for low in (-3, 0)]
+        free, above = (np.trapezoid(np.exp(-m * t - 0.5 * square * np.exp(-2 * t)), t) for t in grids)
+        ours = [posterior.log_likelihood(np.array(square), m, given) for given in (False, True)]
+        constant = scipy.special.gammaln(0.5 * m) - np.log(2)
+        assert ours[0] + constant == pytest.approx(np.log(free), rel=1e-6)
+        assert ours[1] + constant == pytest.approx(np.log(above), rel=1e-5)
+
+
+def one_mode(noise: float, seed: int) -> Sweep:
+    rng = np.random.default_rng(seed)
+    model = generalised_maxwell.Maxwell(np.float64(700.0), np.array([0.4]), np.array([0.3]))
+    storage, loss = generalised_maxwell.moduli(model, OMEGA)
+    factor = 1 + noise * rng.standard_normal((2, len(OMEGA)))
+    return Sweep(OMEGA, storage * factor[0], loss * factor[1])
+
+
+def test_the_draws_of_one_mode_have_the_moments_of_quadrature():
+    sweep = one_mode(0.2, 1)
+    fit = viscoelastic.closed_form(sweep, 1)
+    found = posterior.of_sweep(fit, sweep, 1000)
+    data = (OMEGA, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
+    at = posterior._sweep_target(fit.kind, sweep, lambda u: generalised_maxwell.residuals(u, *data))
+    centre = np.asarray(fit.solution.u)
+    axes = [c + np.linspace(-w, w, n) for c, w, n in zip(centre, (0.2, 0.5, 0.3), (41, 41, 41), strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    log_density = np.concatenate([at.log_likelihood(u) + at.prior.log_prior(u) for u in np.array_split(grid, 50)])
+    weight = np.exp(log_density - log_density.max())
+    weight /= weight.sum()
+    numbers = at.prior.numbers(grid)
+    mean = weight @ numbers
+    sd = np.sqrt(weight @ (numbers - mean) ** 2)
+    flat = found.draws.reshape(-1, 4)
+    assert found.names == ("shear_modulus", "equilibrium_modulus", "ratios[0]", "relaxation_times[0]")
+    assert np.all(np.abs(flat.mean(axis=0) - mean) < 0.08 * sd)  # 4000 draws: 0.016, and five resamplings
+    assert np.allclose(flat.std(axis=0), sd, rtol=0.1)
+    assert found.r_hat.max() < 1.01
+
+
+def calibration(modes: int, count: int, noise: float, monkeypatch) -> np.ndarray:
+    """Chances of ranks of the truth among its draws (K,), were they uniform; truths are drawn from the prior."""
+    monkeypatch.setattr(tempering, "CHAINS", 1)
+    monkeypatch.setattr(tempering, "FEWEST", 100)
+    prior = posterior.Modes(False, (np.log(100.0), np.log(10000.0)), (np.log(0.003), np.log(30.0)))
+    rng = np.random.default_rng(0)
+    ranks = []
+    for k in range(count):
+        truth = prior.from_prior(rng, 1, 2 * modes + 1)
+        moduli = np.concatenate(generalised_maxwell.moduli(generalised_maxwell.natural(truth[0]), OMEGA))
+        scales = noise * np.abs(moduli[: len(OMEGA)].mean()) * np.ones(2 * len(OMEGA))
+        measured = moduli + scales * rng.standard_normal(len(moduli))
+        data = (OMEGA, *np.split(measured, 2), scales)
+        at = posterior.Target(lambda u, data=data: generalised_maxwell.residuals(u, *data), prior, False)
+        draws = posterior.sample(at, 2 * modes + 1, 99, seed=k).draws[0]
+        ranks.append((draws < prior.numbers(truth)).sum(axis=0))
+    bins = np.stack([np.bincount(row * 10 // 100, minlength=10) for row in np.array(ranks).T])
+    return scipy.stats.chisquare(bins, axis=1).pvalue
+
+
+def test_ranks_of_the_truth_are_uniform(monkeypatch):
+    assert calibration(1, 40, 0.1, monkeypatch).min() > 1e-3
+
+
+@pytest.mark.slow
+def test_ranks_of_the_truth_are_uniform_of_two_modes(monkeypatch):
+    assert calibration(2, 400, 0.05, monkeypatch).min() > 1e-3
+
+
+def test_a_prior_without_its_slopes_is_found_out(monkeypatch):
+    """The mistake that the calibration is there to see: a flat density of logits and gaps."""
+    right = posterior.Modes.log_prior
+    flat = lambda self, u: np.where(np.isfinite(right(self, u)), 0.0, -np.inf)  # noqa: E731
+    monkeypatch.setattr(posterior.Modes, "log_prior", flat)
+    assert calibration(1, 40, 0.1, monkeypatch).min() < 1e-3
+
+
+def test_the_command_writes_draws_and_their_summary(tmp_path, capsys):
+    assert main([str(LION), "--method", "closed-form", "--modes", "1", "--samples", "200", "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())["posterior"]
+    assert content["chains"] == 4 and content["draws_per_chain"] == 200 and "ratios uniform" in content["prior"]
+    rows = np.genfromtxt(tmp_path / "posterior.csv", delimiter=",", names=True, deletechars="")
+    assert rows.shape == (800,) and rows.dtype.names == ("chain", *content["numbers"])
+    fit = json.loads((tmp_path / "fit.json").read_text())
+    for name, row in content["numbers"].items():
+        value = fit[name] if name in fit else fit[name.split("[")[0]][0]
+        assert row["interval_95"][0] < value < row["interval_95"][1]
+        assert np.isclose(np.median(rows[name]), row["median"], rtol=1e-6)
+    assert "posterior: 4 chains of 200" in capsys.readouterr().out
+
+
+def test_a_springpot_has_the_errors_of_its_curvature():
+    """Two numbers with little noise: the posterior is normal, and its spread that of the linearised fit."""
+    rng = np.random.default_rng(5)
+    G = 700 * (1j * OMEGA) ** 0.3 * np.exp(0.01 * (rng.standard_normal(11) + 1j * rng.standard_normal(11)))
+    sweep = Sweep(OMEGA, G.real, G.imag)
+    reference, model = springpots.reference_frequency(sweep), springpots.FRACTIONAL[0]
+    scaled = (OMEGA / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
+    start = jnp.log(jnp.array([700.0, 0.4]))
+
+    def residuals(u):
+        return springpots.residuals(springpots.full(model, u), model.switches, *scaled)
+
+    def values(u):
+        return model.values(springpots.full(model, u), reference)
+
+    found = levenberg_marquardt(residuals, start)
+    p = uncertainty.estimated(model.names, values, found, 22, False)
+    fit = types.SimpleNamespace(kind=viscoelastic.Kind(model.name, values=values), solution=found)
+    draws = posterior.of_sweep(fit, sweep, 500)
+    flat = draws.draws.reshape(-1, 2)
+    assert draws.names == p.names and "exponents uniform" in draws.prior
+    assert np.all(np.abs(flat.mean(axis=0) - p.values) < 0.1 * p.standard_errors)
+    # The size of 22 errors is not known: Student's t of 20 degrees of freedom is wider by 5 %.
+    assert np.allclose(flat.std(axis=0), p.standard_errors * np.sqrt(20 / 18), rtol=0.1)
+
+
+def test_relaxation_is_sampled_too(tmp_path):
+    time = np.geomspace(0.01, 100, 60)
+    noise = 1 + 0.01 * np.random.default_rng(0).standard_normal(60)
+    modulus = (300 + 400 * np.exp(-time / 2.0)) * noise
+    np.savetxt(
+        tmp_path / "r.csv",
+        np.column_stack([time, modulus]),
+        delimiter=",",
+        header="time_s,relaxation_modulus_Pa",
+        comments="",
+    )
+    arguments = ["relaxation", str(tmp_path / "r.csv"), "--modes", "1", "--samples", "200", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    rows, errors = content["posterior"]["numbers"], content["standard_errors"]
+    for name, truth, error in (
+        ("shear_modulus", content["shear_modulus"], errors["shear_modulus"]),
+        ("relaxation_times[0]", content["relaxation_times"][0], errors["relaxation_times"][0]),
+    ):
+        assert abs(rows[name]["mean"] - truth) < 0.3 * error and np.isclose(
+            rows[name]["standard_deviation"], error, rtol=0.2
+        )
+
+
+@pytest.mark.slow
+def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path):
+    sweep = one_mode(0.02, 2)
+    closed = viscoelastic.closed_form(sweep, 1)
+    simulation = viscoelastic.Simulation(steps=20)
+    fit = viscoelastic.through_torsion(sweep, closed, simulation)
+    found = posterior.of_simulation(fit, sweep, simulation, 500)
+    assert found.simulated["largest_difference"] < 1e-2 and found.r_hat.max() < 1.02
+    assert np.all(
+        np.abs(np.median(found.draws, axis=(0, 1))[[0, 2, 3]] - fit.uncertainty.values)
+        < fit.uncertainty.standard_errors
+    )
+    lost = found._replace(simulated={"draws": 12.0, "largest_difference": 2.0})
+    assert "log density is off by up to 2" in lost.warnings()[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--samples", "5"], "--samples 5 is out of range: give 100 to 100000"),
+        (["--samples", "1000", "--model", "spectrum"], "leave it out for --model spectrum"),
+        ([str(PORCINE), "--samples", "1000"], "is of one sample, 2 files are given"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(arguments, sentence, tmp_path, capsys):
+    assert main([str(LION), *arguments, "--out", str(tmp_path)]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_chains_that_do_not_agree_are_named():
+    found = posterior.of_sweep(viscoelastic.closed_form(one_mode(0.02, 1), 1), one_mode(0.02, 1), 200)
+    assert not found.warnings()
+    assert "R-hat 1.3" in found._replace(r_hat=np.array([1.0, 1.3, 1.0, 1.0])).warnings()[0]
