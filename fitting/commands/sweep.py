@@ -34,6 +34,15 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="SWEEP.csv",
         help="frequency sweep: CSV, TRIOS or RheoCompass text; several files are samples of one material",
     )
+    command.add_argument(
+        "--with",
+        type=Path,
+        nargs="+",
+        dest="others",
+        default=[],
+        metavar="TEST",
+        help="further tests of the same material (relaxation, creep, sweep): one Prony series for all",
+    )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
@@ -89,6 +98,10 @@ def run(options: argparse.Namespace) -> int:
         from fitting.commands import samples
 
         return samples.run(options)
+    if options.others:
+        from fitting.commands import together
+
+        return together.run(options)
     options.sweep, options.method = options.sweep[0], options.method or "torsion"
     sweep = rheometer.read_sweep(options.sweep, options.table)
     sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
@@ -139,6 +152,8 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
     if len(options.sweep) > 1:
         _check_samples(options)
+    if options.others:
+        _check_together(options)
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
     if options.model in ("fractional", "spectrum") and options.modes != "auto":
@@ -161,6 +176,19 @@ def _check_samples(options: argparse.Namespace) -> None:
     ):
         if asked:
             raise InputError(f"{name} is of one sample, {len(options.sweep)} files are given: {instead}")
+
+
+def _check_together(options: argparse.Namespace) -> None:
+    """Refuse what a fit of several tests does not have."""
+    for name, asked in (
+        ("--method torsion", options.method == "torsion"),
+        ("--profile", options.profile),
+        ("--samples", options.samples is not None),
+        (f"--model {options.model}", options.model != "prony"),
+        (f"{len(options.sweep)} samples", len(options.sweep) > 1),
+    ):
+        if asked:
+            raise InputError(f"--with fits Prony modes to one sample in closed form: leave out {name}")
 
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":

@@ -51,11 +51,10 @@ class TimeFit(NamedTuple):
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
     """(u, time, driven, rows, answer, scales) -> (m,), of relaxation or creep, of a solid or a fluid."""
-    respond = time_response.stress if kind == "relaxation" else time_response.strain
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
-        return (respond(natural(u), time, driven)[rows] - answer) / scales
+        return (response(kind, natural(u), time, driven, rows) - answer) / scales
 
     return residuals
 
@@ -137,8 +136,19 @@ def _one(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
 def residuals_of(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
     """Residuals (m,) of u and of the data that come second, for Prony modes of a solid or a fluid."""
     rows = thinned(test)
-    data = (test.time, test.driven, rows, test.answer[rows], _scales(test, rows))
+    kept = _corners(test.time, test.driven)
+    kept[rows] = True
+    places = np.cumsum(kept)[rows] - 1
+    data = (test.time[kept], test.driven[kept], places, test.answer[rows], _scales(test, rows))
     return _residuals(test.kind, kind.name), data
+
+
+def _corners(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
+    """Points (n,) that the drive needs: where it is straight on both sides, the point between says nothing."""
+    kept = np.ones(len(time), bool)
+    middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))
+    return kept
 
 
 def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
@@ -147,11 +157,32 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
     return every[rows]
 
 
+def response(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax.Array:
+    """What a test measures: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
+
+    Args:
+        kind: "sweep", "relaxation" or "creep".
+        model: Prony modes.
+        at: angular frequencies (n,) [rad/s], or times (n,) [s].
+        drive: of a test in time: what is driven (n,), and the rows (m,) that are answered.
+    """
+    if kind == "sweep":
+        return jax.numpy.concatenate(generalised_maxwell.moduli(model, at))
+    driven, rows = drive
+    return (time_response.stress if kind == "relaxation" else time_response.strain)(model, at, driven)[rows]
+
+
+def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
+    """Stress over strain (m,) [Pa] of the answers that are fitted, and their times: G(t) roughly."""
+    rows = thinned(test)
+    driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
+    ratio = answer / np.maximum(driven, 1e-6 * driven.max())
+    return ratio if test.kind == "relaxation" else 1 / ratio, test.time[rows]
+
+
 def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int = 12) -> np.ndarray:
     """Times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
-    driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
-    apparent = answer / np.maximum(driven, 1e-6 * driven.max())
-    apparent = apparent if test.kind == "relaxation" else 1 / apparent
+    modulus, at = apparent(test)
     low, high = np.log(test.resolved)
     rng = np.random.default_rng(0)
     grids = [np.linspace(low, high, modes + 2)[1:-1]]
@@ -161,8 +192,8 @@ def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int
         times = np.exp(np.sort(grid)[::-1])
         for k in range(1, modes):
             times[k] = min(times[k], 0.9 * times[k - 1])
-        A = np.column_stack([np.ones(len(rows)), np.exp(-test.time[rows][:, None] / times)])
-        strengths, _ = generalised_maxwell.non_negative(A / apparent[:, None], np.ones(len(rows)))
+        A = np.column_stack([np.ones(len(rows)), np.exp(-at[:, None] / times)])
+        strengths, _ = generalised_maxwell.non_negative(A / modulus[:, None], np.ones(len(rows)))
         share = np.maximum(strengths / strengths.sum(), 0.01)
         u = generalised_maxwell.unconstrained(Maxwell(strengths.sum(), share[1:] / share.sum(), times))
         out.append(generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u)

@@ -135,6 +135,17 @@ def read(
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
 
 
+def kind_of(path: str | os.PathLike) -> str:
+    """ "relaxation" or "creep": by the modulus or compliance, or by which of two columns is held, the other moving."""
+    columns, _ = _columns(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
+    if len(form) == 1:
+        return "relaxation" if form == ("modulus",) else "creep"
+    late = len(columns["time"]) // 2
+    moves = [np.ptp(columns[q][late:]) / max(float(np.max(np.abs(columns[q]))), 1e-300) for q in form]
+    return "relaxation" if moves[0] <= moves[1] else "creep"
+
+
 def _own(kind: str) -> str:
     return "modulus" if kind == "relaxation" else "compliance"
 

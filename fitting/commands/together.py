@@ -1,0 +1,63 @@
+"""``python -m fitting SWEEP.csv --with RELAXATION.csv CREEP.csv …``: one Prony series for several tests."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from liverjax.core.errors import InputError
+
+if TYPE_CHECKING:
+    from fitting.fits.together import Measured
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit all tests in closed form; 1 if the fit did not converge."""
+    from tqdm import tqdm
+
+    from fitting.commands.sweep import write_cards
+    from fitting.fits import together
+    from fitting.reports import together_report
+    from liverjax.core.files import writable
+
+    tests = [_sweep(options, options.sweep[0]), *(_any(options, path) for path in options.others)]
+    for test in tests:
+        for note in test.notes:
+            print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
+    writable(options.out, ("fit.json", "fit.png"))
+    with tqdm(desc=f"{len(tests)} tests", disable=None, leave=False) as bar:
+
+        def told(text: str) -> None:
+            bar.set_postfix_str(text)
+            bar.update()
+
+        found = together.fit(tests, options.modes, told)
+    together_report.write(options.out, found)
+    print(together_report.table(found))
+    if options.cards:
+        write_cards(options.out, found.model)
+    for sentence in found.warnings:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/fit.json, fit.png")
+    return 0 if found.converged else 1
+
+
+def _sweep(options: argparse.Namespace, path: Path) -> "Measured":
+    from fitting.readers import rheometer
+
+    sweep = rheometer.within(rheometer.read_sweep(path, options.table), options.min_frequency, options.max_frequency)
+    return rheometer.without_inertia(sweep, options.radius, options.height)
+
+
+def _any(options: argparse.Namespace, path: Path) -> "Measured":
+    """A test in time, or another sweep."""
+    from fitting.readers import rheometer, time_tests
+
+    try:
+        sweep = rheometer.read_sweep(path)
+    except InputError as no_sweep:
+        if "no header names" not in str(no_sweep) and "no column for" not in str(no_sweep):
+            raise
+    else:
+        return sweep
+    return time_tests.read(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))

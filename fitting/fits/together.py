@@ -1,0 +1,287 @@
+"""One Prony series for several tests of one material in closed form: sweeps, relaxation, creep; and what each adds.
+
+Every test has noise of its own, whose size is found with the fit: the weights of a test are what it leaves over.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits import time_tests, viscoelastic
+from fitting.fits.viscoelastic import FLUID, Kind
+from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods.estimate import Estimate, errors_and_correlation, spread
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.time_tests import TimeTest
+from liverjax.core.errors import InputError
+
+#: Rounds of fit and weights, smallest relative noise that a test is given, and starts.
+ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
+#: The misfit of a test in the common fit over that by itself, above which the tests do not agree.
+APART = 1.5
+
+Measured = Sweep | TimeTest
+
+
+class Band(NamedTuple):
+    """The relaxation times that one of the tests resolves."""
+
+    resolved: tuple[float, float]
+
+
+class Share(NamedTuple):
+    """What one test says of the common parameters."""
+
+    name: str  # sweep, relaxation or creep
+    source: str
+    points: int  # measured numbers
+    noise: float  # relative size of what the common fit leaves
+    alone: float  # the same of a fit of as many modes to this test by itself
+    mean_relative_error: float
+    errors_without: np.ndarray  # (P,) standard errors of the others alone, at the common fit
+
+
+class Together(NamedTuple):
+    """The common fit."""
+
+    tests: list[Measured]
+    kind: Kind
+    model: Maxwell
+    solution: Solution
+    uncertainty: Estimate
+    converged: bool
+    shares: list[Share]
+    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], or the answers
+    tried: list[dict[str, Any]]
+    warnings: tuple[str, ...]
+    run_time: float
+    compile_time: float
+
+    @property
+    def modes(self) -> int:
+        """N."""
+        return len(self.model.ratios)
+
+
+def _numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
+    """Arrays that predict a test, its measured numbers and their scales."""
+    if isinstance(test, Sweep):
+        return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
+    _, (at, driven, rows, answer, scales) = time_tests.residuals_of(test, Kind())
+    return (at, driven, rows), answer, scales
+
+
+@lru_cache(maxsize=32)
+def _residuals(kinds: tuple[str, ...], fluid: bool) -> Callable[..., jax.Array]:
+    """(u, data of every test) -> residuals of all tests, one below the other."""
+    natural = generalised_maxwell.natural_fluid if fluid else generalised_maxwell.natural
+
+    def residuals(u, data):
+        model, rows = natural(u), []
+        for kind, (at, measured, scales) in zip(kinds, data, strict=True):
+            rows.append((time_tests.response(kind, model, *at) - measured) / scales)
+        return jnp.concatenate(rows)
+
+    return residuals
+
+
+def name_of(test: Measured) -> str:
+    """sweep, relaxation or creep."""
+    return "sweep" if isinstance(test, Sweep) else test.kind
+
+
+def fit(
+    tests: Sequence[Measured], modes: int | str = "auto", progress: Callable[[str], None] = lambda text: None
+) -> Together:
+    """The number of modes of the lowest criterion among those that the tests determine together.
+
+    Args:
+        tests: two or more.
+        modes: N, or "auto".
+        progress: told what is fitted.
+    """
+    tests = list(tests)
+    band = Band(_resolved(tests))
+    largest = (sum(len(_numbers(t)[1]) for t in tests) - 2) // 2
+    if modes != "auto" and not 1 <= int(modes) <= largest:
+        raise InputError(f"--modes {modes} is out of range: give 1 to {largest} for these files, or auto")
+    top = min(uncertainty.supported_modes(band), largest)
+    numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
+    tried = _raised(tests, band, numbers, Kind(), progress)
+    solid = min(tried, key=_criterion)
+    stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
+    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the tests may be of a fluid
+        tried += _raised(tests, band, range(max(numbers.start, solid.modes - 1), numbers.stop), FLUID, progress)
+    able = [f for f in tried if _able(f, band)] or tried
+    chosen = min(able, key=_criterion)
+    progress("what each test adds")
+    return _told(chosen, tried, band)
+
+
+def _resolved(tests: list[Measured]) -> tuple[float, float]:
+    ends = np.array([t.resolved for t in tests])
+    return float(ends[:, 0].min()), float(ends[:, 1].max())
+
+
+def _raised(tests: list[Measured], band: Band, numbers: range, kind: Kind, progress: Callable) -> list[Together]:
+    """Fits of rising number of modes until the criterion twice fails to fall."""
+    tried: list[Together] = []
+    best, failures = np.inf, 0
+    for n in numbers:
+        progress(f"{n} modes")
+        tried.append(_one(tests, band, n, kind))
+        lower = _criterion(tried[-1]) < best and (len(tried) == 1 or _able(tried[-1], band))
+        best, failures = (_criterion(tried[-1]), 0) if lower else (best, failures + 1)
+        if failures == 2:
+            break
+    return tried
+
+
+def _able(fit: Together, band: Band) -> bool:
+    return fit.converged and not uncertainty.superfluous(band, fit.uncertainty)
+
+
+def _criterion(fit: Together) -> float:
+    """Bayesian information criterion with the noise of each test estimated."""
+    total = sum(s.points for s in fit.shares)
+    return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + len(fit.solution.u) * np.log(total))
+
+
+def _one(tests: list[Measured], band: Band, modes: int, kind: Kind) -> Together:
+    """Fit and weights in turn, for one number of modes."""
+    parts = [_numbers(t) for t in tests]
+    function = _residuals(tuple(map(name_of, tests)), kind.name == FLUID.name)
+    best = viscoelastic.best_of(levenberg_marquardt, function)
+    starts = _starts(tests, band, modes, kind)
+    noise, compiling, running = np.full(len(tests), 0.03), 0.0, 0.0
+    for _ in range(ROUNDS):
+        data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
+        found, compiled, ran = viscoelastic.timed(best, starts, data)
+        compiling, running = compiling + compiled, running + ran
+        noise = _noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
+        starts = np.tile(np.asarray(found.u), (STARTS, 1))  # near already; the program is that of all starts
+    modes_found = kind.maxwell(found.u)
+    spreads = uncertainty.estimate(found, False, kind.maxwell)
+    left = np.split(np.asarray(found.residuals), np.cumsum([len(y) for _, y, _ in parts])[:-1])
+    fitted = [r * scales + y for r, (_, y, scales) in zip(left, data, strict=True)]
+    shares = [
+        Share(name_of(t), t.source, len(y), float(s), np.nan, float(np.mean(np.abs(f - y) / scales)), np.array([]))
+        for t, (_, y, scales), s, f in zip(tests, parts, noise, fitted, strict=True)
+    ]
+    model = Maxwell(*(np.asarray(v) for v in modes_found))
+    converged = bool(found.converged)
+    return Together(tests, kind, model, found, spreads, converged, shares, fitted, [], (), running, compiling)
+
+
+def _noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: int) -> np.ndarray:
+    """Relative noise of each test: root mean square of what is left, each test paying its part of the parameters."""
+    counts = np.array([len(y) for _, y, _ in parts])
+    left = np.split(residuals, np.cumsum(counts)[:-1])
+    out = []
+    for test, r, s, count in zip(tests, left, used, counts, strict=True):
+        found = s * float(np.sqrt(np.sum(r**2) / max(1.0, count * (1 - free / counts.sum()))))
+        given = isinstance(test, Sweep) and test.storage_sd is not None
+        out.append(max(1.0 if given else QUIETEST, found))
+    return np.array(out)
+
+
+def _starts(tests: list[Measured], band: Band, modes: int, kind: Kind) -> np.ndarray:
+    """Times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
+    low, high = np.log(band.resolved)
+    rng = np.random.default_rng(0)
+    grids = [np.linspace(low, high, modes + 2)[1:-1]]
+    grids += [np.sort(rng.uniform(low - 1, high + 1, modes)) for _ in range(STARTS - 1)]
+    out = []
+    for grid in grids:
+        times = np.exp(np.sort(grid)[::-1])
+        for k in range(1, modes):
+            times[k] = min(times[k], 0.9 * times[k - 1])
+        rows = [_apparent(t, times) for t in tests]
+        A, b = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+        strengths, _ = generalised_maxwell.non_negative(A, b)
+        share = np.maximum(strengths / strengths.sum(), 0.01)
+        u = generalised_maxwell.unconstrained(Maxwell(strengths.sum(), share[1:] / share.sum(), times))
+        out.append(generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u)
+    return np.stack(out)
+
+
+def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (relative) of the strengths of an equilibrium modulus and of modes, and their right-hand side."""
+    if isinstance(test, TimeTest):
+        modulus, at = time_tests.apparent(test)
+        A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
+        return A / modulus[:, None], np.ones(len(at))
+    x = test.angular_frequency[:, None] * times
+    one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
+    A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])])
+    b = np.concatenate([test.storage, test.loss])
+    return A / b[:, None], np.ones(len(b))
+
+
+def _told(chosen: Together, tried: list[Together], band: Band) -> Together:
+    """With the shares of the tests, the table of what was tried, and the sentences that a user should read."""
+    begin = time.perf_counter()
+    chosen = chosen._replace(shares=_shares(chosen))
+    lowest = min(map(_criterion, tried))
+    table = [
+        {
+            "model": f.kind.name,
+            "modes": f.modes,
+            "above_the_lowest": _criterion(f) - lowest,
+            "identifiable": _able(f, band),
+        }
+        for f in tried
+    ]
+    out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
+    out += [_apart(s) for s in chosen.shares if s.noise > APART * s.alone and s.noise > 0.01]
+    out += uncertainty.superfluous(band, chosen.uncertainty)
+    low, high = band.resolved
+    for k, tau in enumerate(chosen.model.relaxation_times):
+        if not low <= tau <= high:
+            out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of all tests")
+    return chosen._replace(
+        tried=sorted(table, key=lambda row: row["above_the_lowest"]),
+        warnings=tuple(out),
+        run_time=sum(f.run_time for f in tried) + time.perf_counter() - begin,
+        compile_time=sum(f.compile_time for f in tried),
+    )
+
+
+def _apart(share: Share) -> str:
+    return (
+        f"the tests do not agree: {share.source or share.name} is missed by {100 * share.noise:.2g} % in the common "
+        f"fit and by {100 * share.alone:.2g} % by itself; look for another temperature, strain or sample"
+    )
+
+
+def _shares(fit: Together) -> list[Share]:
+    """What each test adds: errors without it, and what it leaves by itself with as many modes.
+
+    Tests without weight are taken out by infinite deviations: the program is there already.
+    """
+    parts = [_numbers(t) for t in fit.tests]
+    counts = [len(y) for _, y, _ in parts]
+    place = np.repeat(np.arange(len(parts)), counts)
+    function = _residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
+    best = viscoelastic.best_of(levenberg_marquardt, function)
+    u = np.asarray(fit.solution.u)
+    starts = np.concatenate([u[None], _starts(fit.tests, Band(_resolved(fit.tests)), fit.modes, fit.kind)[1:]])
+    vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
+    jacobian = np.asarray(fit.solution.jacobian)
+    out = []
+    for k, share in enumerate(fit.shares):
+        root, _ = spread(jacobian[place != k], 1.0, vector)
+        without = errors_and_correlation(root)[0]
+        data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
+        alone = viscoelastic.timed(best, starts, data)[0]
+        square = 2 * float(alone.cost) / max(1.0, counts[k] - min(len(u), counts[k] / 2))
+        unknown = ~(without < 1e3 * np.abs(fit.uncertainty.values))
+        out.append(share._replace(alone=float(np.sqrt(square)), errors_without=np.where(unknown, np.inf, without)))
+    return out

@@ -1,0 +1,140 @@
+"""What a fit of several tests leaves behind: fit.json, fit.png, and a table on the terminal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.fits.time_tests import thinned
+from fitting.fits.together import Share, Together
+from fitting.methods.uncertainty import equilibrium_error
+from fitting.readers.frequency_sweep import Sweep
+from fitting.reports.sweep_report import numbers
+from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
+from liverjax.core.versions import versions
+
+
+def write(out: Path, found: Together) -> dict[str, Any]:
+    """Write both files; returns the JSON, whose names are those of a sweep's, with `tests` beside them."""
+    out.mkdir(parents=True, exist_ok=True)
+    u, n = found.uncertainty, found.modes
+    errors = np.array([s.mean_relative_error for s in found.shares])
+    points = np.array([s.points for s in found.shares])
+    content = numbers(
+        {
+            "method": "closed-form",
+            "model": found.kind.name,
+            "converged": found.converged,
+            "modes": n,
+            "shear_modulus": float(found.model.shear_modulus),
+            "equilibrium_modulus": _equilibrium(found),
+            "ratios": found.model.ratios.tolist(),
+            "relaxation_times": found.model.relaxation_times.tolist(),
+            "standard_errors": _by_name(u.standard_errors, n) | {"equilibrium_modulus": equilibrium_error(u)},
+            "interval_quantile_95": u.quantile,
+            "correlation": u.correlation.tolist(),
+            "correlation_names": list(u.names),
+            "mean_relative_error": float(errors @ points / points.sum()),
+            "max_relative_error": max(_largest(found)),
+            "tests": [_share(s, n) for s in found.shares],
+            "warnings": list(found.warnings),
+            "run_time_s": found.run_time,
+            "compile_time_s": found.compile_time,
+            "details": {"tried": found.tried},
+            "versions": versions(),
+        }
+    )
+    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    save(figure(found), out / "fit.png")
+    return content
+
+
+def _equilibrium(found: Together) -> float:
+    return max(0.0, float(found.model.shear_modulus * (1 - found.model.ratios.sum())))
+
+
+def _by_name(values: np.ndarray, n: int) -> dict[str, Any]:
+    return {
+        "shear_modulus": float(values[0]),
+        "ratios": values[1 : n + 1].tolist(),
+        "relaxation_times": values[n + 1 :].tolist(),
+    }
+
+
+def _share(share: Share, n: int) -> dict[str, Any]:
+    return {
+        "test": share.name,
+        "data": share.source,
+        "measured_numbers": share.points,
+        "mean_relative_error": share.mean_relative_error,
+        "misfit": share.noise,
+        "misfit_by_itself": share.alone,
+        "standard_errors_without_it": _by_name(share.errors_without, n),
+    }
+
+
+def _measured(found: Together, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Abscissae [Hz or s] and measured numbers of test k, as `Together.fitted`."""
+    test = found.tests[k]
+    if isinstance(test, Sweep):
+        return test.angular_frequency / (2 * np.pi), np.concatenate([test.storage, test.loss])
+    rows = thinned(test)
+    return test.time[rows], test.answer[rows]
+
+
+def _largest(found: Together) -> list[float]:
+    pairs = ((_measured(found, k)[1], fitted) for k, fitted in enumerate(found.fitted))
+    return [float(np.max(np.abs(f - y) / np.maximum(np.abs(y), 1e-3 * np.abs(y).max()))) for y, f in pairs]
+
+
+def table(found: Together) -> str:
+    """Parameters ± standard error, and beside them the errors that would be left without each of the tests."""
+    u, n = found.uncertainty, found.modes
+    heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
+    rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
+    rows.append(f"{'':32s}" + "".join(f"{h:>12s}" for h in heads))
+    units = ["Pa", *[""] * n, *["s"] * n]
+    labels = ["G0", *(f"g{k + 1}" for k in range(n)), *(f"tau{k + 1}" for k in range(n))]
+    for j, (label, unit) in enumerate(zip(labels, units, strict=True)):
+        without = "".join(f"{_error(s.errors_without[j]):>12s}" for s in found.shares)
+        own = f"{u.values[j]:11.5g} ± {_error(u.standard_errors[j]):8s} {unit}"
+        rows.append(f"{label:6s}{own:26s}{without}".rstrip())
+    if found.kind.name == "prony":
+        rows.append(f"G_inf {_equilibrium(found):11.5g} ± {_error(equilibrium_error(u))} Pa")
+    for k, s in enumerate(found.shares, 1):
+        rows.append(f"{k}: misfit {100 * s.noise:.2g} %, by itself {100 * s.alone:.2g} %")
+    for row in found.tried if len(found.tried) > 1 else []:
+        free = "" if row["identifiable"] else "   numbers left free"
+        rows.append(f"{row['model']:12s} {row['modes']:2d} modes, criterion +{row['above_the_lowest']:.1f}{free}")
+    return "\n".join(rows)
+
+
+def _error(value: float) -> str:
+    return f"{value:.2g}" if np.isfinite(value) else "free"
+
+
+def figure(found: Together) -> Any:
+    """One panel a test, measured and fitted."""
+    count = len(found.tests)
+    fig = pyplot().figure(figsize=(max(6.0, 3.6 * count), 4.4), layout="constrained")
+    axes = np.atleast_1d(fig.subplots(1, count))
+    for k, (test, panel) in enumerate(zip(found.tests, axes, strict=True)):
+        x, y = _measured(found, k)
+        sweep = isinstance(test, Sweep)
+        pairs = [("G'", 0, BLUE), ("G''", 1, ORANGE)] if sweep else [("measured", 0, BLUE)]
+        for label, half, colour in pairs:
+            part = slice(half * len(x), (half + 1) * len(x))
+            panel.plot(x, y[part], "o", color=colour, ms=3, mfc="none", label=label)
+            panel.plot(x, found.fitted[k][part], "-", color=colour if sweep else ORANGE, lw=1.2)
+        share = found.shares[k]
+        unit = "modulus [Pa]" if sweep else "stress [Pa]" if share.name == "relaxation" else "strain [1]"
+        panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]" if sweep else "time [s]", ylabel=unit)
+        panel.set_title(
+            f"{share.name}: misfit {100 * share.noise:.2g} %\nby itself {100 * share.alone:.2g} %", fontsize=9
+        )
+        panel.legend(fontsize=8, frameon=False)
+        panel.grid(color=GREY, alpha=0.2)
+    plural = "s" if found.modes > 1 else ""
+    fig.suptitle(f"{count} tests, {found.kind.name}, {found.modes} mode{plural}", fontsize=10)
+    return fig

@@ -1,0 +1,153 @@
+"""Several tests of one material in one fit: what they say together, and what each of them adds."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import SHARED
+
+from fitting.__main__ import main
+from fitting.fits import together
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.time_tests import TimeTest, kind_of
+from liverjax import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+TRUTH = Maxwell(np.float64(800.0), np.array([0.3, 0.4]), np.array([30.0, 0.1]))
+OMEGA, TIME = np.geomspace(0.5, 100, 15), np.geomspace(1, 300, 25)
+
+
+def modulus(time: np.ndarray) -> np.ndarray:
+    g, tau = TRUTH.ratios, TRUTH.relaxation_times
+    return TRUTH.shear_modulus * (1 - (g * (1 - np.exp(-time[:, None] / tau))).sum(axis=1))
+
+
+def sweep(noise: float) -> Sweep:
+    factor = 1 + noise * np.random.default_rng(1).standard_normal((2, len(OMEGA)))
+    G = generalised_maxwell.moduli(TRUTH, OMEGA)
+    return Sweep(OMEGA, G[0] * factor[0], G[1] * factor[1], source="sweep.csv")
+
+
+def relaxation(noise: float, scale: float = 1.0) -> TimeTest:
+    at = np.append(0.0, TIME)
+    answer = scale * modulus(at) * (1 + noise * np.random.default_rng(2).standard_normal(len(at)))
+    return TimeTest("relaxation", at, np.ones(len(at)), answer, at > 0, source="relaxation.csv")
+
+
+@pytest.fixture(scope="module")
+def found() -> together.Together:
+    return together.fit([sweep(0.02), relaxation(0.005)], 2)
+
+
+def test_two_tests_find_what_neither_sees_alone(found):
+    errors = found.uncertainty.standard_errors
+    values = np.array([800, 0.3, 0.4, 30, 0.1])
+    assert found.converged and np.all(np.abs(found.uncertainty.values - values) < 4 * errors)
+    # The sweep ends at 2 s, the relaxation begins at 1 s: each leaves one time to the other.
+    without_sweep, without_relaxation = (s.errors_without for s in found.shares)
+    assert without_sweep[4] > 20 * errors[4] and without_relaxation[3] > 3 * errors[3]
+    assert np.all(without_sweep >= errors * 0.99) and np.all(without_relaxation >= errors * 0.99)
+
+
+def test_each_test_has_the_weight_of_its_own_noise(found):
+    # Root mean squares of 30 and of 25 numbers, 5 parameters: 15 %.
+    assert [s.noise for s in found.shares] == [pytest.approx(0.02, rel=0.4), pytest.approx(0.005, rel=0.4)]
+    assert not any("do not agree" in w for w in found.warnings)
+
+
+def test_the_errors_are_those_of_the_stacked_rows(found):
+    """Against numerical derivatives of both tests' predictions, by hand."""
+    p = found.uncertainty.values
+    noise = [s.noise for s in found.shares]
+
+    def predicted(p):
+        model = Maxwell(p[0], p[1:3], p[3:])
+        G = np.concatenate(generalised_maxwell.moduli(model, OMEGA))
+        decay = p[0] * (1 - (p[1:3] * (1 - np.exp(-TIME[:, None] / p[3:]))).sum(axis=1))
+        s = sweep(0.02)
+        return np.concatenate([G / np.concatenate([s.storage, s.loss]) / noise[0], decay / scales / noise[1]])
+
+    scales = relaxation(0.005).scales
+    columns = []
+    for k in range(5):
+        step = 1e-5 * p[k] * np.eye(5)[k]
+        columns.append((predicted(p + step) - predicted(p - step)) / (2e-5 * p[k]))
+    errors = np.sqrt(np.diag(np.linalg.inv(np.array(columns) @ np.array(columns).T)))
+    assert np.allclose(found.uncertainty.standard_errors, errors, rtol=0.05)
+
+
+def test_tests_that_do_not_agree_are_named():
+    told = together.fit([sweep(0.02), relaxation(0.005, 1.4)], 2).warnings
+    assert any("the tests do not agree" in w for w in told)
+
+
+def test_the_command_reads_any_test(tmp_path, capsys):
+    s, creep_time = sweep(0.01), np.geomspace(1, 100, 20)
+    columns = np.column_stack([s.angular_frequency, s.storage, s.loss])
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", columns, delimiter=",", header=head, comments="")
+    from fitting.methods.time_response import creep_compliance
+
+    compliance = np.column_stack([creep_time, creep_compliance(TRUTH, creep_time)])
+    np.savetxt(tmp_path / "c.csv", compliance, delimiter=",", header="time_s,creep_compliance_1/Pa", comments="")
+    arguments = [str(tmp_path / "s.csv"), "--with", str(tmp_path / "c.csv"), "--modes", "2", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert [t["test"] for t in content["tests"]] == ["sweep", "creep"] and content["modes"] == 2
+    assert np.isclose(content["relaxation_times"][0], 30, rtol=0.02) and (tmp_path / "fit.png").is_file()
+    without = content["tests"][1]["standard_errors_without_it"]["relaxation_times"][0]
+    assert without is None or without > 3 * content["standard_errors"]["relaxation_times"][0]
+    assert "without 1" in capsys.readouterr().out
+
+
+def test_the_driven_column_is_the_one_that_is_held(tmp_path):
+    time = np.linspace(0, 10, 20)
+    for kind, strain, stress in (
+        ("relaxation", np.minimum(time, 1), 5 * np.exp(-time / 5)),
+        ("creep", 0.1 + 0.02 * time, np.minimum(time, 1)),
+    ):
+        rows = np.column_stack([time, strain, stress])
+        np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header="time_s,strain,stress_Pa", comments="")
+        assert kind_of(tmp_path / "t.csv") == kind
+
+
+def test_points_on_a_straight_drive_are_not_needed():
+    """A ramp, a hold, a ramp down: their three corners and ends say it all."""
+    from fitting.fits.time_tests import _corners
+
+    time = np.sort(np.concatenate([np.linspace(0, 10, 101), [3.33]]))
+    driven = np.interp(time, [0, 2, 6, 10], [0, 1, 1, 0.5])
+    assert np.allclose(time[_corners(time, driven)], [0, 2, 6, 10])
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--method", "torsion"], "leave out --method torsion"),
+        (["--model", "auto"], "leave out --model auto"),
+        (["--samples", "1000"], "leave out --samples"),
+    ],
+)
+def test_what_a_common_fit_does_not_have_is_refused(more, words, tmp_path, capsys):
+    assert main(["a.csv", "--with", "b.csv", *more, "--out", str(tmp_path)]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_number_of_modes_beyond_the_tests_is_refused():
+    with pytest.raises(InputError, match="give 1 to"):
+        together.fit([sweep(0.02), relaxation(0.005)], 60)
+
+
+@pytest.mark.slow
+def test_polystyrene_in_three_tests(tmp_path, capsys):
+    folder = SHARED / "data" / "rheology" / "pyrheo"
+    if not folder.is_dir():
+        pytest.skip("the measured files are not here")
+    first, *others = (folder / f"{kind}_ps160_data.csv" for kind in ("oscillation", "stressrelaxation", "creep"))
+    assert main([str(first), "--with", *map(str, others), "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert any("do not agree" in w for w in content["warnings"])
+    assert max(t["misfit"] for t in content["tests"]) < 0.4
