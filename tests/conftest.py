@@ -1,9 +1,11 @@
 """Strict numerics for every test: 64 bit, no silent rank promotion; data of other programs where it is present."""
 
+import gc
 import json
 import os
 import shutil
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -20,6 +22,32 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 ROOT = Path(__file__).parent.parent
 #: Results of other programs and measured data that are not part of the project.
 SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
+# XLA's newer way to write kernels takes half of the time of a compilation; 0.11 knows no other.
+if "XLA_FLAGS" not in os.environ and version("jaxlib").startswith(("0.8.", "0.9.", "0.10.")):
+    os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
+
+#: Files that take seconds: with -x they tell within half a minute what is broken.
+QUICK = {
+    f"test_{name}"
+    for name in (
+        "bounds",
+        "check",
+        "host",
+        "house",
+        "law_values",
+        "laws",
+        "material_cards",
+        "mesh",
+        "mjed",
+        "names",
+        "raw_torque",
+        "rheometer",
+        "stretches",
+    )
+}
+#: Programs after which a file begins without any: some 430 live ones fill the memory maps that Linux grants a process,
+#: and jax 0.10.1 crashes then. Files that compile few go on with what is there.
+MANY_PROGRAMS = 100
 
 
 def pytest_addoption(parser):
@@ -29,9 +57,10 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
-    """With --verification only tests of known answers run."""
+    """With --verification only tests of known answers run. Otherwise files that compile little come first."""
     if config.getoption("--verification"):
         items[:] = [item for item in items if "verified" in item.fixturenames]
+    items.sort(key=lambda item: item.path.stem not in QUICK)
 
 
 def pytest_terminal_summary(terminalreporter, config):
@@ -68,7 +97,10 @@ def pytest_configure(config):
         config.compiled = tempfile.mkdtemp()
         os.environ["LIVERJAX_CACHE"] = "off"  # the user's own stays as it is
         os.environ["JAX_COMPILATION_CACHE_DIR"] = config.compiled
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.02"  # found again in a few milliseconds
+    # Tracing makes millions of objects that live on: Python would look through all of them again and again.
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
 
 
 def pytest_unconfigure(config):
@@ -77,13 +109,26 @@ def pytest_unconfigure(config):
         shutil.rmtree(config.compiled, ignore_errors=True)
 
 
+_compiled: list[float] = []
+
+
+def _count(event: str, seconds: float, **_: object) -> None:
+    if event.endswith("backend_compile_duration"):
+        _compiled.append(seconds)
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _compilation(request):
     quick = any(mark.name == "quick_to_compile" for mark in request.node.iter_markers())
+    changed = quick != jax.config.values["jax_disable_most_optimizations"]
     jax.config.update("jax_disable_most_optimizations", quick)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # of commands that tests start
-    # Some 430 live programs fill the memory maps that Linux grants a process, and jax 0.10.1 crashes then.
-    jax.clear_caches()
+    if changed or len(_compiled) > MANY_PROGRAMS:
+        jax.clear_caches()
+        _compiled.clear()
 
 
 @pytest.fixture(autouse=True)

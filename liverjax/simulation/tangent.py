@@ -6,6 +6,7 @@ diagonal blocks and, where slow motions would slow them down, a coarse space.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -119,9 +120,28 @@ def tangent(
     flag is set; `kind` is one of `KINDS`. Everything in the result is without derivative.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
+    matrix, inverse, below, A = _assembled(e, pressure, x, kind=kind)
+
+    def new() -> Coarse:
+        return _coarse(e, A)
+
+    slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
+    # Loads that follow the body need to know where.
+    return Tangent(matrix, inverse, below, slow, *((None, None) if e.conservative else (x, s)))
+
+
+#: Matrix, inverse and vertices of a `Tangent`, and the matrix that its coarse space is made of.
+_Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix]
+
+# A program has the two functions below several times: within jit they are traced once.
+
+
+@partial(jax.jit, static_argnames="kind")
+def _assembled(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembled:
+    """The tangent without its coarse space."""
     mesh, volume = e.mesh, _coupled(e)
     if mesh.order > 1:
-        return _of_points(e, pressure, x, s, near, kind)
+        return _of_points(e, pressure, x, kind)
     if volume is None:
         A = stiffness(e, pressure, x, kind)
         diagonal = A.diagonal
@@ -132,21 +152,17 @@ def tangent(
         A = mixed_system.coupled(mesh, K, node_blocks(e), F, pressures)
         diagonal = mixed_system.undrained_diagonal(A, 1.0 if volume.flow is None else volume.flow.mask)
     inverse = block_matrix.inverse_blocks(diagonal, e.free.mask, e.free.normals)
-
-    def new() -> Coarse:
-        used = False if e.scene.solve.linear_solver == "direct" else worthwhile(A, _shift(e))
-        return coarse(mesh, A, _coarse_mask(e.free), used)
-
-    slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    return Tangent(A, inverse, None, slow, *_followed(e, x, s))
+    return A, inverse, None, A
 
 
-def _followed(e: Equations, x: jax.Array, s: Any) -> tuple[Any, Any]:
-    """Where the tangent is made, for loads that follow the body."""
-    return (None, None) if e.conservative else (x, s)
+@jax.jit
+def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
+    """The coarse space of the vertices."""
+    used = False if e.scene.solve.linear_solver == "direct" else worthwhile(A, _vertex_shift(e))
+    return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 
 
-def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, near: Any, kind: str) -> Tangent:
+def _of_points(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembled:
     """The tangent of quadratic elements: moduli at their points, and two levels of a preconditioner."""
     mesh, volume = e.mesh, _coupled(e)
     F = deformation_gradient(mesh, x)
@@ -164,13 +180,7 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, near: Any, kin
     inverse = block_matrix.inverse_blocks(own.diagonal, e.free.mask, e.free.normals)
     free = _of_vertices(e)
     vertices = block_matrix.inverse_blocks(own.vertices.diagonal, free.mask, free.normals)
-
-    def new() -> Coarse:
-        used = False if e.scene.solve.linear_solver == "direct" else worthwhile(own.vertices, _vertex_shift(e))
-        return coarse(mesh, own.vertices, _coarse_mask(free), used)
-
-    slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    return Tangent(A, inverse, vertices, slow, *_followed(e, x, s))
+    return A, inverse, vertices, own.vertices
 
 
 def _of_vertices(e: Equations) -> Free:
@@ -181,7 +191,7 @@ def _of_vertices(e: Equations) -> Free:
 
 def _vertex_shift(e: Equations) -> jax.Array | None:
     own = _shift(e)
-    return None if own is None else point_matrix.restricted(e.mesh, own)
+    return own if own is None or e.mesh.order == 1 else point_matrix.restricted(e.mesh, own)
 
 
 def _coarse_mask(free: Free) -> jax.Array:
