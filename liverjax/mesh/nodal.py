@@ -5,13 +5,14 @@ import jax.numpy as jnp
 
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.tensors.places import given, taken
 
 
 def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
     """Sum (V,) at every vertex of what each of its elements gives to each of its vertices, `share` (E,)."""
     total = jnp.zeros(mesh.number_of_vertices, share.dtype)
     for a in range(4):
-        total = total.at[mesh.tetrahedra[:, a]].add(share)
+        total = given(total, mesh.tetrahedra[:, a], share)
     return total
 
 
@@ -32,7 +33,7 @@ def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
         return to_nodes(mesh, shares / 4)
     total, L = jnp.zeros(mesh.number_of_vertices, shares.dtype), jnp.asarray(basis(mesh.order).L, shares.dtype)
     for a in range(4):
-        total = total.at[mesh.tetrahedra[:, a]].add(jnp.sum(L[a][:, None] * shares, axis=0))
+        total = given(total, mesh.tetrahedra[:, a], jnp.sum(L[a][:, None] * shares, axis=0))
     return total
 
 
@@ -43,7 +44,7 @@ def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
 
 def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
     """Values of a field, linear in every element, at its points: (E,) or (Q, E) from those of the vertices (V,)."""
-    corner = [values[mesh.tetrahedra[:, a]] for a in range(4)]
+    corner = [taken(values, mesh.tetrahedra[:, a]) for a in range(4)]
     if mesh.order == 1:
         return (corner[0] + corner[1] + corner[2] + corner[3]) / 4
     L = jnp.asarray(basis(mesh.order).L, values.dtype)

@@ -15,6 +15,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.mesh.adjacency import PAIRS, Pattern, pattern
 from liverjax.mesh.basis import basis
+from liverjax.tensors.places import given, taken
 
 T = TypeVar("T")
 
@@ -92,10 +93,10 @@ class TetMesh:
         (y_k - y_0) D_k.
         """
         if self.order == 1:
-            first, *others = [[column[n] for column in columns] for n in self.element_nodes]
+            first, *others = [[taken(column, n) for column in columns] for n in self.element_nodes]
             return [tuple(a - b for a, b in zip(corner, first, strict=True)) for corner in others]
         nodes = jnp.stack(self.element_nodes)
-        values = self._oriented(jnp.stack([column[nodes] for column in columns], axis=1))
+        values = self._oriented(jnp.stack([taken(column, nodes) for column in columns], axis=1))
         y = jnp.tensordot(self._slopes(), values, axes=(1, 0)).reshape(3, -1, *values.shape[1:])
         return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
 
@@ -116,7 +117,7 @@ class TetMesh:
             # Chained scatters: after a concatenate XLA:CPU recomputes the shares for every update (4 times slower).
             total = jnp.zeros(self.number_of_nodes, own[0].dtype)
             for where, share in zip(nodes, own, strict=True):
-                total = total.at[where].add(share)
+                total = given(total, where, share)
             columns.append(total)
         return columns
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from liverjax.mesh.adjacency import PAIRS, Pattern
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.matrices import cofactor, dot, stored
+from liverjax.tensors.places import given, taken
 
 #: An m x m matrix as nested tuples of arrays.
 Block = tuple[tuple[Any, ...], ...]
@@ -46,9 +47,9 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
             for k, pair in enumerate(PAIRS):
                 K = blocks[pair]
                 value = K[r][c] if r == c else jnp.where(swapped[pair], K[c][r], K[r][c])
-                total = total.at[pattern.element_edges[k]].add(value)
+                total = given(total, pattern.element_edges[k], value)
             edge[r][c] = total
-    gathered: list[list[Any]] = [[None if e is None else e[pattern.row_edges] for e in row] for row in edge]
+    gathered: list[list[Any]] = [[None if e is None else taken(e, pattern.row_edges) for e in row] for row in edge]
     upward = jnp.arange(mesh.number_of_vertices, dtype=jnp.int32)[None] < pattern.row_nodes
     return tuple(
         tuple(gathered[r][c] if r == c else jnp.where(upward, gathered[r][c], gathered[c][r]) for c in range(m))
@@ -125,7 +126,7 @@ def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ..
     """A v as columns (V,), for the k columns (V,) of v: the first k columns of the blocks, all of their rows."""
 
     def add(slot, total):
-        near = [column[A.nodes[slot]] for column in columns]
+        near = [taken(column, A.nodes[slot]) for column in columns]
         return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
 
     # One neighbour after the other, in a loop: what is gathered stays in cache.

@@ -21,6 +21,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers import block_matrix
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector, dot, stored, transpose
+from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
@@ -107,7 +108,7 @@ def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
     ]
     values = jnp.tensordot(matrix, jnp.concatenate(symmetric), axes=(1, 0))
     nodes, zero = jnp.stack(mesh.element_nodes), jnp.zeros(mesh.number_of_nodes, mesh.points.dtype)
-    six = {entry: zero.at[nodes].add(values[:, k]) for k, entry in enumerate(entries)}
+    six = {entry: given(zero, nodes, values[:, k]) for k, entry in enumerate(entries)}
     return tuple(tuple(six[min(r, s), max(r, s)] for s in range(3)) for r in range(3))
 
 
@@ -120,7 +121,7 @@ def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
     """The transpose of `prolonged`: (V,) of all nodes to the vertices."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     half = 0.5 * column[V : V + low.shape[0]]
-    return column[:V].at[low].add(half).at[high].add(half)
+    return given(given(column[:V], low, half), high, half)
 
 
 def prolonged(mesh: TetMesh, column: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.block_matrix import BlockMatrix
+from liverjax.tensors.places import given, taken
 
 #: A vector, one array (V,) a component.
 Columns = Sequence[jax.Array]
@@ -65,10 +66,10 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
 
     def apply(columns):
         weighted = jnp.stack([fk * free * r for fk in f for free, r in zip(masks, columns, strict=True)], axis=-1)
-        sums = jnp.zeros((number, 4 * m), weighted.dtype).at[patch].add(weighted)
+        sums = given(jnp.zeros((number, 4 * m), weighted.dtype), patch, weighted)
         motion = (coarse.inverse @ sums.ravel()).reshape(number, 4, m)
         # Written out: a sum over an axis of four costs XLA:CPU more than all the rest.
-        return tuple(masks[i] * sum(f[k] * motion[:, k, i][patch] for k in range(4)) for i in range(m))
+        return tuple(masks[i] * sum(f[k] * taken(motion[:, k, i], patch) for k in range(4)) for i in range(m))
 
     return apply
 
@@ -93,12 +94,14 @@ def _galerkin(mesh: TetMesh, A: BlockMatrix, f: jax.Array, mask: jax.Array, numb
     patch, slot = pattern.patches, pattern.edge_slots
 
     def pairs(blocks, i, j):
-        B = jnp.stack([blocks[r][c] * mask[i, r] * mask[j, c] for r in range(m) for c in range(m)], axis=1)
-        both = (f[i][:, :, None] * f[j][:, None, :]).reshape(-1, 16)
+        free_i, free_j = taken(mask, i).T, taken(mask, j).T
+        B = jnp.stack([blocks[r][c] * free_i[r] * free_j[c] for r in range(m) for c in range(m)], axis=1)
+        both = (taken(f, i)[:, :, None] * taken(f, j)[:, None, :]).reshape(-1, 16)
         entries = (both[:, :, None] * B[:, None, :]).reshape(-1, 16 * m * m)
-        return jnp.zeros((number * number, 16 * m * m), f.dtype).at[patch[i] * number + patch[j]].add(entries)
+        nothing = jnp.zeros((number * number, 16 * m * m), f.dtype)
+        return given(nothing, taken(patch, i) * number + taken(patch, j), entries)
 
-    once = pairs([[entry.ravel()[slot] for entry in row[:m]] for row in A.rows[:m]], low, high)
+    once = pairs([[taken(entry.ravel(), slot) for entry in row[:m]] for row in A.rows[:m]], low, high)
     every = jnp.arange(mesh.number_of_vertices)
     once, own = (
         jnp.transpose(E.reshape(number, number, 4, 4, m, m), (0, 2, 4, 1, 3, 5)).reshape(size, size)

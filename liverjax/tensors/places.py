@@ -1,0 +1,15 @@
+"""Read and add at places that a mesh names: its node and edge numbers are within bounds, so no program looks."""
+
+from typing import Any
+
+import jax
+
+
+def taken(values: jax.Array, places: Any) -> jax.Array:
+    """`values` (n, …) at `places`, whole numbers from 0 to n - 1 of any shape."""
+    return values.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def given(total: jax.Array, places: Any, shares: jax.Array) -> jax.Array:
+    """`total` (n, …) with `shares` added at `places`, whole numbers from 0 to n - 1, as often as they occur."""
+    return total.at[places].add(shares, mode="promise_in_bounds", wrap_negative_indices=False)
