@@ -25,7 +25,10 @@ from liverjax.physics import viscosity
 from liverjax.physics.base import End, Free, Physics, Step
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.inertia import Inertia, Motion
+from liverjax.physics.prescribed import Fixed
+from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.viscosity import Prony, Viscoelasticity
+from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.solvers import newton
 from liverjax.tensors.matrices import deformation_gradient
 
@@ -244,6 +247,35 @@ def _steady(rest: _Linearised, modulus: Any) -> _Response:
 def torque_for_strain(rig: Rig, modulus: Any, strain: Any) -> Any:
     """Torque amplitude [N m] that gives about `strain` at the rim of a sample of dynamic modulus |G*| [Pa]."""
     return jnp.pi * rig.radius**3 / 2 * modulus * strain
+
+
+def scene_of(rig: Rig, law: Law, prony: Prony | None, omega: Any, amplitude: Any, drive: Drive = Drive()) -> Scene:
+    """The oscillation as a scene with a rigid plate: `lj.simulate` runs it, from rest. Arguments as of `oscillate`.
+
+    `oscillate` with `start="rest"` has the same answer in a fraction of the time: it knows the inverse of the small
+    body's stiffness.
+    """
+    steps, n = drive.steps * drive.cycles, rig.mesh.number_of_nodes
+    dt = 2 * jnp.pi / (omega * drive.steps)
+    times = dt * jnp.arange(steps + 1)
+    turn = amplitude * jnp.sin(omega * times)
+    plate = RigidPlate(nodes=jnp.arange(n - rig.top, n), turn=turn, times=times, by=drive.by, lifts=rig.free_height)
+    moves = rig.density is not None
+    return Scene(
+        mesh=rig.mesh,
+        law=law,
+        viscosity=prony,
+        body=Body(density=rig.density) if moves else None,
+        fixed=(Fixed(nodes=jnp.arange(rig.bottom)),),
+        physics=(plate,),
+        solve=Solve(
+            dt=dt,
+            steps=steps,
+            kind="dynamic" if moves else "static",
+            integrator="newmark",
+            tolerance=drive.options.tolerance,
+        ),
+    )
 
 
 # -- time stepping -----------------------------------------------------------------------------------------------------

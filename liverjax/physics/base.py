@@ -17,7 +17,7 @@ A `VolumeStress` has pressures at the nodes, which the mixed system of positions
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -32,21 +32,39 @@ from liverjax.tensors.matrices import Matrix, Vector
 Pairs = tuple[tuple[int, int], ...]
 
 
+class Tied(Protocol):
+    """Nodes that move together in a step, by a few numbers; a field of the nodes carries these numbers."""
+
+    def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
+        """The part of a field (V, 3) along the free motions; forces at positions x (V, 3) work along those of x."""
+
+    def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
+        """The field (V, 3) with the rows that stand for positions x (V, 3): `placed` gives them back."""
+
+    def placed(self, field: jax.Array, s: Any) -> jax.Array:
+        """Positions (V, 3) that a field stands for, at part s of the step."""
+
+
 class Free(NamedTuple):
     """Where the body can move: a projection of nodal vectors onto the free directions."""
 
     mask: jax.Array  # (V, 3) 0 along the axes that are held or prescribed
     normals: jax.Array | None = None  # (V, 3) unit normals that nodes may not move along, 0 elsewhere
+    tied: tuple[Tied, ...] = ()  # nodes that move together
 
-    def vectors(self, field: jax.Array) -> jax.Array:
-        """The free part of a field (V, 3)."""
+    def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
+        """The free part of a field (V, 3); of forces at positions x (V, 3) where nodes move together."""
         field = self.mask * field
-        if self.normals is None:
-            return field
-        return field - jnp.sum(self.normals * field, axis=1, keepdims=True) * self.normals
+        if self.normals is not None:
+            field = field - jnp.sum(self.normals * field, axis=1, keepdims=True) * self.normals
+        for nodes in self.tied:
+            field = nodes.gathered(field, x)
+        return field
 
     def columns(self, columns: Any) -> list[jax.Array]:
         """The free part of a field given by its columns x, y, z (V,)."""
+        if self.tied:
+            return list(self.vectors(jnp.stack(columns, axis=-1)).T)
         masked = [m * c for m, c in zip(self.mask.T, columns, strict=True)]
         if self.normals is None:
             return masked
@@ -171,6 +189,8 @@ class Physics:
 
     #: Table of the scene file that it is read from, and the keys of that table.
     section: ClassVar[str] = ""
+    #: Whether it makes nodes move together: the factorisation knows no such rows.
+    ties: ClassVar[bool] = False
     keys: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
@@ -204,6 +224,10 @@ class Physics:
     def constrain(self, free: Free) -> Free:
         """The free directions, without those that this physics takes away."""
         return free
+
+    def tied(self, step: Step) -> Tied | None:
+        """Nodes that this physics makes move together during a step."""
+        return None
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Node numbers (n,) and directions (n, 3) along which the body is held against rigid motion."""

@@ -39,6 +39,10 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
+    if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
+        raise InputError(
+            "[solve] linear_solver = 'direct' knows no nodes that move together: use cg with a rigid plate"
+        )
     if scene.solve.volumetric in ("nodal", "mixed"):
         _own_volumes(scene)
     if scene.solve.volumetric == "mixed":

@@ -20,7 +20,7 @@ def linear_solver(scene: Scene) -> str:
     mesh, solve = scene.mesh, scene.solve
     # A quadratic element has about eight times the unknowns of a linear one.
     small = mesh.number_of_elements * (1 if mesh.order == 1 else 8) <= LARGEST
-    if solve.volumetric == "mixed":
+    if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return "cg"
     if solve.kind != "static" or not small or any(load.pressure is not None for load in scene.traction):
         return "cg"

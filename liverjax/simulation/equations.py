@@ -138,6 +138,8 @@ def equations(scene: Scene, state: State, k: Any, sizes: Sizes | None = None) ->
     physics, free = physics_of(scene), free_directions(scene)
     tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
     step = _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance)
+    free = free._replace(tied=tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None))
+    step = step._replace(free=free)
     return Equations(
         scene=scene,
         physics=physics,
@@ -162,9 +164,11 @@ def positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
         )
         held = held + before + s * (after - before)
     x = free.mask * jnp.stack(columns(q), axis=-1) + (1 - free.mask) * held
-    if free.normals is None:
-        return x
-    return x - jnp.sum(free.normals * (x - e.mesh.points), axis=1, keepdims=True) * free.normals
+    if free.normals is not None:
+        x = x - jnp.sum(free.normals * (x - e.mesh.points), axis=1, keepdims=True) * free.normals
+    for nodes in free.tied:
+        x = nodes.placed(x, s)
+    return x
 
 
 def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> jax.Array:
@@ -173,7 +177,10 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
     Args:
         pressure: of the vertices (V,) [Pa], where they are unknown; default: those at the beginning of the step.
     """
-    q = flat(e.free.vectors(x))
+    field = e.free._replace(tied=()).vectors(x)
+    for nodes in e.free.tied:
+        field = nodes.unknown(field, x)
+    q = flat(field)
     if e.mixed is None:
         return q
     pressure = e.mixed.before if pressure is None else pressure
@@ -206,7 +213,7 @@ def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, 
     at_work = e.noise + jnp.linalg.norm(f.internal)
     for force in f.nodal:
         at_work = at_work + jnp.linalg.norm(force)
-    r, at_work = flat(e.free.vectors(f.total)), jax.lax.stop_gradient(at_work)
+    r, at_work = flat(e.free.vectors(f.total, f.x)), jax.lax.stop_gradient(at_work)
     if e.mixed is not None:
         r = jnp.concatenate([r, e.mixed.unit * e.mixed.balance(e.mesh, f.pressure, determinant(f.F))])
     return r, at_work, f.pressure

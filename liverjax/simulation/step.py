@@ -15,7 +15,6 @@ from liverjax.physics.elasticity import Elastic
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, State, advanced, energy, forces, positions, residual, unknowns
 from liverjax.solvers import continuation
-from liverjax.solvers.block_matrix import flat
 from liverjax.solvers.problem import Kept, Potential, Problem, StepOptions, StepStatistics
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
@@ -36,7 +35,8 @@ def problem_of(e: Equations) -> Problem:
         tangent=partial(_tangent, e, "true"),
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
-        adjoint=partial(tangent.adjoint, e) if e.conservative else None,
+        # Where nodes move together on circles, the tangent is that of small turns: near, but not the derivative.
+        adjoint=partial(tangent.adjoint, e) if e.conservative and not e.free.tied else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
@@ -51,7 +51,7 @@ def _tangent(e: Equations, kind: str, q: jax.Array, s: Any, pressure: Any, near:
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
     """The reference shape, and whether the first step begins at another one, which without inertia is a guess."""
     points = e.mesh.points
-    return flat(e.free.vectors(points)), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
+    return unknowns(e, points), (e.k == 1) & jnp.any(e.free.vectors(e.state.x - points) != 0)
 
 
 def _finite(e: Equations) -> Equations:
@@ -81,7 +81,8 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     q, statistics, kept = continuation.solve(problem_of(e), unknowns(e, x), options, guess, kept, near)
     f = forces(e, q, jnp.ones((), x.dtype))
-    reactions = f.total - e.free.vectors(f.total) if e.free.normals is not None else (1 - e.free.mask) * f.total
+    projected = e.free.normals is not None or e.free.tied
+    reactions = f.total - e.free.vectors(f.total, f.x) if projected else (1 - e.free.mask) * f.total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)
     inverted = found & jnp.any(volume_ratios(e.mesh, f.x) <= 0)
     statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))

@@ -185,7 +185,7 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembl
 
 def _of_vertices(e: Equations) -> Free:
     """Where the vertices can move."""
-    V, (mask, normals) = e.mesh.number_of_vertices, e.free
+    V, (mask, normals) = e.mesh.number_of_vertices, e.free[:2]
     return Free(mask[:V], None if normals is None else normals[:V])
 
 
@@ -196,7 +196,7 @@ def _vertex_shift(e: Equations) -> jax.Array | None:
 
 def _coarse_mask(free: Free) -> jax.Array:
     """(V, 3) 1 where coarse motions act: not at nodes that slide along no axis."""
-    mask, normals = free
+    mask, normals = free[:2]
     return mask if normals is None else mask * jnp.all(normals == 0, axis=1, keepdims=True)
 
 
@@ -239,7 +239,7 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
 
 def _flat(e: Equations, columns: Any) -> jax.Array:
     """The free part of columns (V,) as a flat vector."""
-    if e.free.normals is None:
+    if e.free.normals is None and not e.free.tied:
         return e.free.mask.T.ravel() * jnp.concatenate(columns)
     return jnp.concatenate(e.free.columns(columns))
 

@@ -1,0 +1,181 @@
+"""A rigid plate: nodes that turn about an axis as one body, by an angle or a torque given over time.
+
+The plate takes away all motions of its nodes but two: the turn, and the way along the axis where that is free.
+Unknowns stay nodal vectors. The turn is carried by the field b = e x (x - c) / R of the plate's nodes at the beginning
+of a step. R^2 is the sum of their squared distances from the axis. A field a b stands for the angle a / R. Positions
+follow the circle exactly, so angles may be large.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, static, struct
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import NodalForce, Physics, Step
+
+
+@struct
+class RigidPlate(Physics):
+    """Nodes that turn about an axis as one body."""
+
+    nodes: jax.Array = param("1", "node numbers (n,)", lower=0)
+    turn: Any = param("rad or N m", "angle or torque; a number, or at times of a history (T,), linear in between")
+    times: Any = param("s", "times of the history (T,), ascending; None: the turn stays as it is", default=None)
+    axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
+    centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
+    by: str = static(default="angle", about="what is given: angle or torque")
+    lifts: bool = static(default=False, about="free to move along the axis, under no axial force")
+
+    section: ClassVar[str] = "plate"
+    ties: ClassVar[bool] = True
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Node numbers of the mesh, an axis, and a history."""
+        numbers, turn = np.asarray(self.nodes), np.asarray(self.turn)
+        times = np.zeros(()) if self.times is None else np.asarray(self.times)
+        if numbers.size < 2 or numbers.max() >= mesh.number_of_nodes:
+            raise InputError(
+                f"{name} names fewer than two nodes or one beyond {mesh.number_of_nodes - 1}: renumber them"
+            )
+        if self.by not in ("angle", "torque"):
+            raise InputError(f"{name} by = {self.by!r} is not known: use angle or torque")
+        if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
+            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
+        if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):
+            raise InputError(f"{name} needs ascending times and as many values of turn: correct its history")
+        arms = self.at_rest(mesh).arms(mesh.points)
+        if not np.abs(np.asarray(arms)).max() > 1e-9 * np.ptp(np.asarray(mesh.points)):
+            raise InputError(f"{name} has all its nodes on its axis: name more nodes, or move the centre")
+
+    def at_rest(self, mesh: TetMesh) -> "Plate":
+        """Its nodes in the reference positions."""
+        X, zero = mesh.points[self.nodes], jnp.zeros((), mesh.points.dtype)
+        return Plate(self, X, X, zero, zero)
+
+    def tied(self, step: Step) -> "Plate":
+        """Its nodes during a step."""
+        before = after = jnp.asarray(self.turn)
+        if self.times is not None:
+            before, after = (jnp.interp(step.dt * n, jnp.asarray(self.times), after) for n in (step.k - 1, step.k))
+        return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)
+
+    def freeze(self, memory: None, step: Step) -> "Torque | None":
+        """The torque; an angle acts on no node."""
+        if self.by == "angle":
+            return None
+        return Torque(plate=self.tied(step))
+
+    def enriched(self, more: Callable[[Any], Any]) -> "RigidPlate":
+        """With the nodes in between."""
+        return replace(self, nodes=more(self.nodes))
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Across the axis; along it too where the plate cannot lift; about it where the angle is given."""
+        nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
+        across = np.linalg.svd(np.asarray(self.axis)[None], full_matrices=True)[2][1:]
+        first = [nodes[:1], nodes[:1]] + ([] if self.lifts else [nodes[:1]])
+        rows = [*across] + ([] if self.lifts else [np.asarray(self.axis)])
+        if self.by == "angle":
+            far = int(np.argmax(np.linalg.norm(arms, axis=1)))
+            first, rows = [*first, nodes[far : far + 1]], [*rows, arms[far] / np.linalg.norm(arms[far])]
+        return np.concatenate(first), np.stack(rows)
+
+
+class Plate(NamedTuple):
+    """The nodes of a plate during a step."""
+
+    plate: RigidPlate
+    reference: jax.Array  # (n, 3) [m]
+    carrier: jax.Array  # (n, 3) [m] positions at the beginning of the step, which the field b is of
+    before: jax.Array  # angle [rad] or torque [N m] at the beginning
+    after: jax.Array  # and at the end
+
+    def arms(self, x: jax.Array) -> jax.Array:
+        """e x (x - c) of the plate's nodes (n, 3) [m] in positions x (V, 3)."""
+        return self._arms(x[self.plate.nodes])
+
+    def _arms(self, x: jax.Array) -> jax.Array:
+        return jnp.cross(self._axis(x)[None], x - jnp.asarray(self.plate.centre, x.dtype)[None])
+
+    def _axis(self, like: jax.Array) -> jax.Array:
+        return jnp.asarray(self.plate.axis, like.dtype)
+
+    @property
+    def radius(self) -> jax.Array:
+        """R [m]."""
+        return jnp.linalg.norm(self._arms(self.reference))
+
+    def angle(self, x: jax.Array) -> jax.Array:
+        """Angle [rad] of the plate in positions x (V, 3), between -pi and pi."""
+        e, (old, new) = self._axis(x), (self._arms(self.reference), self.arms(x))
+        return jnp.arctan2(jnp.sum(jnp.cross(old, new) @ e), jnp.sum(old * new))
+
+    def lift(self, x: jax.Array) -> jax.Array:
+        """Way [m] of the plate along the axis in positions x (V, 3)."""
+        return jnp.mean((x[self.plate.nodes] - self.reference) @ self._axis(x))
+
+    def torque(self, x: jax.Array, f: jax.Array) -> jax.Array:
+        """Moment [N m] about the axis of forces f (V, 3) [N] on the plate's nodes at positions x (V, 3)."""
+        return jnp.sum(self.arms(x) * f[self.plate.nodes])
+
+    def spread(self, field: jax.Array, turn: Any, lift: Any) -> jax.Array:
+        """The field (V, 3) with the plate's rows made of amplitudes of its two motions."""
+        rows = turn * self._arms(self.carrier) / self.radius
+        if self.plate.lifts:
+            rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
+        return field.at[self.plate.nodes].set(rows)
+
+    def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Any, Any]:
+        """R times the turn, and sqrt(n) times the way along the axis, that a field (V, 3) has along `arms` (n, 3)."""
+        rows = field[self.plate.nodes]
+        turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
+        return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
+
+    def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
+        """The part of a field (V, 3) along the free motions; at positions x (V, 3) forces work along those of x."""
+        return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
+
+    def given(self, s: Any) -> jax.Array:
+        """Angle or torque at part s of the step."""
+        return self.before + s * (self.after - self.before)
+
+    def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
+        """The field (V, 3) with the plate's rows that stand for positions x (V, 3)."""
+        turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
+        return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
+
+    def placed(self, field: jax.Array, s: Any) -> jax.Array:
+        """Positions (V, 3) that a field stands for."""
+        turn, lift = self.amplitudes(field, self._arms(self.carrier))
+        angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
+        return self.moved(field, angle, lift / len(self.reference) ** 0.5)
+
+    def moved(self, field: jax.Array, angle: Any, lift: Any) -> jax.Array:
+        """The field (V, 3) with the plate's rows at the positions of an angle [rad] and a way along the axis [m]."""
+        axis, arms = self._axis(field)[None], self._arms(self.reference)
+        # x - c turns in its plane: it changes by sin(a) of its arm and by cos(a) - 1 of what is across the axis.
+        rows = self.reference + jnp.sin(angle) * arms + (jnp.cos(angle) - 1) * jnp.cross(arms, axis)
+        if self.plate.lifts:
+            rows = rows + lift * axis
+        return field.at[self.plate.nodes].set(rows)
+
+
+@struct
+class Torque(NodalForce):
+    """The torque of a plate during a step: forces on its nodes along their circles."""
+
+    plate: Plate = param("1", "its nodes")
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Minus the forces whose moment is the torque."""
+        rows = -self.plate.given(s) * self.plate.arms(x) / self.plate.radius**2
+        return jnp.zeros_like(x).at[self.plate.plate.nodes].set(rows)
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Minus torque times angle."""
+        return -self.plate.after * self.plate.angle(x)

@@ -1,0 +1,131 @@
+"""A rigid plate as a physics of scenes: its circle, the rheometer as a scene, derivatives, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting.rigs import torsion
+from fitting.rigs.torsion import Drive
+from liverjax.core.struct import replace
+from liverjax.physics.base import Step
+from liverjax.physics.rigid_plate import RigidPlate
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return torsion.make_rig(cell_size=0.008)
+
+
+def _plate(rig, **given):
+    n = rig.mesh.number_of_nodes
+    return RigidPlate(**({"nodes": jnp.arange(n - rig.top, n), "turn": 0.5} | given))
+
+
+def _step(rig, x):
+    return Step(rig.mesh, x, 1, 1, None, False, 1e-8, None)
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
+def test_unknowns_stand_for_positions_on_the_circle(rig, axis):
+    """Rodrigues' formula turns the nodes by 2.5 rad about an axis anywhere; the field of unknowns gives them back."""
+    e, c, a = np.array(axis), np.array([1e-3, -2e-3, 5e-3]), 2.5
+    plate = _plate(rig, axis=axis, centre=tuple(c), by="torque", lifts=True)
+    X = np.asarray(rig.mesh.points)
+    W = np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
+    Q = np.eye(3) + np.sin(a) * W + (1 - np.cos(a)) * W @ W
+    turned = jnp.asarray((X - c) @ Q.T + c + 3e-4 * e)
+    tied = plate.tied(_step(rig, rig.mesh.points))
+    x = tied.placed(tied.unknown(jnp.asarray(X), turned), 1.0)
+    nodes = np.asarray(plate.nodes)
+    assert np.allclose(x[nodes], turned[nodes], rtol=0, atol=1e-16 / 1e-2)
+    assert np.array_equal(x[: nodes[0]], X[: nodes[0]])
+    assert np.isclose(tied.angle(turned), a, rtol=1e-13) and np.isclose(tied.lift(turned), 3e-4, rtol=1e-10)
+    # Forces at x work along the motions at x: the difference quotient of f . x along the field.
+    rng = np.random.default_rng(0)
+    f, direction = jnp.asarray(rng.normal(size=X.shape)), jnp.asarray(rng.normal(size=X.shape))
+    q, h = tied.unknown(jnp.asarray(X), turned), 1e-6
+    up, down = (jnp.sum(f * tied.placed(q + s * h * direction, 1.0)) for s in (1, -1))
+    assert np.isclose(jnp.sum(tied.gathered(f, turned) * direction), (up - down) / (2 * h), rtol=1e-7)
+
+
+PRONY = lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.1]))
+CASES = [
+    pytest.param("angle", None, None, id="elastic"),
+    pytest.param("angle", PRONY, None, marks=pytest.mark.slow, id="viscous"),
+    pytest.param("torque", PRONY, None, marks=pytest.mark.slow, id="torque"),
+    pytest.param("angle", PRONY, 1000.0, marks=pytest.mark.slow, id="inertia"),
+]
+
+
+@pytest.mark.parametrize(("by", "prony", "density"), CASES)
+def test_the_rheometer_is_a_scene_too(rig, by, prony, density):
+    """The same numbers by the simulation's step as by the rig's own: angle, torque and lift, at a tenth of strain."""
+    law = lj.laws.typical("neo_hookean")
+    rig = replace(rig, density=density, free_height=True)
+    omega, strain = 2 * np.pi, 0.1
+    amplitude = strain * 0.4 if by == "angle" else torsion.torque_for_strain(rig, 500.0, strain)
+    drive = Drive(steps=8, by=by, start="rest", cycles=1)
+    run = torsion.oscillate(rig, law, prony, omega, amplitude, drive)
+    scene = torsion.scene_of(rig, law, prony, omega, amplitude, drive)
+    result = lj.simulate(scene)
+    assert result.status.max() == 0 and run.statistics.status.max() == 0
+    at_rest = scene.physics[0].at_rest(rig.mesh)
+    angle, lift = (np.array([getattr(at_rest, name)(x) for x in result.positions]) for name in ("angle", "lift"))
+    size = np.abs(run.angle).max()
+    assert np.allclose(angle[-8:], run.angle[1:], rtol=0, atol=1e-8 * size)
+    assert np.allclose(lift[-8:], run.lift[1:], rtol=0, atol=1e-7 * np.abs(run.lift).max())
+    if by == "angle":
+        pairs = zip(result.positions[-8:], result.reactions[-8:], strict=True)
+        torque = np.array([at_rest.torque(x, f) for x, f in pairs])
+        assert np.allclose(torque, run.torque[1:], rtol=0, atol=1e-7 * np.abs(run.torque).max())
+
+
+@pytest.mark.slow
+def test_the_derivative_of_a_turned_body(rig):
+    """Angle under a torque, 0.5 rad: by the shear modulus, against central differences."""
+    plate = _plate(rig, turn=jnp.array([0.0, 3e-3]), times=jnp.array([0.0, 1.0]), by="torque")
+    law = lj.laws.NeoHookean(mu=770.0, bulk=7700.0)
+    scene = lj.Scene(
+        mesh=rig.mesh,
+        law=law,
+        fixed=(lj.boundary.Fixed(nodes=jnp.arange(rig.bottom)),),
+        physics=(plate,),
+        solve=lj.Solve(dt=1.0, steps=1, tolerance=1e-11),
+    )
+
+    @jax.jit
+    def angle(mu):
+        return plate.at_rest(rig.mesh).angle(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1])
+
+    found = jax.jit(jax.grad(angle))(770.0)
+    errors = [abs((angle(770 + h) - angle(770 - h)) / (2 * h) / found - 1) for h in (30.0, 1.0, 1e-6)]
+    assert angle(770.0) > 0.3 and errors[1] < 1e-5 and errors[1] < min(errors[0], errors[2])
+
+
+REFUSED = {
+    "by = 'force' is not known: use angle or torque": {"by": "force"},
+    "must be of length 1": {"axis": (0.0, 0.0, 2.0)},
+    "needs ascending times": {"turn": (0.0, 1.0), "times": (1.0, 1.0)},
+    "fewer than two nodes": {"nodes": jnp.array([3])},
+}
+
+
+@pytest.mark.parametrize("sentence", REFUSED)
+def test_what_no_plate_can_use_is_refused(rig, sentence):
+    with pytest.raises(lj.InputError, match=sentence):
+        _plate(rig, **REFUSED[sentence]).check(rig.mesh, "plate.0")
+
+
+def test_a_factorisation_is_refused(rig):
+    scene = lj.Scene(
+        mesh=rig.mesh,
+        law=lj.laws.typical("neo_hookean"),
+        physics=(_plate(rig),),
+        solve=lj.Solve(linear_solver="direct"),
+    )
+    with pytest.raises(lj.InputError, match="knows no nodes that move together: use cg"):
+        lj.simulate(scene)
