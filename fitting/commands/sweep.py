@@ -59,6 +59,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
+        "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m]; it widens the errors of moduli"
+    )
+    command.add_argument(
         "--density", type=float, metavar="KG_M3", help="of the sample: simulate its inertia (default: none)"
     )
     command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
@@ -108,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
     sweep = rheometer.without_inertia(sweep, options.radius, options.height)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
-    fits = _fits(options, sweep)
+    fits, sweep = _fits(options, sweep)
     profile = None
     if options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
@@ -146,6 +149,11 @@ def _check(options: argparse.Namespace) -> None:
         if value is not None and not 0 < value <= 0.2:
             meant = f"{value / 1000:g}" if 0.2 < value <= 200 else "0.004"
             raise InputError(f"--{name} {value} cannot be a plate {name} in metres: give e.g. --{name} {meant}")
+    if options.gap_error is not None and not (options.height and 0 <= options.gap_error < options.height):
+        raise InputError(
+            f"--gap-error {options.gap_error:g} is the gap's standard deviation in metres: give --height, and an error "
+            "below it"
+        )
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form":
@@ -207,22 +215,34 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
     return models.choose(sweep, options.model, prony, dense)
 
 
-def _fits(options: argparse.Namespace, sweep: "Sweep") -> list["Fit"]:
-    """The closed form, and after it the fit through the simulation if asked for."""
-    from fitting.fits import edges, viscoelastic
+def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
+    """The closed form, and after it the fit through the simulation if asked for; the sweep that they fit."""
+    from fitting.fits import edges, instrument, viscoelastic
     from fitting.methods import generalised_maxwell
 
     if options.modes != "auto":
         viscoelastic.check_modes(sweep, options.modes)
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    closed = edges.honest(_closed(options, sweep, dense), sweep, dense)
-    if options.method == "closed-form":
-        return [closed]
+    closed, corrected = instrument.without_error_of_inertia(_closed(options, sweep, dense), sweep)
+    for note in corrected.notes[len(sweep.notes) :]:
+        print(f"note: {note}", file=sys.stderr)
+    fits = [edges.honest(closed, corrected, dense)]
+    if options.method != "closed-form":
+        fits.append(_simulated(options, corrected, fits[0]))
+    if options.gap_error:
+        fits = [instrument.with_gap_error(fit, options.gap_error / _simulation(options).height) for fit in fits]
+    return fits, corrected
+
+
+def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit") -> "Fit":
+    """The fit through the torsion simulation."""
+    from fitting.fits import viscoelastic
+
     simulation = _simulation(options)
     bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
     with bar:
-        return [closed, viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)]
+        return viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)
 
 
 def _simulation(options: argparse.Namespace) -> "Simulation":

@@ -383,8 +383,9 @@ OF_THE_DATA = (
     "Kramers-Kronig",
     "half decade",
     "structured misfit",
+    "poses as inertia",
 )
-KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency")
+KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency", "instrument")
 
 
 def through_torsion(

@@ -22,6 +22,9 @@ class Sweep(NamedTuple):
     source: str = ""
     notes: tuple[str, ...] = ()  # what the reader changed or chose, sentences
     raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], where the file has them
+    inertia: np.ndarray | None = (
+        None  # (n,) [Pa] what the instrument subtracted for its inertia, where raw columns tell
+    )
     grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out for the instrument's sake
 
     @property
@@ -68,7 +71,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
 
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     """The points where `kept` (n,) is true."""
-    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")
+    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia")
     columns: dict[str, Any] = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
     raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
     return sweep._replace(**columns, raw=raw)
@@ -86,6 +89,7 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     found = raw_torque.share(sweep.angular_frequency, G, sweep.raw, geometry)
     if found is None:
         return sweep
+    sweep = sweep._replace(inertia=found.modulus)
     unknown = raw_torque.UNCERTAINTY * found.modulus
     lost = unknown > np.abs(G)
     k = int(np.argmax(found.modulus / np.abs(G)))

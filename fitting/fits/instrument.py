@@ -1,0 +1,148 @@
+"""What the instrument adds to a fit: errors that all points share, each a number of its own with a prior.
+
+The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K where I is off by delta. Fitted without a
+prior, such a term takes up whatever the model misses. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
+is found from raw columns alone, and it is used only if it stays the same when the end of the band is left out.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fitting.fits import viscoelastic
+from fitting.fits.edges import HALF_DECADE
+from fitting.fits.viscoelastic import Fit
+from fitting.methods import host, uncertainty
+from fitting.methods.estimate import Estimate, errors_and_correlation
+from fitting.readers import raw_torque
+from fitting.readers.frequency_sweep import Sweep, some
+
+#: Rounds of fit and correction.
+ROUNDS = 4
+
+
+class InertiaError(NamedTuple):
+    """How far the inertia that was subtracted is off, relative."""
+
+    value: float
+    standard_error: float
+    part: float | None  # the same without the last half decade; None where too few points are left
+    part_error: float | None
+
+    @property
+    def steady(self) -> bool:
+        """It does not move with the band by more than two standard errors of the shorter one."""
+        return (
+            self.part is not None and self.part_error is not None and abs(self.value - self.part) <= 2 * self.part_error
+        )
+
+
+def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
+    """The fit of Prony modes with the error of the instrument's inertia beside them, and the sweep corrected by it.
+
+    Both are as they were where there are no raw columns, or the model is another one. Where the error moves with the
+    band, it is reported and not used.
+    """
+    if sweep.inertia is None or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
+        return fit, sweep
+    value, error, refitted = _found(fit, sweep)
+    kept = sweep.angular_frequency < sweep.angular_frequency[-1] / HALF_DECADE * (1 - 1e-9)
+    part: tuple[Any, Any] = (None, None)
+    if len(np.unique(sweep.angular_frequency[kept])) > len(fit.solution.u) // 2 + 1:
+        shorter = some(sweep, kept)
+        part = _found(viscoelastic.closed_form(shorter, fit.modes), shorter)[:2]
+    found = InertiaError(value, error, *part)
+    details = fit.details | {"instrument": numbers(found)}
+    if not found.steady:
+        moved = "too few points are left to check it" if found.part is None else f"it is {_percent(found.part)} there"
+        told = (
+            f"the instrument's inertia seems off by {_percent(value)} (standard error {_percent(error)}), but not "
+            f"without the last half decade ({moved}): the misfit of the model poses as inertia, so it is not corrected"
+        )
+        return fit._replace(details=details, warnings=(*fit.warnings, told)), sweep
+    corrected = _shifted(sweep, value)
+    note = (
+        f"the inertia that the instrument subtracted is taken to be off by {_percent(value)} (standard error "
+        f"{_percent(error)}, prior {_percent(raw_torque.UNCERTAINTY)}), and the storage moduli are corrected for it"
+    )
+    corrected = corrected._replace(notes=(*sweep.notes, note))
+    spread = _with_direction(refitted, corrected, error)
+    return refitted._replace(details=refitted.details | details, uncertainty=spread), corrected
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.2g} %"
+
+
+def numbers(found: InertiaError) -> dict[str, Any]:
+    """The part `instrument` of fit.json."""
+    return {
+        "inertia_off_by": found.value,
+        "standard_error": found.standard_error,
+        "prior_standard_deviation": raw_torque.UNCERTAINTY,
+        "without_last_half_decade": found.part,
+        "moves_with_the_band": not found.steady,
+    }
+
+
+def _direction(sweep: Sweep) -> np.ndarray:
+    """What an error of 1 does to the residuals (2n,)."""
+    assert sweep.inertia is not None
+    return np.concatenate([sweep.inertia, np.zeros(len(sweep.inertia))]) / np.concatenate(sweep.deviations)
+
+
+def _shifted(sweep: Sweep, value: float) -> Sweep:
+    assert sweep.inertia is not None
+    return sweep._replace(storage=sweep.storage + value * sweep.inertia)
+
+
+def _found(fit: Fit, sweep: Sweep) -> tuple[float, float, Fit]:
+    """The error of the inertia, its standard error, and the fit to the moduli that it corrects."""
+    value = 0.0
+    for _ in range(ROUNDS):
+        here = _shifted(sweep, value)
+        J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
+        noise = max(fit.uncertainty.noise, 1e-12)
+        d = _direction(here)
+        own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # what the modes cannot follow
+        precision = own @ own / noise**2 + raw_torque.UNCERTAINTY**-2
+        # The prior is of the whole error, the residuals are of what is left of it.
+        step = (own @ r / noise**2 - value / raw_torque.UNCERTAINTY**2) / precision
+        value, error = value + step, precision**-0.5
+        corrected = _shifted(sweep, value)
+        if np.any(corrected.storage <= 0):  # a sweep that is the instrument's
+            return value - step, error, fit
+        fit = viscoelastic.modes_from(corrected, fit.solution.u[None], fit.kind)._replace(details=fit.details)
+        if abs(step) < 1e-3 * error:
+            break
+    return float(value), float(error), fit
+
+
+def _with_direction(fit: Fit, sweep: Sweep, error: float) -> Estimate:
+    """The estimate with the part of its errors that the inertia's error causes."""
+    J = np.asarray(fit.solution.jacobian)
+    _, slope = host.with_jacobian(
+        lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
+    )
+    moved = slope @ np.linalg.lstsq(J, _direction(sweep), rcond=1e-12)[0]
+    return _wider(fit.uncertainty, moved * error)
+
+
+def with_gap_error(fit: Fit, relative: float) -> Fit:
+    """The fit with the error of the gap, which is that of all moduli together; ratios and times do not feel it."""
+    modes = fit.modes
+    first = np.concatenate([fit.uncertainty.values[:1], np.zeros(2 * modes)])
+    own = fit.parameters
+    if own is not None:
+        moduli = np.array([unit.startswith("Pa") for unit in fit.kind.units])
+        own = _wider(own, np.where(moduli, relative * own.values, 0.0))
+    details = fit.details | {"gap_error": relative}
+    return fit._replace(uncertainty=_wider(fit.uncertainty, relative * first), parameters=own, details=details)
+
+
+def _wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
+    """With one more source of error (P,), independent of the others."""
+    root = np.column_stack([estimate.root, direction])
+    errors, correlation = errors_and_correlation(root)
+    lost = ~np.isfinite(estimate.standard_errors)
+    return estimate._replace(root=root, standard_errors=np.where(lost, np.inf, errors), correlation=correlation)
