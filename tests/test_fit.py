@@ -308,6 +308,18 @@ def test_torsion_fit_recovers_table_2(coarse_torsion):
     assert f.details["geometry_factor"] > 1.3  # a mesh this coarse is far too stiff, and corrected
 
 
+def test_the_table_says_what_the_simulation_adds(coarse_torsion):
+    _, closed, simulated = coarse_torsion
+    errors = simulated.uncertainty.standard_errors
+    near = simulated._replace(
+        uncertainty=simulated.uncertainty._replace(values=closed.uncertainty.values + 0.03 * errors)
+    )
+    assert viscoelastic.largest_shift(closed, near) == pytest.approx(0.03)
+    assert "agree within 3 % of the standard errors" in sweep_report._agreement([closed, near])[0]
+    far = simulated._replace(uncertainty=simulated.uncertainty._replace(values=closed.uncertainty.values + 2 * errors))
+    assert "moves a number by 2 standard errors" in sweep_report._agreement([closed, far])[0]
+
+
 def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
     _, _, f = coarse_torsion
     assert warned(f, "discretisation moves it by")

@@ -489,6 +489,14 @@ def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law,
     }
 
 
+def largest_shift(closed: Fit, simulated: Fit) -> float:
+    """Largest change of a parameter by the simulation, over its standard error."""
+    shift = np.abs(simulated.uncertainty.values - closed.uncertainty.values)
+    errors = simulated.uncertainty.standard_errors
+    known = np.isfinite(errors) & (shift > 1e-6 * np.abs(closed.uncertainty.values))
+    return float(np.max(shift[known] / np.maximum(errors[known], 1e-300), initial=0.0))
+
+
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
     """Where the simulation moves a parameter by more than its standard error, and why."""
     shift = simulated.uncertainty.values - closed.uncertainty.values

@@ -10,7 +10,7 @@ import numpy as np
 
 from fitting.fits import edges, models
 from fitting.fits.posterior import Posterior
-from fitting.fits.viscoelastic import Fit
+from fitting.fits.viscoelastic import Fit, largest_shift
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
@@ -19,6 +19,8 @@ from fitting.reports import posterior_report
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
 
+#: Part of a standard error up to which closed form and simulation say the same.
+AGREED = 0.1
 MARK = "* moves by more than its error without the first or the last half decade"
 
 
@@ -119,6 +121,7 @@ def write(
     content["band_sensitivity"] = band_sensitivity(fits[0])
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
+        content["largest_shift_over_standard_error"] = largest_shift(*fits)
     if profile is not None:  # of the closed form, whichever method leads
         content.get("closed_form", content)["profile_intervals_95"] = profile
     if posterior is not None:
@@ -320,4 +323,17 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
     width = max(len(r) for r in columns[0]) + 3
     rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
     decided = [MARK] if any(edges.moved(fit) for fit in fits) else []
-    return "\n".join([*rows, *decided, *models.table(fits[0])])
+    return "\n".join([*rows, *decided, *_agreement(fits), *models.table(fits[0])])
+
+
+def _agreement(fits: list[Fit]) -> list[str]:
+    """What the simulation adds, in one line."""
+    if len(fits) < 2:
+        return []
+    shift, seconds = largest_shift(*fits), fits[-1].run_time + fits[-1].compile_time
+    if shift > AGREED:
+        return [f"the simulation moves a number by {shift:.2g} standard errors, in {seconds:.2g} s"]
+    return [
+        f"closed form and simulation agree within {100 * max(shift, 1e-3):.1g} % of the standard errors: the "
+        f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form says the same"
+    ]
