@@ -90,6 +90,25 @@ def test_no_folder_holds_more_than_a_dozen_files():
     assert not {name: n for name, n in held.items() if n > 13}
 
 
+#: Functions that users call by keyword: more than six parameters, each with a default or a name of its own.
+PUBLIC_AND_LONG = {"estimate", "fit", "moduli", "param"}
+MOST_PARAMETERS, MOST_LINES = 6, 60
+
+
+def _functions(tree: ast.Module) -> list[ast.FunctionDef]:
+    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+
+
+@pytest.mark.parametrize("module", TREES)
+def test_functions_take_few_parameters_and_fit_a_screen(module):
+    for function in _functions(TREES[module]):
+        a = function.args
+        names = [x.arg for x in (*a.posonlyargs, *a.args, *a.kwonlyargs) if x.arg not in ("self", "cls")]
+        assert len(names) <= MOST_PARAMETERS or function.name in PUBLIC_AND_LONG, f"{function.name}: {names}"
+        lines = function.end_lineno - function.lineno + 1
+        assert lines <= MOST_LINES, f"{function.name} has {lines} lines"
+
+
 def _public(tree: ast.Module) -> list:
     kinds = (ast.FunctionDef, ast.ClassDef)
     top = [n for n in tree.body if isinstance(n, kinds) and not n.name.startswith("_")]

@@ -280,7 +280,7 @@ def test_inertia_against_the_torsional_wave(law, prony, cell_size, verified):
 def test_state_holds_only_the_physics_there_is(rig, law, prony):
     def carried(rig, prony):
         drive = Drive()
-        state = torsion._initial(rig, law, prony, 1.0, 0.1, drive, jnp.ones(n), jnp.array(1j))
+        state = torsion._initial(torsion._Oscillation(rig, law, prony, 1.0, 1.0, drive), jnp.ones(n), jnp.array(1j))
         return [leaf.shape for leaf in jax.tree.leaves(state)]
 
     n, E = 3 * (rig.mesh.number_of_nodes - rig.bottom - rig.top) + 1, rig.mesh.number_of_elements

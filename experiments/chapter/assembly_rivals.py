@@ -56,7 +56,8 @@ def chapter(mesh: TetMesh, law: Any, x: jax.Array, constant: list | None = None,
     """Six terms for every product, section 4.1.2, with `constant` matrices stored or computed on the fly."""
     F = _kept(write)(deformation_gradient(mesh, x))
     force = mjed.nodal_force(mesh, chapter_terms.first_piola(law, F))
-    return force, _entries(mesh, chapter_terms.blocks(law, F, _shape_vectors(mesh), PAIRS, False, constant, write))
+    layout = chapter_terms.Layout(constant, write)
+    return force, _entries(mesh, chapter_terms.blocks(law, F, _shape_vectors(mesh), PAIRS, False, layout))
 
 
 def stored_matrices(mesh: TetMesh) -> list:

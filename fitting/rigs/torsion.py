@@ -281,64 +281,67 @@ def scene_of(rig: Rig, law: Law, prony: Prony | None, omega: Any, amplitude: Any
 # -- time stepping -----------------------------------------------------------------------------------------------------
 
 
-def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearised) -> tuple[Run, jax.Array]:
+class _Oscillation(NamedTuple):
+    """One oscillation: what turns, and how it is driven."""
+
+    rig: Rig
+    law: Law
+    prony: Prony | None
+    omega: Any  # [rad/s]
+    amplitude: Any  # [N m] or [rad]
+    drive: Drive
+
+    @property
+    def by_torque(self) -> bool:
+        """Whether the torque is given, and the angle solved for."""
+        return self.drive.by == "torque"
+
+    @property
+    def dt(self) -> Any:
+        """Time step [s]."""
+        return 2 * jnp.pi / (self.omega * self.drive.steps)
+
+    def positions(self, q: jax.Array) -> jax.Array:
+        """Positions (V, 3) [m] of all coordinates."""
+        return _positions(self.rig, *_unpack(self.rig, q))
+
+    def full(self, q: jax.Array, t: Any) -> jax.Array:
+        """All coordinates at time t, of those that are solved for."""
+        if self.by_torque:
+            return q
+        return jnp.append(q, self.rig.radius * self.amplitude * jnp.sin(self.omega * t))
+
+    def solved_part(self, q: jax.Array) -> jax.Array:
+        """The coordinates that are solved for, of all."""
+        return q if self.by_torque else q[:-1]
+
+
+class _Cycle(NamedTuple):
+    """The steady cycle of the linearised discrete problem, and what its solution rests on."""
+
+    steady: _Response
+    arc: Any  # complex amplitude of the last coordinate [m]
+    inverse: jax.Array  # of the elastic stiffness of what is solved for
+
+    def at(self, omega: Any, t: Any) -> jax.Array:
+        """Coordinates at time t [s]."""
+        return jnp.real(self.steady.shape * (self.arc * jnp.exp(1j * omega * t)))
+
+
+def _oscillate(o: _Oscillation, rest: _Linearised) -> tuple[Run, jax.Array]:
     """The run, and the bias of the mesh at this frequency (complex where only the isochoric part relaxes)."""
-    mesh, by_torque = rig.mesh, drive.by == "torque"
-    n_steps = drive.steps * drive.cycles
-    dt = 2 * jnp.pi / (omega * drive.steps)
-    modulus = 1.0 if prony is None else 1 - jnp.sum(viscosity.complex_ratios(prony, omega, dt), axis=0)
+    rig, drive = o.rig, o.drive
+    modulus = 1.0 if o.prony is None else 1 - jnp.sum(viscosity.complex_ratios(o.prony, o.omega, o.dt), axis=0)
     steady = _steady(rest, modulus)
     # A sin(w t) = Re(-i A e^(i w t)); the complex arc of the linearised discrete problem.
-    arc = -1j * amplitude * (1 / (steady.stiffness * rig.radius) if by_torque else rig.radius)
-    inverse = jax.lax.stop_gradient(rest.inverse if by_torque else _without_last(rest.inverse))
-    physics, free = _physics(rig, law, prony), Free(jnp.ones_like(mesh.points))
-
-    def predicted(t):
-        """Coordinates of the linear solution at time t."""
-        return jnp.real(steady.shape * (arc * jnp.exp(1j * omega * t)))
-
-    def full(q, t):
-        return q if by_torque else jnp.append(q, rig.radius * amplitude * jnp.sin(omega * t))
-
-    def solved_part(q):
-        return q if by_torque else q[:-1]
-
-    def step(carry, t):
-        q_old, memories = carry
-        begin = Step(mesh, _positions(rig, *_unpack(rig, q_old)), 1, n_steps, dt, True, drive.options.tolerance, free)
-        solid, *nodal = (p.freeze(memory, begin) for p, memory in zip(physics, memories, strict=True))
-
-        def forces(q):
-            x = _positions(rig, *_unpack(rig, q))
-            f = mjed.nodal_force(mesh, solid.stress(deformation_gradient(mesh, x)))
-            f = sum((a.force(mesh, x, 1.0) for a in nodal), f)
-            return _pack(rig, *_generalised(rig, x, f))
-
-        load = jnp.zeros_like(q_old)
-        if by_torque:
-            load = load.at[-1].set(amplitude * jnp.sin(omega * t) / rig.radius)
-        # The linear solution moves on; what the last step deviated from it is kept.
-        guess = predicted(t) + (q_old - predicted(t - dt))
-        q, statistics = newton.solve(
-            lambda v: solved_part(forces(full(v, t)) - load),
-            solved_part(guess),
-            lambda r: inverse @ r,
-            jnp.abs(steady.stiffness * arc),
-            drive.options,
-        )
-        q = full(q, t)
-        torque = load[-1] * rig.radius if by_torque else forces(q)[-1] * rig.radius
-        x = _positions(rig, *_unpack(rig, q))
-        end, each = End(x, deformation_gradient(mesh, x), None), zip(physics, memories, (solid, *nodal), strict=True)
-        memories = tuple(p.advance(memory, acting, end) for p, memory, acting in each)
-        _, lift, angle = _unpack(rig, q)
-        return (q, memories), (angle, torque, lift, statistics)
-
-    q, memories = _initial(rig, law, prony, omega, dt, drive, steady.shape, arc)
-    times = dt * jnp.arange(1, n_steps + 1)
-    _, (angle, torque, lift, statistics) = jax.lax.scan(step, (q, memories), times)
+    arc = -1j * o.amplitude * (1 / (steady.stiffness * rig.radius) if o.by_torque else rig.radius)
+    inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
+    cycle = _Cycle(steady, arc, inverse)
+    q, memories = _initial(o, steady.shape, arc)
+    times = o.dt * jnp.arange(1, drive.steps * drive.cycles + 1)
+    _, (angle, torque, lift, statistics) = jax.lax.scan(partial(_step, o, cycle), (q, memories), times)
     _, lift_0, angle_0 = _unpack(rig, q)
-    torque_0 = 0.0 if by_torque else rig.radius * jnp.real(steady.stiffness * arc) * (drive.start == "cycle")
+    torque_0 = 0.0 if o.by_torque else rig.radius * jnp.real(steady.stiffness * arc) * (drive.start == "cycle")
     run = Run(
         jnp.append(0.0, times),
         jnp.append(angle_0, angle),
@@ -346,7 +349,42 @@ def _oscillate(rig, law, prony, omega, amplitude, drive: Drive, rest: _Linearise
         jnp.append(lift_0, lift),
         statistics,
     )
-    return run, steady.stiffness / (modulus * _exact_stiffness(rig, law))
+    return run, steady.stiffness / (modulus * _exact_stiffness(rig, o.law))
+
+
+def _step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
+    """One time step: coordinates and memories, then angle, torque, lift and what Newton did."""
+    (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
+    physics, free = _physics(rig, o.law, o.prony), Free(jnp.ones_like(mesh.points))
+    steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
+    begin = Step(mesh, o.positions(q_old), 1, steps, o.dt, True, tolerance, free)
+    solid, *nodal = (p.freeze(memory, begin) for p, memory in zip(physics, memories, strict=True))
+
+    def forces(q):
+        x = o.positions(q)
+        f = mjed.nodal_force(mesh, solid.stress(deformation_gradient(mesh, x)))
+        f = sum((a.force(mesh, x, 1.0) for a in nodal), f)
+        return _pack(rig, *_generalised(rig, x, f))
+
+    load = jnp.zeros_like(q_old)
+    if o.by_torque:
+        load = load.at[-1].set(o.amplitude * jnp.sin(o.omega * t) / rig.radius)
+    # The linear solution moves on; what the last step deviated from it is kept.
+    guess = cycle.at(o.omega, t) + (q_old - cycle.at(o.omega, t - o.dt))
+    q, statistics = newton.solve(
+        lambda v: o.solved_part(forces(o.full(v, t)) - load),
+        o.solved_part(guess),
+        lambda r: cycle.inverse @ r,
+        jnp.abs(cycle.steady.stiffness * cycle.arc),
+        o.drive.options,
+    )
+    q = o.full(q, t)
+    torque = load[-1] * rig.radius if o.by_torque else forces(q)[-1] * rig.radius
+    x = o.positions(q)
+    end, each = End(x, deformation_gradient(mesh, x), None), zip(physics, memories, (solid, *nodal), strict=True)
+    memories = tuple(p.advance(memory, acting, end) for p, memory, acting in each)
+    _, lift, angle = _unpack(rig, q)
+    return (q, memories), (angle, torque, lift, statistics)
 
 
 def _without_last(inverse: jax.Array) -> jax.Array:
@@ -361,29 +399,28 @@ def _physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, ...]:
     return (solid,) if rig.density is None else (solid, Inertia(density=rig.density, integrator="newmark"))
 
 
-def _initial(rig, law, prony, omega, dt, drive, shape, arc):
+def _initial(o: _Oscillation, shape: jax.Array, arc: Any) -> tuple[jax.Array, tuple]:
     """Coordinates at time 0, and what the physics remember: at rest, or on the cycle of the linearised problem."""
-    on_cycle = drive.start == "cycle"
-    mesh = rig.mesh
+    rig, prony, on_cycle, mesh = o.rig, o.prony, o.drive.start == "cycle", o.rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
     if prony is not None and on_cycle:
 
         def S(q):
-            return viscosity.relaxing_stress(prony, law, deformation_gradient(mesh, _positions(rig, *_unpack(rig, q))))
+            return viscosity.relaxing_stress(prony, o.law, deformation_gradient(mesh, o.positions(q)))
 
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
         if jnp.iscomplexobj(shape):  # a real shape needs the slope once: it is a fifth of the program
             S_shape += slope(jnp.imag(shape)) * 1j * arc
-        ratios = viscosity.complex_ratios(prony, omega, dt)
+        ratios = viscosity.complex_ratios(prony, o.omega, o.dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
-        history = viscosity.History(gamma, None if history.stress is None else jnp.real(S_shape))
+        history = viscosity.History(gamma, None if prony.scheme == "backward_euler" else jnp.real(S_shape))
     if rig.density is None:
         return q, (history,)
-    _, field = jax.linearize(lambda q: _positions(rig, *_unpack(rig, q)), jnp.zeros_like(q))
+    _, field = jax.linearize(o.positions, jnp.zeros_like(q))
     on = 1.0 if on_cycle else 0.0
-    return q, (history, Motion(*(field(on * jnp.real(c * shape * arc)) for c in (1j * omega, -(omega**2)))))
+    return q, (history, Motion(*(field(on * jnp.real(c * shape * arc)) for c in (1j * o.omega, -(o.omega**2)))))
 
 
 @partial(jax.jit, static_argnames="drive")
@@ -398,7 +435,7 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Any, amplitude: An
         amplitude: [N m] if driven by torque, [rad] if by angle.
         drive: static.
     """
-    return _oscillate(rig, law, prony, omega, amplitude, drive, _linearise(rig, law, prony))[0]
+    return _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), _linearise(rig, law, prony))[0]
 
 
 def demodulate(run: Run, omega: Any, drive: Drive) -> tuple[jax.Array, jax.Array]:
@@ -429,7 +466,7 @@ def moduli(
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
 
     def one(omega, amplitude):
-        run, bias = _oscillate(rig, law, prony, omega, amplitude, drive, rest)
+        run, bias = _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), rest)
         torque, angle = demodulate(run, omega, drive)
         G = 2 * rig.height / (jnp.pi * rig.radius**4) * torque / angle / (bias if corrected else 1.0)
         defect = jnp.abs(run.angle[-1] - run.angle[-1 - drive.steps]) / jnp.abs(angle)

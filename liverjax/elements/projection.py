@@ -102,7 +102,7 @@ def blocks(
         fibres = invariant_terms.fibre_invariants(law.summands())
         for key, part in fibres.items():
             a = green_terms.components(part.fibre, F[0][0])
-            added.append(_fibre(weight, slopes[key], curvatures.get((key, key), 0.0), a, F, D, pairs))
+            added.append(_fibre(weight * slopes[key], weight * curvatures.get((key, key), 0.0), a, F, D, pairs))
         _gather(first, weight, {k: v for k, v in slopes.items() if k not in fibres})
         _gather(second, weight, {k: v for k, v in curvatures.items() if not set(k) & set(fibres)})
         for part in law.summands():
@@ -153,11 +153,11 @@ def _diagonal(value: Any) -> Matrix:
     return ((value, zero, zero), (zero, value, zero), (zero, zero, value))
 
 
-def _fibre(weight: Any, W4: Any, W44: Any, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+def _fibre(W4: Any, W44: Any, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa, the positive part of each eigenvalue."""
     Fa = matvec(F, a)
-    across = jnp.maximum(2 * weight * W4, 0.0)
-    along = jnp.maximum(2 * weight * W4 + 4 * weight * W44 * dot(Fa, Fa), 0.0)
+    across = jnp.maximum(2 * W4, 0.0)
+    along = jnp.maximum(2 * W4 + 4 * W44 * dot(Fa, Fa), 0.0)
     size = dot(Fa, Fa)
     line = scale_matrix((along - across) / jnp.where(size > 0, size, 1.0), outer(Fa, Fa))
     both = add_matrices(_diagonal(across), line)

@@ -15,7 +15,7 @@ from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.nodal import integrals, summed
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers import block_matrix, preconditioner
-from liverjax.solvers.krylov import chebyshev, differentiable_solve
+from liverjax.solvers.krylov import Known, chebyshev, differentiable_solve
 from liverjax.solvers.preconditioner import Coarse
 from liverjax.tensors.matrices import Matrix, dot
 
@@ -73,7 +73,7 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
         return r / diagonal + slow((r,))[0]
 
     D = jax.lax.stop_gradient(diagonal)
-    return differentiable_solve(apply, b, precondition, flow.tolerance, 2000, diagonal=D)
+    return differentiable_solve(apply, b, precondition, flow.tolerance, 2000, Known(diagonal=D))
 
 
 def _product(flow: Flow, p: jax.Array) -> jax.Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from liverjax.core import status
-from liverjax.solvers.krylov import differentiable_solve
+from liverjax.solvers.krylov import Known, differentiable_solve
 from liverjax.solvers.minimisation import minimise, untangled
 from liverjax.solvers.problem import (
     LINEAR_TOLERANCE,
@@ -129,7 +129,7 @@ def solve(
         K = problem.tangent(q, one, jax.lax.stop_gradient(problem.residual(q, one)[2]), some)
         limits = (jnp.maximum(_ADJOINT * options.tolerance, 1e-13), MOST_LINEAR_ITERATIONS)
         solver = None if problem.adjoint is None else lambda b: problem.adjoint(K, b, *limits)
-        return differentiable_solve(linear, y, problem.preconditioner(K), *limits, problem.symmetric, solver)
+        return differentiable_solve(linear, y, problem.preconditioner(K), *limits, Known(problem.symmetric, solver))
 
     root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)
     code, iterations, linear, cuts = (n.astype(jnp.int32) for n in statistics[:4])
@@ -146,7 +146,7 @@ def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptio
     at = (start, zero, by)
     finest = 16 * float(jnp.finfo(start.dtype).eps)
     wanted = jnp.clip(0.3 * options.tolerance, finest, _ONE_STEP)
-    dq, linear, kept, _ = _direction(problem, options, kept, at, load, wanted, True, True)
+    dq, linear, kept, _ = _direction(problem, kept, at, load, wanted, (True, True))
     q = start + dq
     r, force, _ = problem.residual(q, one)
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
@@ -315,7 +315,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     forcing = jnp.where(v.launch_now, LINEAR_TOLERANCE, jnp.maximum(reach, jnp.maximum(goal, 1e-12)))
     forcing = jnp.minimum(forcing, LINEAR_TOLERANCE)
     at = (trial, s, by)
-    dq, linear, kept, positive = _direction(problem, options, c.kept, at, load, forcing, renew, v.go_on)
+    dq, linear, kept, positive = _direction(problem, c.kept, at, load, forcing, (renew, v.go_on))
     return _Point(
         q=jnp.where(v.accepted, trial, c.q),
         size=jnp.where(v.accepted, size, c.size),
@@ -350,10 +350,13 @@ def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
 
 
 def _direction(
-    problem: Problem, options: StepOptions, kept: Kept, at: Any, load: jax.Array, forcing: Any, renew: Any, wanted: Any
+    problem: Problem, kept: Kept, at: Any, load: jax.Array, forcing: Any, when: tuple[Any, Any]
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
-    """Solution of dr/dq dq = load to `forcing`, its iterations, the tangent it is of and whether that is positive."""
-    near = (kept.made & ~kept.worn, kept.tangent)
+    """Solution of dr/dq dq = load to `forcing`, its iterations, the tangent it is of and whether that is positive.
+
+    `when`: whether the tangent is made anew, and whether a solution is wanted.
+    """
+    near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at
     K = jax.lax.cond(renew, lambda: problem.tangent(q, s, by, near), lambda: kept.tangent)
     dq, linear, positive = jax.lax.cond(

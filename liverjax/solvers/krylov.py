@@ -121,25 +121,31 @@ def true_residual(matvec: Callable[[jax.Array], jax.Array], b: jax.Array, x: jax
     return jnp.linalg.norm(b - matvec(x)) / jnp.where(scale > 0, scale, 1.0)
 
 
+class Known(NamedTuple):
+    """What is known of the matrix A of `differentiable_solve`."""
+
+    symmetric: bool = True
+    #: b -> solution for a symmetric A, and the true residual over |b|; None: iterations find it.
+    solver: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
+    diagonal: jax.Array | None = None  # of an A whose entries beside it add up to no more
+
+
 def differentiable_solve(
     matvec: Callable[[jax.Array], jax.Array],
     b: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
     tolerance: Any,
     max_iterations: int,
-    symmetric: bool = True,
-    solver: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None,
-    diagonal: jax.Array | None = None,
+    known: Known = Known(),
 ) -> jax.Array:
     """A solve as a linear map of `b`: its derivatives are solves as well, not derivatives of the iterations.
-
-    `solver` (b) solves the same by itself, for a symmetric A, and tells the true residual over |b|.
 
     Conjugate gradients for a symmetric A, positive definite as theirs; otherwise BiCGSTAB. NaN where the true residual
     stays above 6e-6 |b| (float32: 1e-3) and ten times the tolerance: no wrong solution passes for one. With the
     `diagonal` D of an A whose entries beside it add up to no more, a solution that iterations found is as good as its
     digits allow where the residual is below 4 eps |D x|: x rounded to them has eps |D x|.
     """
+    symmetric, solver, diagonal = known
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients
 
     def solve(matvec, b):

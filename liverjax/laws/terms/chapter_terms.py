@@ -105,25 +105,31 @@ def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, Any]]
     return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
 
 
+class Layout(NamedTuple):
+    """What is kept in memory; the default is the fastest (experiments/chapter)."""
+
+    #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes; None: computed where they are used.
+    constant: list | None = None
+    #: Write what blocks share to memory, as `invariant_terms` does; here the compiler does better without.
+    write: bool = False
+
+
 def blocks(
     law: Any,
     F: Matrix,
     D: list[Vector],
     pairs: tuple,
     regularised: bool = False,
-    constant: list | None = None,
-    write: bool = False,
+    layout: Layout = Layout(),
 ) -> list[Matrix]:
     """d2W/dx_i dx_j per reference volume: G + H + I + Lambda + M + R of every k, and phi'' of a function of the sum.
 
-    `regularised` changes the G of every product (not phi''). `constant` is `constant_matrices(D, pairs)`, stored in
-    advance as the chapter proposes; without it they are computed here, which is faster (experiments/chapter).
-    `write` writes what blocks share to memory, as `invariant_terms` does; here the compiler does better without.
+    `regularised` changes the G of every product (not phi'').
     """
-    keep = _written if write else lambda values: values
+    keep = _written if layout.write else lambda values: values
     s = keep(_at(law, F))
     nodes = keep([_node(s, d) for d in D])
-    constant = constant_matrices(D, pairs) if constant is None else constant
+    constant = constant_matrices(D, pairs) if layout.constant is None else layout.constant
     return [_block(s, nodes[i], nodes[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
 
 
