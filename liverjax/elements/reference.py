@@ -3,16 +3,20 @@
 Independent of the hand-derived terms: everything here starts from `law.strain_energy` alone. Slow on purpose.
 """
 
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 
 from liverjax.elements.mjed import sparse
 from liverjax.laws.autodiff import derivative, first_piola, tangent
 from liverjax.laws.base import Law
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 __all__ = [
     "energy",
@@ -49,7 +53,7 @@ def _hessians(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     return derivative(jax.grad(total), x[jnp.stack(mesh.element_nodes, axis=1)])
 
 
-def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
+def stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
     """Hessian of the total energy by forward over reverse mode, element by element, (3V, 3V) [N/m]."""
     return sparse(mesh, np.asarray(_hessians(mesh, law, x)))
 
@@ -82,7 +86,7 @@ def _standard_entries(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     return whole.reshape(-1, *whole.shape[-5:]).sum(axis=0)
 
 
-def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> scipy.sparse.csr_array:
+def standard_stiffness_matrix(mesh: TetMesh, law: Law, x: jax.Array) -> "scipy.sparse.csr_array":
     """Standard finite elements: B^T D B plus the geometric term, (3V, 3V) [N/m] (Zienkiewicz and Taylor 2000)."""
     return sparse(mesh, np.asarray(_standard_entries(mesh, law, x)))
 

@@ -4,18 +4,19 @@ SciPy's SuperLU: time and memory grow faster than the mesh (n^1.5 to n^2), so th
 """
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 
 def solve(A: BlockMatrix, free: jax.Array, b: jax.Array, normals: jax.Array | None = None) -> jax.Array:
@@ -51,8 +52,10 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack([jnp.zeros_like(like) if e is None else e for e in row]) for row in blocks])
 
 
-def _across(normals: np.ndarray, size: int) -> scipy.sparse.csr_array:
+def _across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     """n n^T of every node, in the order of the unknowns, (size, size)."""
+    import scipy.sparse  # a fifth of the time that importing the package takes: here and below only where it is used
+
     number, own = len(normals), np.arange(len(normals))
     entries = [
         (normals[:, r] * normals[:, c], (r * number + own, c * number + own)) for r in range(3) for c in range(3)
@@ -62,6 +65,8 @@ def _across(normals: np.ndarray, size: int) -> scipy.sparse.csr_array:
 
 
 def _solve(rows: Any, diagonal: Any, nodes: Any, free: Any, b: Any, normals: Any) -> np.ndarray:
+    import scipy.sparse
+
     rows, diagonal, nodes, free, b = (np.asarray(a) for a in (rows, diagonal, nodes, free, b))
     m, n = b.shape
     own = np.arange(n)
@@ -76,6 +81,8 @@ def _solve(rows: Any, diagonal: Any, nodes: Any, free: Any, b: Any, normals: Any
 
 
 def _solve_points(order: int, *given: Any) -> np.ndarray:
+    import scipy.sparse
+
     blocks, nodes, own, coupled, free, b, normals = jax.tree.map(np.asarray, given)
     n, c = b.shape[1], basis(order).c
     pairs = [(a, b) for a in (1, 2, 3) for b in (1, 2, 3) if a <= b]
@@ -111,6 +118,8 @@ def _solve_points(order: int, *given: Any) -> np.ndarray:
 
 def _factorised(A: Any, free: np.ndarray, b: np.ndarray, normals: Any, mean: float) -> np.ndarray:
     """Solution (n,) of A x = b where `free` (n,) is not 0; `mean` stands for A along the normals."""
+    import scipy.sparse.linalg
+
     if normals is not None:
         N = _across(np.asarray(normals), len(b))
         inside = scipy.sparse.eye_array(len(b)) - N
