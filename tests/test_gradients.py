@@ -201,7 +201,11 @@ def test_a_step_keeps_no_more_than_its_state_and_root():
     sizes = []
     for steps in (20, 120):
         longer = replace(scene, solve=replace(scene.solve, steps=steps))
-        program = gradients._program(_sum, "all", "reverse").lower(longer, {"law.mu": jnp.asarray(770.0)}).compile()
+        program = (
+            gradients._program_of_gradient(_sum, "all", "reverse")
+            .lower(longer, {"law.mu": jnp.asarray(770.0)})
+            .compile()
+        )
         sizes.append(program.memory_analysis().temp_size_in_bytes)
         predicted = gradients.memory(longer)
     a_step = (sizes[1] - sizes[0]) / 100

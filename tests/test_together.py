@@ -116,11 +116,11 @@ def test_the_driven_column_is_the_one_that_is_held(tmp_path):
 
 def test_points_on_a_straight_drive_are_not_needed():
     """A ramp, a hold, a ramp down: their three corners and ends say it all."""
-    from fitting.fits.time_tests import _corners
+    from fitting.fits.time_tests import _corners_in_time
 
     time = np.sort(np.concatenate([np.linspace(0, 10, 101), [3.33]]))
     driven = np.interp(time, [0, 2, 6, 10], [0, 1, 1, 0.5])
-    assert np.allclose(time[_corners(time, driven)], [0, 2, 6, 10])
+    assert np.allclose(time[_corners_in_time(time, driven)], [0, 2, 6, 10])
 
 
 @pytest.mark.parametrize(

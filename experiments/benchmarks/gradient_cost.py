@@ -64,7 +64,7 @@ def measure(model: str, steps: int, store: str) -> dict:
     """One row, in this process."""
     scene, mu = scene_of(model, steps), jnp.asarray(770.0)
     kept = int(store) if store.isdigit() else store
-    program = gradients._program(loss, kept, "reverse").lower(scene, {"law.mu": mu})
+    program = gradients._program_of_gradient(loss, kept, "reverse").lower(scene, {"law.mu": mu})
     begin = time.perf_counter()
     program = program.compile()
     compiling = time.perf_counter() - begin

@@ -73,10 +73,10 @@ def _problem(options: argparse.Namespace) -> Problem:
 
 def run(options: argparse.Namespace) -> int:
     """Find a map, or a few numbers, of scenes; 1 if a solve or the fit did not converge."""
-    return (_map if options.parameters is None else _numbers)(options, _problem(options))
+    return (_map if options.parameters is None else _fit_few_numbers)(options, _problem(options))
 
 
-def _numbers(options: argparse.Namespace, problem: Problem) -> int:
+def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
     names = options.parameters.split(",")
     for name in names:
         numbers_at(problem.scenes[0], name)

@@ -22,7 +22,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.set_defaults(kind=kind)
     command.add_argument("file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text")
-    command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
+    command.add_argument(
+        "--modes", type=_modes_in_time, default="auto", help="number of relaxation modes, or auto (default)"
+    )
     command.add_argument(
         "--ramp", type=float, default=0.0, metavar="S", help="seconds of the ramp, where no column has it"
     )
@@ -37,7 +39,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     return command
 
 
-def _modes(text: str) -> int | str:
+def _modes_in_time(text: str) -> int | str:
     try:
         return text if text == "auto" else int(text)
     except ValueError:

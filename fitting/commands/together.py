@@ -20,7 +20,7 @@ def run(options: argparse.Namespace) -> int:
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
-    tests = [_sweep(options, options.sweep[0]), *(_any(options, path) for path in options.others)]
+    tests = [_read_one_sweep(options, options.sweep[0]), *(_any(options, path) for path in options.others)]
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     return 0 if found.converged else 1
 
 
-def _sweep(options: argparse.Namespace, path: Path) -> "Measured":
+def _read_one_sweep(options: argparse.Namespace, path: Path) -> "Measured":
     from fitting.readers import rheometer
 
     sweep = rheometer.within(rheometer.read_sweep(path, options.table), options.min_frequency, options.max_frequency)

@@ -83,7 +83,7 @@ def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dic
 
 
 @partial(jax.jit, static_argnames="name")
-def _cost(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
+def _cost_of_map(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
     """chi^2/2, its gradient by m, and the codes."""
 
     def half(m):
@@ -105,7 +105,7 @@ class _Search:
         """(chi^2 + |z|^2)/2 and its gradient."""
         deviation = DEVIATIONS[self.k]
         m = deviation * smooth.to_nodes(self.p, z)
-        (half, codes), g = _cost(self.problem, self.base, jnp.asarray(m), self.name)
+        (half, codes), g = _cost_of_map(self.problem, self.base, jnp.asarray(m), self.name)
         half, g = float(half), np.asarray(g)
         self.evaluations += 1
         if not (np.isfinite(half) and np.all(np.isfinite(g)) and not np.any(np.asarray(codes) == status.NOT_FINITE)):
@@ -181,12 +181,12 @@ def estimate(
     search = _Search(problem, name, base, p, file, progress)
     if resume and file is not None:
         search.read()
-    _weights(search, max_iterations)
+    _deviations_in_turn(search, max_iterations)
     deviation = DEVIATIONS[search.k]
     m = deviation * smooth.to_nodes(p, search.z)
     search.cost(search.z)
     asked = _Asked.at(search, deviation, m)
-    values, vectors = _known(asked, len(m), modes)
+    values, vectors = _measured_directions(asked, len(m), modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
     return Field(
         name=name,
@@ -194,7 +194,7 @@ def estimate(
         modulus=np.asarray(values_at(problem, name, base, jnp.asarray(m))[name]),
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
-        mesh_bias=_bias(search, asked, m, values, vectors) if mesh_error else None,
+        mesh_bias=_bias_of_map(search, asked, m, values, vectors) if mesh_error else None,
         deviation=deviation,
         length=length,
         chi2=search.chi2,
@@ -207,7 +207,7 @@ def estimate(
     )
 
 
-def _weights(search: _Search, max_iterations: int) -> None:
+def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
     """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
     while True:
         begin, before = time.perf_counter(), search.evaluations
@@ -267,7 +267,7 @@ class _Asked(NamedTuple):
         return self.gradient(self.push(dm))
 
 
-def _known(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
+def _measured_directions(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
     k = min(modes, n - 2, jax.eval_shape(asked.push, jnp.zeros(n)).size)
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=asked.product, dtype=float)
@@ -276,7 +276,9 @@ def _known(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
-def _bias(search: _Search, asked: _Asked, m: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
+def _bias_of_map(
+    search: _Search, asked: _Asked, m: np.ndarray, values: np.ndarray, vectors: np.ndarray
+) -> np.ndarray | None:
     """What the meshes move the field m (V,): (I + J^T J)^-1 J^T of what they leave out of the residuals."""
     left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, jnp.asarray(m)))
     if left_out is None or not np.all(np.isfinite(left_out)):

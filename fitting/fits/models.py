@@ -186,7 +186,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
     able = [fit for fit in tried if identifiable(fit, sweep)] or tried
     chosen = min(able, key=information_criterion)
     return chosen._replace(
-        warnings=(*chosen.warnings, *_near(chosen, tried, able)),
+        warnings=(*chosen.warnings, *_rival_models(chosen, tried, able)),
         run_time=sum(fit.run_time for fit in tried),
         compile_time=sum(fit.compile_time for fit in tried),
         details=chosen.details | {"models_compared": _compared(sweep, tried)},
@@ -211,7 +211,7 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: row["information_criterion"])
 
 
-def _near(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
+def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     """Sentences where another model explains the data about as well, or better with numbers that stay free."""
     best, out = min(tried, key=information_criterion), []
     if information_criterion(best) < information_criterion(chosen) - STRONG:

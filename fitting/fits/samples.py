@@ -53,11 +53,11 @@ def fit(
     dense = [generalised_maxwell.refuse_impossible(s) for s in sweeps]
     tried: list[_Candidate] = []
     if model in ("prony", "auto"):
-        tried += _modes(sweeps, dense, modes, progress)
+        tried += _modes_for_all(sweeps, dense, modes, progress)
     if model in ("fractional", "auto"):
         progress("springpots")
         for fits in zip(*(models.fractional(s) for s in sweeps), strict=True):
-            tried.append(_candidate(sweeps, list(fits), {"model": fits[0].kind.name}))
+            tried.append(_candidate_for_all(sweeps, list(fits), {"model": fits[0].kind.name}))
     able = [c for c in tried if c.able] or tried
     best = min(able, key=lambda c: c.criterion)
     progress("ends of the band")
@@ -66,15 +66,17 @@ def fit(
     rows = [c.label | {"above_the_lowest": c.criterion - lowest, "identifiable": c.able} for c in tried]
     compared = sorted(rows, key=lambda row: row["above_the_lowest"])
     populations = _populations(fits)
-    return Samples(sweeps, fits, populations, _typical(sweeps, fits, populations), compared)
+    return Samples(sweeps, fits, populations, _typical_sample(sweeps, fits, populations), compared)
 
 
-def _candidate(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Candidate:
+def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Candidate:
     determined = [models.identifiable(f, s) for f, s in zip(fits, sweeps, strict=True)]
     return _Candidate(label, fits, sum(map(information_criterion, fits)), 2 * sum(determined) >= len(fits))
 
 
-def _modes(sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable) -> list[_Candidate]:
+def _modes_for_all(
+    sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
+) -> list[_Candidate]:
     """Prony modes, their number raised until the summed criterion twice fails to fall."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
@@ -87,7 +89,7 @@ def _modes(sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progres
     for n in numbers:
         progress(f"{n} modes")
         fits = [viscoelastic.closed_form(s, n, d) for s, d in zip(sweeps, dense, strict=True)]
-        tried.append(_candidate(sweeps, fits, {"model": "prony", "modes": n}))
+        tried.append(_candidate_for_all(sweeps, fits, {"model": "prony", "modes": n}))
         lower = tried[-1].able and tried[-1].criterion <= min(c.criterion for c in tried)
         failures = 0 if lower or len(tried) == 1 else failures + 1
         exact = max(np.max(f.relative_errors(s)) for f, s in zip(fits, sweeps, strict=True)) < viscoelastic.EXACT
@@ -105,7 +107,7 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     return out
 
 
-def _typical(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
+def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
     """Prony modes at the means of the population; where there is none, modes stay out and other numbers are medians."""
     kind, middle = fits[0].kind, {n: float(np.median([edges.values(f)[n][0] for f in fits])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

@@ -145,7 +145,7 @@ def _single(label: str, typical: Law) -> Candidate:
         u = np.where(positive, near, middle * np.exp(rng.standard_normal((n, len(names)))))
         # An exponent alpha may have either sign; other free numbers are coefficients.
         alpha = np.array([m == "alpha" for m in names])
-        return np.where(alpha, _exponents(rng, (n, len(names))), u)
+        return np.where(alpha, _exponents_of_law(rng, (n, len(names))), u)
 
     def law(p):
         return replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
@@ -189,14 +189,14 @@ def _shear_modulus(law: Law) -> float:
         return float(law.tangent(jnp.eye(3))[0, 1, 0, 1])
 
 
-def _exponents(rng: np.random.Generator, shape: tuple) -> np.ndarray:
+def _exponents_of_law(rng: np.random.Generator, shape: tuple) -> np.ndarray:
     return rng.choice([-1.0, 1.0], shape) * np.exp(rng.uniform(np.log(0.5), np.log(30.0), shape))
 
 
 def _ogden_starts(rng: np.random.Generator, n: int, terms: int) -> np.ndarray:
     share = rng.dirichlet(np.ones(terms), n)
     return np.concatenate(
-        [np.log(share + 1e-3) + 0.5 * rng.standard_normal((n, terms)), _exponents(rng, (n, terms))], 1
+        [np.log(share + 1e-3) + 0.5 * rng.standard_normal((n, terms)), _exponents_of_law(rng, (n, terms))], 1
     )
 
 
@@ -278,7 +278,7 @@ def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale:
     misfit = r[:n]
     values = np.asarray(candidate.values(jnp.asarray(u), scale))
     noise = noise_factor(misfit, n - p, deviations_given=False)
-    limits = _limits(candidate, values, scale)
+    limits = _run_away(candidate, values, scale)
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
     # Of a parameter at its limit nothing more is known; the others' errors are those of the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
@@ -349,7 +349,7 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     return told
 
 
-def _limits(candidate: Candidate, values: np.ndarray, scale: float) -> dict[str, str]:
+def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[str, str]:
     """Parameters that ran away: far from every start, whose spread is a few times their typical size."""
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)

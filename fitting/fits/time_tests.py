@@ -90,7 +90,7 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the data may be a fluid's
         begin = max(numbers.start, solid.modes - 1)
         tried += _raised(test, rows, range(begin, numbers.stop), FLUID)
-    return _told(_chosen(tried, test), test, tried)
+    return _told(_chosen_model(tried, test), test, tried)
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
@@ -98,7 +98,7 @@ def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> lis
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:
-        tried.append(_one(test, rows, n, kind))
+        tried.append(_one_model(test, rows, n, kind))
         lower = criterion(tried[-1]) < best and (len(tried) == 1 or identifiable(tried[-1], test))
         best, failures = (criterion(tried[-1]), 0) if lower else (best, failures + 1)
         if failures == 2 or np.max(tried[-1].relative_errors) < viscoelastic.EXACT:
@@ -106,7 +106,7 @@ def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> lis
     return tried
 
 
-def _chosen(tried: list[TimeFit], test: TimeTest) -> TimeFit:
+def _chosen_model(tried: list[TimeFit], test: TimeTest) -> TimeFit:
     return min([f for f in tried if identifiable(f, test)] or tried, key=criterion)
 
 
@@ -121,7 +121,7 @@ def identifiable(fit: TimeFit, test: TimeTest) -> bool:
     return fit.converged and not uncertainty.superfluous(test, fit.uncertainty)
 
 
-def _one(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
+def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
     function, data = residuals_of(test, kind)
     scales = data[-1]
     best = viscoelastic.best_of(levenberg_marquardt, function)
@@ -136,14 +136,14 @@ def _one(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
 def residuals_of(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
     """Residuals (m,) of u and of the data that come second, for Prony modes of a solid or a fluid."""
     rows = thinned(test)
-    kept = _corners(test.time, test.driven)
+    kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
     places = np.cumsum(kept)[rows] - 1
     data = (test.time[kept], test.driven[kept], places, test.answer[rows], _scales(test, rows))
     return _residuals(test.kind, kind.name), data
 
 
-def _corners(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
+def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
     """Points (n,) that the drive needs: where it is straight on both sides, the point between says nothing."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])

@@ -70,7 +70,7 @@ class Together(NamedTuple):
         return len(self.model.ratios)
 
 
-def _numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
+def _reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
     """Arrays that predict a test, its measured numbers and their scales."""
     if isinstance(test, Sweep):
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
@@ -79,7 +79,7 @@ def _numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=32)
-def _residuals(kinds: tuple[str, ...], fluid: bool) -> Callable[..., jax.Array]:
+def _all_residuals(kinds: tuple[str, ...], fluid: bool) -> Callable[..., jax.Array]:
     """(u, data of every test) -> residuals of all tests, one below the other."""
     natural = generalised_maxwell.natural_fluid if fluid else generalised_maxwell.natural
 
@@ -109,20 +109,22 @@ def fit(
     """
     tests = list(tests)
     band = Band(_resolved(tests))
-    largest = (sum(len(_numbers(t)[1]) for t in tests) - 2) // 2
+    largest = (sum(len(_reported_numbers(t)[1]) for t in tests) - 2) // 2
     if modes != "auto" and not 1 <= int(modes) <= largest:
         raise InputError(f"--modes {modes} is out of range: give 1 to {largest} for these files, or auto")
     top = min(uncertainty.supported_modes(band), largest)
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
-    tried = _raised(tests, band, numbers, Kind(), progress)
+    tried = _raised_together(tests, band, numbers, Kind(), progress)
     solid = min(tried, key=_criterion)
     stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
     if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the tests may be of a fluid
-        tried += _raised(tests, band, range(max(numbers.start, solid.modes - 1), numbers.stop), FLUID, progress)
+        tried += _raised_together(
+            tests, band, range(max(numbers.start, solid.modes - 1), numbers.stop), FLUID, progress
+        )
     able = [f for f in tried if _able(f, band)] or tried
     chosen = min(able, key=_criterion)
     progress("what each test adds")
-    return _told(chosen, tried, band)
+    return _told_of_all(chosen, tried, band)
 
 
 def _resolved(tests: list[Measured]) -> tuple[float, float]:
@@ -130,13 +132,15 @@ def _resolved(tests: list[Measured]) -> tuple[float, float]:
     return float(ends[:, 0].min()), float(ends[:, 1].max())
 
 
-def _raised(tests: list[Measured], band: Band, numbers: range, kind: Kind, progress: Callable) -> list[Together]:
+def _raised_together(
+    tests: list[Measured], band: Band, numbers: range, kind: Kind, progress: Callable
+) -> list[Together]:
     """Fits of rising number of modes until the criterion twice fails to fall."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
         progress(f"{n} modes")
-        tried.append(_one(tests, band, n, kind))
+        tried.append(_one_test(tests, band, n, kind))
         lower = _criterion(tried[-1]) < best and (len(tried) == 1 or _able(tried[-1], band))
         best, failures = (_criterion(tried[-1]), 0) if lower else (best, failures + 1)
         if failures == 2:
@@ -154,12 +158,12 @@ def _criterion(fit: Together) -> float:
     return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + len(fit.solution.u) * np.log(total))
 
 
-def _one(tests: list[Measured], band: Band, modes: int, kind: Kind) -> Together:
+def _one_test(tests: list[Measured], band: Band, modes: int, kind: Kind) -> Together:
     """Fit and weights in turn, for one number of modes."""
-    parts = [_numbers(t) for t in tests]
-    function = _residuals(tuple(map(name_of, tests)), kind.name == FLUID.name)
+    parts = [_reported_numbers(t) for t in tests]
+    function = _all_residuals(tuple(map(name_of, tests)), kind.name == FLUID.name)
     best = viscoelastic.best_of(levenberg_marquardt, function)
-    starts = _starts(tests, band, modes, kind)
+    starts = _starts_of_all(tests, band, modes, kind)
     noise, compiling, running = np.full(len(tests), 0.03), 0.0, 0.0
     for _ in range(ROUNDS):
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
@@ -192,7 +196,7 @@ def _noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.
     return np.array(out)
 
 
-def _starts(tests: list[Measured], band: Band, modes: int, kind: Kind) -> np.ndarray:
+def _starts_of_all(tests: list[Measured], band: Band, modes: int, kind: Kind) -> np.ndarray:
     """Times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
     low, high = np.log(band.resolved)
     rng = np.random.default_rng(0)
@@ -225,7 +229,7 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return A / b[:, None], np.ones(len(b))
 
 
-def _told(chosen: Together, tried: list[Together], band: Band) -> Together:
+def _told_of_all(chosen: Together, tried: list[Together], band: Band) -> Together:
     """With the shares of the tests, the table of what was tried, and the sentences that a user should read."""
     begin = time.perf_counter()
     chosen = chosen._replace(shares=_shares(chosen))
@@ -266,13 +270,13 @@ def _shares(fit: Together) -> list[Share]:
 
     Tests without weight are taken out by infinite deviations: the program is there already.
     """
-    parts = [_numbers(t) for t in fit.tests]
+    parts = [_reported_numbers(t) for t in fit.tests]
     counts = [len(y) for _, y, _ in parts]
     place = np.repeat(np.arange(len(parts)), counts)
-    function = _residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
+    function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
     best = viscoelastic.best_of(levenberg_marquardt, function)
     u = np.asarray(fit.solution.u)
-    starts = np.concatenate([u[None], _starts(fit.tests, Band(_resolved(fit.tests)), fit.modes, fit.kind)[1:]])
+    starts = np.concatenate([u[None], _starts_of_all(fit.tests, Band(_resolved(fit.tests)), fit.modes, fit.kind)[1:]])
     vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
     jacobian = np.asarray(fit.solution.jacobian)
     out = []

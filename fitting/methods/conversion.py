@@ -30,7 +30,7 @@ class Conversion(NamedTuple):
     error: float  # largest of G' and G'', relative, at the model it was made for
 
 
-def _columns(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:
+def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:
     x = omega[:, None] * times
     A = np.vstack([x**2 / (1 + x**2), x / (1 + x**2)])
     rest = np.concatenate([np.ones(len(omega)), np.zeros(len(omega))])
@@ -54,7 +54,7 @@ def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float,
         for margin in MARGINS:
             ends = (10**margin / low, 10**-margin / high)
             times = np.geomspace(*ends, modes) if modes > 1 else np.array([np.sqrt(ends[0] * ends[1])])
-            A = _columns(omega, times, solid)
+            A = _columns_of_modes(omega, times, solid)
             strengths, _ = non_negative(A / target[:, None], np.ones(len(target)))
             error = float(np.abs(A @ strengths / target - 1).max())
             if best is None or error < best[0]:

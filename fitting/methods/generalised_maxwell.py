@@ -45,10 +45,12 @@ def natural(u: Array) -> Maxwell:
     below one); log of the longest time, then log of the gaps between log times (so they descend).
     """
     n = (u.shape[-1] - 1) // 2
-    return Maxwell(arrays_of(u).exp(u[..., 0]), _shares(u[..., 1 : n + 1])[..., :n], _times(u[..., n + 1 :]))
+    return Maxwell(
+        arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1 : n + 1])[..., :n], _times_of_gaps(u[..., n + 1 :])
+    )
 
 
-def _shares(logits: Array) -> Array:
+def _softmax_shares(logits: Array) -> Array:
     """Softmax of logits (N,) and of a last one that is 0, (N + 1,)."""
     xp = arrays_of(logits)
     logits = xp.concatenate([logits, xp.zeros((*logits.shape[:-1], 1), logits.dtype)], axis=-1)
@@ -56,7 +58,7 @@ def _shares(logits: Array) -> Array:
     return share / xp.sum(share, axis=-1, keepdims=True)
 
 
-def _times(u: Array) -> Array:
+def _times_of_gaps(u: Array) -> Array:
     """Descending relaxation times (N,) of the log of the first and the logs of the gaps between their logs."""
     xp = arrays_of(u)
     gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(xp.exp(u[..., 1:]), axis=-1)], axis=-1)
@@ -82,7 +84,7 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 def natural_fluid(u: Array) -> Maxwell:
     """Model without an equilibrium modulus of u (2N,): as `natural`, the last mode in place of the equilibrium part."""
     n = u.shape[-1] // 2
-    return Maxwell(arrays_of(u).exp(u[..., 0]), _shares(u[..., 1:n]), _times(u[..., n:]))
+    return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
 
 def fluid_residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:

@@ -46,7 +46,7 @@ class State(NamedTuple):
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
 
 
-def _steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
+def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
     """Damped step, the gain of cost it promises, and that of the undamped step; one singular value decomposition."""
     xp = host.arrays_of(J)
     scale = xp.maximum(xp.linalg.norm(J, axis=-2), 1e-300)
@@ -93,7 +93,7 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
     u, r = (xp.where(better[..., None], new, old) for new, old in ((s.trial, s.u), (r, s.r)))
     J = xp.where(better[..., None, None], J, s.J)
     cost = xp.minimum(cost, xp.where(better, cost_new, cost))
-    step, predicted, left = _steps(J, r, damping)
+    step, predicted, left = _damped_steps(J, r, damping)
     # No step, however short, lowers the cost: at roundoff that is as converged as the arithmetic allows.
     exhausted = damping > MAX_DAMPING
     at_roundoff = xp.isfinite(cost_new) & ((left <= 1e-4 * cost) | (cost <= 1e-14 * r.shape[-1]))
@@ -211,6 +211,6 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     found = jax.scipy.optimize.minimize(cost, start, method="BFGS", options={"gtol": gtol, "maxiter": 1000})
     r, J = with_jacobian(residuals)(found.x, *data)
     s = accept(begin(found.x, r.shape[0]), r, J)
-    _, _, left = _steps(J, r, s.damping)
+    _, _, left = _damped_steps(J, r, s.damping)
     near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the latter: exact to any data's digits
     return solution(s._replace(iterations=jnp.asarray(found.nit), converged=s.converged | near))

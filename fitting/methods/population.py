@@ -30,8 +30,8 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     if known.sum() < 2:
         return None
     y, v = np.log(values[known]), np.maximum((errors / values)[known] ** 2, 1e-24)
-    variance = _between(y, v)
-    mean, sd = _mean(y, v, variance)
+    variance = _variance_between(y, v)
+    mean, sd = _weighted_mean(y, v, variance)
     n = len(y)
     half = float(scipy.stats.t.ppf(0.975, n - 1)) * sd
     half_new = float(scipy.stats.t.ppf(0.975, max(1, n - 2))) * float(np.hypot(np.sqrt(variance), sd))
@@ -48,7 +48,7 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     )
 
 
-def _between(y: np.ndarray, v: np.ndarray) -> float:
+def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
     """Variance between samples, of the largest restricted likelihood."""
     top = 10 * float(np.var(y, ddof=1)) + 1e-24
 
@@ -65,7 +65,7 @@ def _between(y: np.ndarray, v: np.ndarray) -> float:
     return float(scipy.optimize.minimize_scalar(minus, bounds=ends, method="bounded", options={"xatol": 1e-9 * top}).x)
 
 
-def _mean(y: np.ndarray, v: np.ndarray, variance: float) -> tuple[float, float]:
+def _weighted_mean(y: np.ndarray, v: np.ndarray, variance: float) -> tuple[float, float]:
     """Weighted mean and its standard error from the scatter that is there, not below the one that the errors give."""
     w = 1 / (v + variance)
     mean = float(np.sum(w * y) / np.sum(w))

@@ -149,7 +149,7 @@ def starts(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
     size = np.log(np.hypot(sweep.storage, sweep.loss))
     half = 0.5 * np.log(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
     typical = float(np.clip(2 / np.pi * np.arctan(np.median(sweep.loss / sweep.storage)), 0.02, 0.6))
-    ordered = [_crossing(np.median(size), typical, alpha, c * half) for alpha in (0.95, 0.65) for c in _CROSSINGS]
+    ordered = [_softer_pot(np.median(size), typical, alpha, c * half) for alpha in (0.95, 0.65) for c in _CROSSINGS]
     k = max(0, count - len(ordered))
     alpha, other = rng.uniform(0.05, 0.95, k), rng.uniform(0.02, 0.9, (2, k))
     pot = np.log(np.median(sweep.loss)) - np.log(np.sin(0.5 * np.pi * alpha)) + rng.uniform(-1, 1, k)
@@ -166,7 +166,7 @@ def _logit(p: np.ndarray | float) -> np.ndarray:
     return np.log(p / (1 - np.asarray(p)))
 
 
-def _crossing(level: float, smaller: float, alpha: float, log_x: float) -> list[float]:
+def _softer_pot(level: float, smaller: float, alpha: float, log_x: float) -> list[float]:
     """A pot of exponent `alpha` that is as stiff as one of exponent `smaller` at log_x."""
     ratio = float(_logit(min(smaller / alpha, 0.95)))
     return [level, ratio, level - (alpha - smaller) * log_x, float(_logit(alpha)), level, ratio]

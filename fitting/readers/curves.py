@@ -54,7 +54,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     """
     curves, notes = [], []
     for file in files:
-        rows = _rows(file)
+        rows = _rows_of_curves(file)
         found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
         curves += found
         if not named:
@@ -67,7 +67,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     return curves, notes
 
 
-def _rows(file: Path) -> list[dict[str, str]]:
+def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     try:
         data = file.read_bytes()
         workbook.refuse(file, data, "the sheet of the curves")
@@ -141,7 +141,7 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
     kind = _kind(F)
     several = len(measured) > 1
     return [
-        _curve(file, f"{file.stem}{f', P{i + 1}{j + 1}' if several else ''}", kind, F, (i, j), values)
+        _one_curve(file, f"{file.stem}{f', P{i + 1}{j + 1}' if several else ''}", kind, F, (i, j), values)
         for (i, j), values in measured.items()
     ], named
 
@@ -178,11 +178,11 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
         label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
         component = (0, 1) if shear else (0, 0)
-        curves.append(_curve(file, label, test, F, component, column[1] * _column(file, group, column[0])))
+        curves.append(_one_curve(file, label, test, F, component, column[1] * _column(file, group, column[0])))
     return curves, column[2]
 
 
-def _curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, stress: np.ndarray) -> Curve:
+def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, stress: np.ndarray) -> Curve:
     J = np.linalg.det(F)
     worst = int(np.argmax(np.abs(J - 1)))
     if abs(J[worst] - 1) > 1e-3:

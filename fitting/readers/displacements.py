@@ -54,7 +54,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     path = Path(path)
     if unit not in UNITS:
         raise InputError(f"--unit {unit!r} is not known: use one of {', '.join(UNITS)}")
-    table = _table(path)
+    table = _table_of_nodes(path)
     mesh, scale = scene.mesh, UNITS[unit]
     n = len(table["ux"])
     measured = scale * np.stack([table[c] for c in ("ux", "uy", "uz")], axis=1)
@@ -84,7 +84,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     )
 
 
-def _table(path: Path) -> dict[str, np.ndarray]:
+def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of an empty file

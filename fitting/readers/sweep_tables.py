@@ -100,7 +100,7 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
         name = _title(lines[free : k - 1])
         columns, k = _with_unit_row(columns, lines, k, delimiter)
         above = k
-        rows, numbers, k = _rows(path, columns, lines, k, delimiter, len(cells))
+        rows, numbers, k = _rows_below(path, columns, lines, k, delimiter, len(cells))
         if rows:
             units = [split_cells(line, delimiter) for line in lines[headers[-1] : above]]
             raw = _raw(cells, units, [split_cells(lines[n - 1], delimiter) for n in numbers], delimiter)
@@ -144,7 +144,7 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
     return columns, k
 
 
-def _rows(path, columns, lines, k, delimiter, width):
+def _rows_below(path, columns, lines, k, delimiter, width):
     """Rows of numbers below a header, their line numbers, and where to go on."""
     needed = [c for c in columns if c.quantity in NEEDED]
     rows, numbers = [], []

@@ -111,16 +111,16 @@ def read(
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
     """
-    columns, notes = _columns(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     time = columns["time"]
     if np.any(np.diff(time) <= 0) or time[0] < 0:
         k = int(np.argmax(np.diff(time) <= 0)) + 1
         order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
         raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
-    if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own(kind)):
+    if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own_table(kind)):
         raise InputError(
-            f"{path}: a {kind} test needs, beside time, {_own(kind)}, or strain and stress, angle and torque, or "
+            f"{path}: a {kind} test needs, beside time, {_own_table(kind)}, or strain and stress, angle and torque, or "
             f"displacement and force; the file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
@@ -137,7 +137,7 @@ def read(
 
 def kind_of(path: str | os.PathLike) -> str:
     """ "relaxation" or "creep": by the modulus or compliance, or by which of two columns is held, the other moving."""
-    columns, _ = _columns(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    columns, _ = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
     if len(form) == 1:
         return "relaxation" if form == ("modulus",) else "creep"
@@ -146,17 +146,17 @@ def kind_of(path: str | os.PathLike) -> str:
     return "relaxation" if moves[0] <= moves[1] else "creep"
 
 
-def _own(kind: str) -> str:
+def _own_table(kind: str) -> str:
     return "modulus" if kind == "relaxation" else "compliance"
 
 
-def _columns(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
+def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
     """Columns in SI of the first table that has time and an answer, and notes."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found = _heading(cells)
         if "time" in found and any(set(f) <= set(found) for f in FORMS):
-            rows, units = _rows(path, lines, k + 1, delimiter, found)
+            rows, units = _rows_in_time(path, lines, k + 1, delimiter, found)
             return _in_si(path, found, np.array(rows), units)
     first = next((line.strip() for line in lines if line.strip()), "")[:80]
     raise InputError(
@@ -176,22 +176,22 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
         for word, quantity in WORDS:
             if name.lower().startswith(word):
                 rest = name[len(word) :].strip()
-                if rest and not _known(quantity, rest):
+                if rest and not _known_column(quantity, rest):
                     break  # "strain rate", "stress (step)"
                 found.setdefault(quantity, (k, unit or rest or None))
                 break
     return found
 
 
-def _plain(unit: str) -> str:
+def _plain_heading(unit: str) -> str:
     return unit.replace("µ", "u").replace("μ", "u").replace("·", ".").replace("⋅", ".").strip('[]() "')
 
 
-def _known(quantity: str, unit: str) -> bool:
-    return _plain(unit) in UNITS[quantity]
+def _known_column(quantity: str, unit: str) -> bool:
+    return _plain_heading(unit) in UNITS[quantity]
 
 
-def _rows(path, lines, k, delimiter, found):
+def _rows_in_time(path, lines, k, delimiter, found):
     """Numbers below the header, and the units that a line of their own gives."""
     rows, units = [], {}
     needed = {q: place for q, (place, _) in found.items()}
@@ -203,7 +203,7 @@ def _rows(path, lines, k, delimiter, found):
         if all(v is not None for v in values):
             rows.append(values)
             continue
-        named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known(q, cells[p])}
+        named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
         if not rows and named:
             units = named
         elif rows and any(v is not None for v in values) and line.strip():
@@ -222,9 +222,9 @@ def _in_si(path, found, rows, units):
         if unit is None:
             unit = next(iter(UNITS[quantity]))
             notes.append(f"the column of {quantity} states no unit; {unit} is taken")
-        if not _known(quantity, unit):
+        if not _known_column(quantity, unit):
             raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(UNITS[quantity])}")
-        columns[quantity] = rows[:, j] * UNITS[quantity][_plain(unit)]
+        columns[quantity] = rows[:, j] * UNITS[quantity][_plain_heading(unit)]
     good = np.all(np.isfinite(rows), axis=1)
     if not good.all():
         notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a number in them is not finite")

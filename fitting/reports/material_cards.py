@@ -36,16 +36,16 @@ def _bulk(shear: float) -> float:
     return 2 * shear * (1 + POISSON) / (3 * (1 - 2 * POISSON))
 
 
-def _number(value: float) -> str:
+def _written_number(value: float) -> str:
     return f"{float(value):.10g}"
 
 
 def febio(model: Maxwell) -> str:
     """A viscoelastic material; g0 is the part that stays, so the elastic law is the instantaneous one."""
     G0, ratios, times = model
-    young = _number(2 * (1 + POISSON) * float(G0))
-    terms = [f"      <t{k}>{_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
-    terms += [f"      <g{k}>{_number(g)}</g{k}>" for k, g in enumerate(ratios, 1)]
+    young = _written_number(2 * (1 + POISSON) * float(G0))
+    terms = [f"      <t{k}>{_written_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
+    terms += [f"      <g{k}>{_written_number(g)}</g{k}>" for k, g in enumerate(ratios, 1)]
     return "\n".join(
         [
             '<?xml version="1.0" encoding="UTF-8"?>',
@@ -53,7 +53,7 @@ def febio(model: Maxwell) -> str:
             '<febio_spec version="4.0">',
             "  <Material>",
             '    <material id="1" name="tissue" type="viscoelastic">',
-            f"      <g0>{_number(max(0.0, 1 - float(np.sum(ratios))))}</g0>",
+            f"      <g0>{_written_number(max(0.0, 1 - float(np.sum(ratios))))}</g0>",
             *terms,
             '      <elastic type="neo-Hookean">',
             f"        <E>{young}</E>",
@@ -71,13 +71,15 @@ def abaqus(model: Maxwell) -> str:
     """Hyperelastic, instantaneous moduli, C10 = G0 / 2 and D1 = 2 / K; a line g, k, tau for each mode."""
     G0, ratios, times = model
     kept = np.asarray(ratios) * min(1.0, ABAQUS_SUM / max(float(np.sum(ratios)), 1e-300))
-    rows = [f"{_number(g)}, {_number(g)}, {_number(t)}" for g, t in zip(kept, times, strict=True)]
+    rows = [
+        f"{_written_number(g)}, {_written_number(g)}, {_written_number(t)}" for g, t in zip(kept, times, strict=True)
+    ]
     return "\n".join(
         [
             "** SI units: Pa, s. Add *DENSITY.",
             "*MATERIAL, NAME=TISSUE",
             "*HYPERELASTIC, NEO HOOKE, MODULI=INSTANTANEOUS",
-            f"{_number(float(G0) / 2)}, {_number(2 / _bulk(float(G0)))}",
+            f"{_written_number(float(G0) / 2)}, {_written_number(2 / _bulk(float(G0)))}",
             "*VISCOELASTIC, TIME=PRONY",
             *rows,
             "",
@@ -88,10 +90,10 @@ def abaqus(model: Maxwell) -> str:
 def ansys(model: Maxwell) -> str:
     """Mechanical APDL: neo-Hookean mu = G0, d = 2 / K; the same Prony pairs for shear and bulk, six numbers a line."""
     G0, ratios, times = model
-    pairs = [_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
+    pairs = [_written_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
     data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
     lines = ["! SI units: Pa, s. Add MP,DENS.", "TB,HYPER,1,1,2,NEO"]
-    lines.append(f"TBDATA,1,{_number(float(G0))},{_number(2 / _bulk(float(G0)))}")
+    lines.append(f"TBDATA,1,{_written_number(float(G0))},{_written_number(2 / _bulk(float(G0)))}")
     for option in ("SHEAR", "BULK"):
         lines += [f"TB,PRONY,1,1,{len(ratios)},{option}", *data]
     return "\n".join([*lines, ""])
@@ -103,10 +105,10 @@ def sofa(model: Maxwell) -> str:
     rest = float(G0) * (1 - float(np.sum(ratios)))
     shear = rest if rest > 1e-6 * float(G0) else float(G0)
     what = "equilibrium" if shear == rest else "instantaneous (the model is a fluid)"
-    modes = "; ".join(f"{_number(g)} {_number(t)}" for g, t in zip(ratios, times, strict=True))
+    modes = "; ".join(f"{_written_number(g)} {_written_number(t)}" for g, t in zip(ratios, times, strict=True))
     return (
         f"<!-- SI units: Pa, s. The {what} shear modulus: SOFA has no Prony series of its own.\n"
-        f"     G0 {_number(float(G0))}; ratio and relaxation time of each mode: {modes} -->\n"
+        f"     G0 {_written_number(float(G0))}; ratio and relaxation time of each mode: {modes} -->\n"
         '<TetrahedronHyperelasticityFEMForceField materialName="NeoHookean" '
-        f'ParameterSet="{_number(shear)} {_number(_bulk(shear))}" />\n'
+        f'ParameterSet="{_written_number(shear)} {_written_number(_bulk(shear))}" />\n'
     )

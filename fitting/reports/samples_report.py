@@ -16,17 +16,21 @@ from liverjax.core.versions import versions
 def write(out: Path, found: Samples) -> dict[str, Any]:
     """Write all three files; returns the JSON."""
     out.mkdir(parents=True, exist_ok=True)
-    content = numbers(_content(found))
+    content = numbers(_json_content(found))
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(found), out / "fit.png")
-    _store(out / "fit.h5", found, content)
+    _store_samples(out / "fit.h5", found, content)
     return content
 
 
-def _content(found: Samples) -> dict[str, Any]:
+def _json_content(found: Samples) -> dict[str, Any]:
     """On top the sample in the middle of the population, below it the population and every sample."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
-    own = {} if found.kind.values is None else {"parameters": {n: {"value": p.mean} for n, p in _known(found).items()}}
+    own = (
+        {}
+        if found.kind.values is None
+        else {"parameters": {n: {"value": p.mean} for n, p in _known_errors(found).items()}}
+    )
     rest = float(typical.shear_modulus * (1 - np.sum(np.asarray(typical.ratios))))
     return {
         "method": "closed-form",
@@ -39,7 +43,7 @@ def _content(found: Samples) -> dict[str, Any]:
         "relaxation_times": np.asarray(typical.relaxation_times).tolist(),
         **own,
         "population": {name: _population(p) for name, p in found.populations.items()},
-        "samples": [_sample(found, k) for k in range(len(found.fits))],
+        "samples": [_sample_entry(found, k) for k in range(len(found.fits))],
         "models_compared": found.compared,
         "mean_relative_error": float(errors.mean()),
         "max_relative_error": float(errors.max()),
@@ -54,7 +58,7 @@ def _pairs(found: Samples) -> zip:
     return zip(found.fits, found.sweeps, strict=True)
 
 
-def _known(found: Samples) -> dict[str, Any]:
+def _known_errors(found: Samples) -> dict[str, Any]:
     return {name: p for name, p in found.populations.items() if p is not None}
 
 
@@ -69,12 +73,12 @@ def _population(p: Any) -> dict[str, Any] | None:
     }
 
 
-def _sample(found: Samples, k: int) -> dict[str, Any]:
+def _sample_entry(found: Samples, k: int) -> dict[str, Any]:
     """The fit of one sample by itself, and its numbers drawn towards the population."""
     fit, sweep = found.fits[k], found.sweeps[k]
     pooled = {
         name: {"value": p.pooled[k], "standard_deviation_of_logarithm": p.pooled_errors[k]}
-        for name, p in _known(found).items()
+        for name, p in _known_errors(found).items()
     }
     more = {"data": sweep.source, "notes": list(sweep.notes), "pooled": pooled}
     return summary(fit, sweep) | {"band_sensitivity": band_sensitivity(fit)} | more
@@ -150,7 +154,7 @@ def figure(found: Samples) -> Any:
     left.plot([], [], "o-", color=ORANGE, ms=3, label="G'' measured and fitted")
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="modulus [Pa]")
     left.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.3)
-    known = _known(found)
+    known = _known_errors(found)
     for row, (name, p) in enumerate(known.items()):
         own = np.array([edges.values(f)[name][0] for f in found.fits]) / p.mean
         right.plot(own, np.full(len(own), row), "|", color=GREY, ms=9)
@@ -175,7 +179,7 @@ def _inside(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] <= value <= limits[1]
 
 
-def _store(path: Path, found: Samples, content: dict[str, Any]) -> None:
+def _store_samples(path: Path, found: Samples, content: dict[str, Any]) -> None:
     import h5py
 
     with h5py.File(path, "w") as file:

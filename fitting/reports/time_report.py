@@ -33,7 +33,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             "converged": fit.converged,
             "modes": n,
             "shear_modulus": float(fit.model.shear_modulus),
-            "equilibrium_modulus": _equilibrium(fit),
+            "equilibrium_modulus": _equilibrium_in_time(fit),
             "ratios": fit.model.ratios.tolist(),
             "relaxation_times": fit.model.relaxation_times.tolist(),
             "standard_errors": {
@@ -63,7 +63,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
     return content
 
 
-def _equilibrium(fit: TimeFit) -> float:
+def _equilibrium_in_time(fit: TimeFit) -> float:
     return max(0.0, float(fit.model.shear_modulus * (1 - fit.model.ratios.sum())))
 
 
@@ -73,7 +73,7 @@ def table(test: TimeTest, fit: TimeFit) -> str:
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
     rows.append(f"G0    {u.values[0]:11.5g} ± {u.standard_errors[0]:<9.2g} Pa")
     if fit.kind.name == "prony":
-        rows.append(f"G_inf {_equilibrium(fit):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
+        rows.append(f"G_inf {_equilibrium_in_time(fit):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
     for k in range(n):
         rows.append(f"g{k + 1:<4d} {u.values[1 + k]:11.5g} ± {u.standard_errors[1 + k]:<9.2g}".rstrip())
         rows.append(f"tau{k + 1:<2d} {u.values[1 + n + k]:11.5g} ± {u.standard_errors[1 + n + k]:<9.2g} s")

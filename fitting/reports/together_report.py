@@ -37,7 +37,7 @@ def write(out: Path, found: Together) -> dict[str, Any]:
             "correlation_names": list(u.names),
             "mean_relative_error": float(errors @ points / points.sum()),
             "max_relative_error": max(_largest(found)),
-            "tests": [_share(s, n) for s in found.shares],
+            "tests": [_share_of_test(s, n) for s in found.shares],
             "warnings": list(found.warnings),
             "run_time_s": found.run_time,
             "compile_time_s": found.compile_time,
@@ -62,7 +62,7 @@ def _by_name(values: np.ndarray, n: int) -> dict[str, Any]:
     }
 
 
-def _share(share: Share, n: int) -> dict[str, Any]:
+def _share_of_test(share: Share, n: int) -> dict[str, Any]:
     return {
         "test": share.name,
         "data": share.source,

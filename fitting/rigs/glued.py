@@ -141,7 +141,7 @@ def tension(radius: float, height: float, dt: float, strains: Any, cell_size: fl
     Raises:
         InputError: lengths or times that are not positive, strains that are not finite or flatten the sample.
     """
-    strains = _finite("strains", strains)
+    strains = _finite_history("strains", strains)
     if strains.min() <= -0.9:
         raise InputError(f"strains reach {strains.min():g}: keep them above -0.9")
     cells = _cells(radius, height, dt, cell_size)
@@ -161,7 +161,7 @@ def indentation(
     Raises:
         InputError: as of `tension`; a punch wider than the sample, or far narrower.
     """
-    depths = _finite("depths", depths)
+    depths = _finite_history("depths", depths)
     cells = _cells(radius, height, dt, cell_size)
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(
@@ -194,7 +194,7 @@ def creep(
     return Rig(scene=scene, nodes=top, weights=weights, reading="displacement", whole=not sample.physics)
 
 
-def _finite(name: str, values: Any) -> np.ndarray:
+def _finite_history(name: str, values: Any) -> np.ndarray:
     values = np.atleast_1d(np.asarray(values, float))
     if values.ndim != 1 or not len(values) or not np.all(np.isfinite(values)):
         raise InputError(f"{name} must be finite numbers, one a step: mend the list")

@@ -339,7 +339,7 @@ def _oscillate(o: _Oscillation, rest: _Linearised) -> tuple[Run, jax.Array]:
     cycle = _Cycle(steady, arc, inverse)
     q, memories = _initial(o, steady.shape, arc)
     times = o.dt * jnp.arange(1, drive.steps * drive.cycles + 1)
-    _, (angle, torque, lift, statistics) = jax.lax.scan(partial(_step, o, cycle), (q, memories), times)
+    _, (angle, torque, lift, statistics) = jax.lax.scan(partial(_time_step, o, cycle), (q, memories), times)
     _, lift_0, angle_0 = _unpack(rig, q)
     torque_0 = 0.0 if o.by_torque else rig.radius * jnp.real(steady.stiffness * arc) * (drive.start == "cycle")
     run = Run(
@@ -352,10 +352,10 @@ def _oscillate(o: _Oscillation, rest: _Linearised) -> tuple[Run, jax.Array]:
     return run, steady.stiffness / (modulus * _exact_stiffness(rig, o.law))
 
 
-def _step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
+def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
     """One time step: coordinates and memories, then angle, torque, lift and what Newton did."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
-    physics, free = _physics(rig, o.law, o.prony), Free(jnp.ones_like(mesh.points))
+    physics, free = _sample_physics(rig, o.law, o.prony), Free(jnp.ones_like(mesh.points))
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
     begin = Step(mesh, o.positions(q_old), 1, steps, o.dt, True, tolerance, free)
     solid, *nodal = (p.freeze(memory, begin) for p, memory in zip(physics, memories, strict=True))
@@ -393,7 +393,7 @@ def _without_last(inverse: jax.Array) -> jax.Array:
     return inverse[:-1, :-1] - jnp.outer(b, b) / inverse[-1, -1]
 
 
-def _physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, ...]:
+def _sample_physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, ...]:
     """The sample: its solid, and its mass where the rig has a density."""
     solid = Elasticity(law=law) if prony is None else Viscoelasticity(law=law, prony=prony)
     return (solid,) if rig.density is None else (solid, Inertia(density=rig.density, integrator="newmark"))

@@ -71,7 +71,7 @@ def check_value(where: str, metadata: Mapping, value: Any) -> None:
         leaves = jax.tree.leaves(value, is_leaf=lambda v: v is None)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # a number only under jit or grad
             return
-        numbers = _numbers(where, metadata, value, leaves)
+        numbers = _numbers_of(where, metadata, value, leaves)
         if not numbers.size:
             return
         least, most = numbers.min(), numbers.max()  # NaN where one number is
@@ -102,7 +102,7 @@ def _refuse(where: str, metadata: Mapping, value: Any, numbers: np.ndarray) -> N
             raise InputError(f"{said}{'' if unit == '1' else f' {unit}'}: {example or remedy}")
 
 
-def _numbers(where: str, metadata: Mapping, value: Any, leaves: list) -> np.ndarray:
+def _numbers_of(where: str, metadata: Mapping, value: Any, leaves: list) -> np.ndarray:
     """The numbers of all leaves (n,)."""
     try:
         if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):

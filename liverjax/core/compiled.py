@@ -43,7 +43,7 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any
     if folder is None or jax.default_backend() != "cpu":  # elsewhere JAX's own cache serves, until it is measured
         return jax.jit(function).lower(*arguments).compile()
     try:
-        file = folder / f"whole_{_name(function)}-{_key(function, arguments)}-cache"
+        file = folder / f"whole_{_function_name(function)}-{_key(function, arguments)}-cache"
     except _Unknown:
         return jax.jit(function).lower(*arguments).compile()
     return _found(file) or _made(file, function, arguments)
@@ -99,7 +99,7 @@ def _called(program: Callable[..., Any], structure: Any, *arguments: Any) -> Any
     return jax.tree.unflatten(structure, program(*jax.tree.leaves(arguments)))
 
 
-def _name(function: Callable[..., Any]) -> str:
+def _function_name(function: Callable[..., Any]) -> str:
     return _top(function.func if isinstance(function, partial) else function)
 
 

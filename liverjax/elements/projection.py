@@ -117,7 +117,7 @@ def blocks(
         _gather(second, 1.0, volume.second)
     result = _isotropic(Scalars(first, second), stretched, F, D, pairs)
     if metric is not None:
-        added.append([_diagonal(dot(D[i], matvec(metric, D[j]))) for i, j in pairs])
+        added.append([_diagonal_matrix(dot(D[i], matvec(metric, D[j]))) for i, j in pairs])
     for more in added:
         result = [add_matrices(a, b) for a, b in zip(result, more, strict=True)]
     return result
@@ -132,7 +132,7 @@ def regularised(
     volume: Scalars | None = None,
 ) -> list[Matrix]:
     """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
-    result = [_diagonal(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
+    result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
     def with_more(weight: Any, state: invariant_terms.State) -> list[Matrix]:
         K = invariant_terms.blocks(state, D, pairs, regularised=True)
@@ -148,7 +148,7 @@ def _gather(total: dict, weight: Any, values: dict) -> None:
         accumulate(total, key, weight * value)
 
 
-def _diagonal(value: Any) -> Matrix:
+def _diagonal_matrix(value: Any) -> Matrix:
     zero = jnp.zeros_like(value)
     return ((value, zero, zero), (zero, value, zero), (zero, zero, value))
 
@@ -160,7 +160,7 @@ def _fibre(W4: Any, W44: Any, a: Vector, F: Matrix, D: list[Vector], pairs: tupl
     along = jnp.maximum(2 * W4 + 4 * W44 * dot(Fa, Fa), 0.0)
     size = dot(Fa, Fa)
     line = scale_matrix((along - across) / jnp.where(size > 0, size, 1.0), outer(Fa, Fa))
-    both = add_matrices(_diagonal(across), line)
+    both = add_matrices(_diagonal_matrix(across), line)
     return [scale_matrix(dot(D[i], a) * dot(D[j], a), both) for i, j in pairs]
 
 

@@ -65,23 +65,23 @@ def run(
         raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
     scene = prepared(scene)
     if steps <= every and not folder.exists():
-        return _run(scene, steps, None, report)
+        return _run_parts(scene, steps, None, report)
     parts.make_folder(folder)
     with parts.locked(folder / "lock_0"):
         # The text names files, of a mesh or a history, that may change behind it: so all numbers count as well.
         numbers = parts.digest(*jax.tree.leaves(scene))
         parts.same({"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json")
-        return _run(scene, every, folder, report)
+        return _run_parts(scene, every, folder, report)
 
 
-def _run(scene: Scene, count: int, folder: Path | None, report: Callable[[int], None] | None) -> Ran:
+def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[int], None] | None) -> Ran:
     """Parts found in the folder, and the others computed and written."""
     firsts = range(1, scene.solve.steps + 1, count)
     files = [None if folder is None else parts.part(folder, k) for k in range(len(firsts))]
     state, results, computed, run_time = initial_state(scene), [], 0, 0.0
     finished = [file is not None and file.exists() for file in files]
     begin = time.perf_counter()
-    program: Any = None if all(finished) else _compiled(scene, state, count)
+    program: Any = None if all(finished) else _compiled_part(scene, state, count)
     compile_time = time.perf_counter() - begin
     for first, file in zip(firsts, files, strict=True):
         if file is not None and file.exists():
@@ -102,7 +102,7 @@ def _run(scene: Scene, count: int, folder: Path | None, report: Callable[[int], 
     return Ran(whole, computed, run_time, compile_time)
 
 
-def _compiled(scene: Scene, state: Any, count: int) -> Callable:
+def _compiled_part(scene: Scene, state: Any, count: int) -> Callable:
     return compiled(partial(simulate_part, count=count), scene, state, 1.0)
 
 

@@ -10,7 +10,7 @@ from liverjax.laws import Law, homogeneous
 from liverjax.laws.gradient_check import Check
 
 
-def _stress(law: Law, test: str, driven: np.ndarray) -> np.ndarray:
+def _stress_of_curve(law: Law, test: str, driven: np.ndarray) -> np.ndarray:
     return np.asarray(jax.jit(lambda v: homogeneous.response(law, test, v))(driven)) / 1000
 
 
@@ -27,7 +27,7 @@ def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (
         driven = np.linspace(0.0, stretches[1] - 1, 101) if what == "shear" else np.linspace(*stretches, 201)
         ends = []
         for k, (name, law) in enumerate(named.items()):
-            stress = _stress(law, test, driven)
+            stress = _stress_of_curve(law, test, driven)
             style = ("-", "--", ":")[k // len(COLOURS) % 3]
             axis.plot(driven, stress, style, color=COLOURS[k % len(COLOURS)], label=name)
             ends.append((np.nanmin(stress), np.nanmax(stress)))
@@ -57,7 +57,7 @@ def gradient_check(result: Check, name: str, file: Path) -> None:
         rest = 0.0 if homogeneous.TESTS[test] == "shear" else 1.0
         driven = np.linspace(max(low, rest - 0.3), min(high, rest + 0.6), 200)
         label = f"{test.replace('_', ' ')}, stable {low:.3g} to {high:.3g}"
-        right.plot(driven - rest, _stress(result.law, test, driven), color=colour, label=label)
+        right.plot(driven - rest, _stress_of_curve(result.law, test, driven), color=colour, label=label)
     right.set(
         xlabel="stretch - 1, amount of shear", ylabel="nominal stress (kPa)", title="incompressible, stable range"
     )

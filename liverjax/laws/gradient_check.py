@@ -84,7 +84,7 @@ def load(name: str) -> Law:
         raise InputError(f"{file} has no {attribute}: {'use ' + ' or '.join(offered) if offered else 'define a law'}")
     if not _is_law(found):
         raise InputError(f"{name} is no law: derive it from liverjax.Law and decorate it with liverjax.core.struct")
-    law = _typical(found, name) if inspect.isclass(found) else found
+    law = _typical_law(found, name) if inspect.isclass(found) else found
     _try(law, name)
     return law
 
@@ -114,7 +114,7 @@ def _is_law(value: Any) -> bool:
     return isinstance(value, Law) or (inspect.isclass(value) and issubclass(value, Law) and value is not Law)
 
 
-def _typical(cls: type, name: str) -> Law:
+def _typical_law(cls: type, name: str) -> Law:
     if "__dataclass_fields__" not in vars(cls):
         raise InputError(f"{name} is not decorated: write @liverjax.core.struct above its class")
     values = {f.name: f.metadata.get("typical") for f in laws.parameters(cls)}
@@ -134,7 +134,7 @@ def check(law: Law) -> Check:
     F, D = _samples()
     energy, stress, tangent = jax.jit(law.energy), jax.jit(law.first_piola), jax.jit(law.tangent)
     rows, errors = [], {}
-    W, P, A = (_numbers(f, F) for f in (energy, stress, tangent))
+    W, P, A = (_as_numbers(f, F) for f in (energy, stress, tangent))
     finite = all(np.isfinite(v).all() for v in (W, P, A))
     rows.append(Row("finite at moderate stretches", "yes" if finite else "NaN or infinite", "0.7 to 1.4", finite))
     slope, curved = np.einsum("nij,nij->n", P, D), np.einsum("nijkl,nkl->nij", A, D)
@@ -142,19 +142,19 @@ def check(law: Law) -> Check:
         errors[name] = np.array([_difference(function, F, D, h, exact) for h in STEPS])
         rows.append(_v_shape(name, errors[name]))
     for name, by_hand, oracle in (("stress", P, autodiff.first_piola), ("tangent", A, autodiff.tangent)):
-        rows.append(_exact(f"{name} by hand against autodiff", by_hand, _numbers(jax.jit(partial(oracle, law)), F)))
+        rows.append(_exact(f"{name} by hand against autodiff", by_hand, _as_numbers(jax.jit(partial(oracle, law)), F)))
     Q = _rotation(4)
     size = np.abs(W).max() + np.abs(P).max()
-    rows.append(_exact("objective: W(QF) = W(F)", _numbers(energy, Q @ F), W, size))
-    rows.append(_exact("objective: P(QF) = Q P(F)", _numbers(stress, Q @ F), Q @ P))
+    rows.append(_exact("objective: W(QF) = W(F)", _as_numbers(energy, Q @ F), W, size))
+    rows.append(_exact("objective: P(QF) = Q P(F)", _as_numbers(stress, Q @ F), Q @ P))
     rows.append(_exact("tangent symmetric", A, np.transpose(A, (0, 3, 4, 1, 2))))
-    rows += _rest(law, energy, stress, tangent)
-    rows += _limits(energy)
+    rows += _rest_state(law, energy, stress, tangent)
+    rows += _limits_of_energy(energy)
     more, stable = _stability(law, tangent)
     return Check(law, rows + more, STEPS, errors, stable)
 
 
-def _numbers(function: Callable, F: np.ndarray) -> np.ndarray:
+def _as_numbers(function: Callable, F: np.ndarray) -> np.ndarray:
     return np.asarray(function(jnp.asarray(F)), float)
 
 
@@ -175,7 +175,7 @@ def _samples() -> tuple[np.ndarray, np.ndarray]:
 
 def _difference(function: Callable, F: np.ndarray, D: np.ndarray, h: float, exact: np.ndarray) -> float:
     """Largest relative error of the central difference with step h."""
-    quotient = (_numbers(function, F + h * D) - _numbers(function, F - h * D)) / (2 * h)
+    quotient = (_as_numbers(function, F + h * D) - _as_numbers(function, F - h * D)) / (2 * h)
     return float(np.abs(quotient - exact).max() / max(np.abs(exact).max(), 1e-300))
 
 
@@ -195,9 +195,9 @@ def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None =
     return Row(name, f"{error:.1e}", f"< {EXACT_LIMIT:.0e}", bool(error < EXACT_LIMIT))
 
 
-def _rest(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
+def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
     """Energy, stress and moduli of the undeformed state; Voigt's means, of an isotropic law every direction's."""
-    W, P, A = (_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
+    W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     normal, coupled = np.trace(np.einsum("iijj->ij", A)), A[0, 0, 1, 1] + A[0, 0, 2, 2] + A[1, 1, 2, 2]
     shear = (normal - coupled) / 15 + (A[0, 1, 0, 1] + A[0, 2, 0, 2] + A[1, 2, 1, 2]) / 5
     bulk = (normal + 2 * coupled) / 9
@@ -217,11 +217,11 @@ def _rest(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> li
     return rows
 
 
-def _limits(energy: Callable) -> list[Row]:
+def _limits_of_energy(energy: Callable) -> list[Row]:
     """What becomes of the energy at J -> 0, J -> infinity, J = 0 and J < 0."""
 
     def along(*sizes: float) -> np.ndarray:
-        return _numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
+        return _as_numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
 
     small, large = along(1e-4, 1e-8, 1e-16), along(1e4, 1e8)
     if not np.isfinite(small).all():
@@ -233,7 +233,7 @@ def _limits(energy: Callable) -> list[Row]:
     grows = "not finite" if not np.isfinite(large).all() else "faster" if large[1] > 1e4 * large[0] else "no faster"
     swollen = grows if grows == "not finite" else f"grows {grows} than J"
     flat, inverted = np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 1.0, -0.5])
-    ends = ["finite" if np.isfinite(_numbers(energy, F)).all() else "not finite" for F in (flat, inverted)]
+    ends = ["finite" if np.isfinite(_as_numbers(energy, F)).all() else "not finite" for F in (flat, inverted)]
     return [
         Row("energy as J -> 0", crushed, "", None),
         Row("energy as J -> infinity", swollen, "", None),
@@ -249,8 +249,8 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
             continue
         driven = SHEARS if what == "shear" else STRETCHES
         F = np.asarray(homogeneous.deformation_gradient(test, driven))
-        P = _numbers(jax.jit(partial(homogeneous.nominal_stress, law)), F)
-        stable = _work_is_positive(test, driven, P) & (ellipticity(_numbers(tangent, F)) > 0)
+        P = _as_numbers(jax.jit(partial(homogeneous.nominal_stress, law)), F)
+        stable = _work_is_positive(test, driven, P) & (ellipticity(_as_numbers(tangent, F)) > 0)
         start = int(np.argmin(np.abs(driven - (0.0 if what == "shear" else 1.0))))
         low, high = _range(driven, stable, start)
         ranges[test] = (low, high)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from liverjax.core.errors import InputError
 
 
-def _quadratic(K, J):
+def _quadratic_energy(K, J):
     return 0.5 * K * (J - 1) ** 2, K * (J - 1), K * jnp.ones_like(J)
 
 
@@ -22,7 +22,7 @@ def _simo(K, J):
 
 
 #: Name -> function of (K, J) giving U, U', U'': K/2 (J-1)^2, K/2 ln^2 J, K/4 (J^2 - 1 - 2 ln J).
-VOLUMETRIC = {"quadratic": _quadratic, "log": _log, "simo": _simo}
+VOLUMETRIC = {"quadratic": _quadratic_energy, "log": _log, "simo": _simo}
 
 
 def volumetric(kind: str, K: Any, J: Any) -> tuple[Any, Any, Any]:

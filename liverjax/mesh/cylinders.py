@@ -151,12 +151,12 @@ def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np
         size = radius * (_stretch(count) if match_area else 1.0)
         points.append(size * np.column_stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)]))
         outer = inner[-1] + 1 + np.arange(count)
-        triangles += _between(inner, outer)
+        triangles += _ring_of_triangles(inner, outer)
         inner = outer
     return np.vstack(points), np.array(triangles)
 
 
-def _between(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
+def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
     """Triangles between two rings: always the next edge, inside or outside, whose middle comes first."""
     n, m = len(inner), len(outer)
     if n == 1:

@@ -59,12 +59,12 @@ _INTEGRALS = {1: (1 / 4,), 2: (-1 / 20, 1 / 5), 3: (-1 / 20, 1 / 5)}
 
 def nodal_volumes(mesh: TetMesh) -> jax.Array:
     """Lumped mass over density (V,) [m^3]: a quarter of every linear element at each of its nodes."""
-    return _parts(mesh, _LUMPED[min(mesh.order, 2)])
+    return _weighted_parts(mesh, _LUMPED[min(mesh.order, 2)])
 
 
 def load_volumes(mesh: TetMesh) -> jax.Array:
     """Integrals of the shape functions (V,) [m^3]: the nodal forces of a uniform weight of 1 N/m^3."""
-    total = _parts(mesh, _INTEGRALS[mesh.order])
+    total = _weighted_parts(mesh, _INTEGRALS[mesh.order])
     if mesh.order < 3:
         return total
     for nodes in mesh.element_nodes[-4:]:
@@ -72,7 +72,7 @@ def load_volumes(mesh: TetMesh) -> jax.Array:
     return total
 
 
-def _parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
+def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
     total = jnp.zeros(mesh.number_of_nodes, mesh.volumes.dtype)
     for a, nodes in enumerate(mesh.element_nodes[: 4 if mesh.order == 1 else 10]):
         total = total.at[nodes].add(mesh.volumes * parts[a >= 4])

@@ -18,10 +18,10 @@ from liverjax.scenes.scene import Scene
 
 def enriched(scene: Scene) -> Scene:
     """The scene of quadratic elements, or of cubic ones (`liverjax.mesh.promotion.cubic`); numbers may be traced."""
-    return _quadratic(scene) if scene.mesh.order == 1 else _cubic(scene)
+    return _quadratic_mesh(scene) if scene.mesh.order == 1 else _cubic(scene)
 
 
-def _quadratic(scene: Scene) -> Scene:
+def _quadratic_mesh(scene: Scene) -> Scene:
     mesh = promotion.quadratic(scene.mesh)
 
     def more(nodes: Any) -> Any:

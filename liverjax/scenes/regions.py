@@ -48,8 +48,8 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
     """
     for region in regions:
         for name, value in region.law.items():
-            base = jnp.broadcast_to(jnp.asarray(_number(law, name), float), (number_of_elements,))
-            law = names.put(law, name, base.at[region.elements].set(value), _refusal(name))
+            base = jnp.broadcast_to(jnp.asarray(_number_at(law, name), float), (number_of_elements,))
+            law = names.put(law, name, base.at[region.elements].set(value), _refused_name(name))
     return law
 
 
@@ -76,17 +76,17 @@ def check_numbers(law: Law, regions: tuple[Region, ...]) -> None:
     """
     for k, region in enumerate(regions):
         for name, value in region.law.items():
-            _number(law, name)
-            metadata = names.metadata(law, name, _refusal(name)) | {"each": False}
+            _number_at(law, name)
+            metadata = names.metadata(law, name, _refused_name(name)) | {"each": False}
             laws.check_value(f"region.{k}: law.{name}", metadata, value)
 
 
-def _number(law: Law, name: str) -> Any:
-    value = names.get(law, name, _refusal(name))
+def _number_at(law: Law, name: str) -> Any:
+    value = names.get(law, name, _refused_name(name))
     if isinstance(value, tuple):
         raise InputError(f"region: {name} is a list of {len(value)}: name one of them, {name}.0")
     return value
 
 
-def _refusal(name: str) -> str:
+def _refused_name(name: str) -> str:
     return f"region: the law has no number {name!r}"

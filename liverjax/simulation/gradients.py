@@ -65,11 +65,11 @@ def value_and_gradient(
     checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
     with_parameters(scene, {name: value for name, value in values.items() if name != START})
-    return _program(loss, store, mode)(scene, values)
+    return _program_of_gradient(loss, store, mode)(scene, values)
 
 
 @functools.lru_cache(maxsize=32)
-def _program(loss: Callable[[Result], jax.Array], store: str | int, mode: str) -> Callable:
+def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, mode: str) -> Callable:
     def run(values, scene):
         numbers = {name: value for name, value in values.items() if name != START}
         result = simulate(with_parameters(scene, numbers), start=values.get(START), store=store)

@@ -37,7 +37,7 @@ class Minimum(NamedTuple):
     relative: jax.Array  # |r| over the forces at work
 
 
-class _Point(NamedTuple):
+class _Descent(NamedTuple):
     q: jax.Array
     energy: jax.Array
     r: jax.Array
@@ -66,7 +66,7 @@ def minimise(problem: Problem, start: jax.Array, options: StepOptions) -> Minimu
 
     zero = jnp.zeros((), jnp.int32)
     begin = _evaluated(problem, start, zero, zero + 1, jnp.array(False), zero, zero)
-    end = jax.lax.while_loop(go_on, lambda c: _iterate(problem, options, c), begin)
+    end = jax.lax.while_loop(go_on, lambda c: _descend(problem, options, c), begin)
     finite = jnp.isfinite(end.energy) & jnp.isfinite(end.relative)
     failure = jnp.where(finite, jnp.where(end.indefinite, status.INDEFINITE, status.STALLED), status.NOT_FINITE)
     code = jnp.where(finite & (end.relative <= options.tolerance), status.CONVERGED, failure)
@@ -92,14 +92,14 @@ def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple
     return jax.lax.cond(potential.volume(start, jnp.ones((), start.dtype)) <= 0, away, lambda: (start, zero, zero))
 
 
-def _evaluated(problem: Problem, q: jax.Array, definite: Any, patience: Any, indefinite: Any, *counts: Any) -> _Point:
+def _evaluated(problem: Problem, q: jax.Array, definite: Any, patience: Any, indefinite: Any, *counts: Any) -> _Descent:
     r, force, by = problem.residual(q, jnp.ones((), q.dtype))
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
     energy = _potential(problem).energy(q)
-    return _Point(q, energy, r, relative, by, definite, patience, indefinite, jnp.array(False), *counts)
+    return _Descent(q, energy, r, relative, by, definite, patience, indefinite, jnp.array(False), *counts)
 
 
-def _iterate(problem: Problem, options: StepOptions, c: _Point) -> _Point:
+def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     one, definite = jnp.ones((), c.q.dtype), c.definite > 0
     K = jax.lax.cond(
         definite,
@@ -126,7 +126,7 @@ def _iterate(problem: Problem, options: StepOptions, c: _Point) -> _Point:
     return new._replace(stuck=definite & ~moved)
 
 
-def _length(problem: Problem, c: _Point, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
+def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
     """The first of 1, 1/2, 1/4, … with which the energy falls; 0 if there is none."""
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 

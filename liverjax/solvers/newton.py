@@ -49,7 +49,7 @@ def solve(
     """
 
     def iterate(residual, start):
-        return _iterate(residual, start, precondition, jax.lax.stop_gradient(scale), options)
+        return _halving_newton(residual, start, precondition, jax.lax.stop_gradient(scale), options)
 
     def tangent_solve(linear, y):
         return differentiable_solve(linear, y, precondition, options.adjoint_tolerance, options.max_linear_iterations)
@@ -59,7 +59,7 @@ def solve(
     return root, NewtonStatistics(code, iterations, linear, statistics.residual)
 
 
-class _Point(NamedTuple):
+class _Iterate(NamedTuple):
     """State of the iteration: `q` is the best point so far, `q + t dq` the one to try next."""
 
     q: jax.Array
@@ -72,14 +72,14 @@ class _Point(NamedTuple):
     done: jax.Array
 
 
-def _iterate(residual, start, precondition, scale, options):
+def _halving_newton(residual, start, precondition, scale, options):
     """Newton with step halving on |r|. The program has residual and tangent only once, so it compiles twice as fast."""
     goal = options.tolerance * scale
 
     def norm(r):
         return jnp.linalg.norm(r)
 
-    def step(c: _Point) -> _Point:
+    def step(c: _Iterate) -> _Iterate:
         trial = c.q + c.t * c.dq
         r, matvec = jax.linearize(residual, trial)
         first = c.iterations == 0
@@ -93,7 +93,7 @@ def _iterate(residual, start, precondition, scale, options):
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
         load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a zero load costs no iteration
         dq, s = conjugate_gradients(matvec, load, precondition, forcing, options.max_linear_iterations)
-        return _Point(
+        return _Iterate(
             q=q,
             r=r,
             dq=jnp.where(better, dq, c.dq),
@@ -105,7 +105,7 @@ def _iterate(residual, start, precondition, scale, options):
         )
 
     zero = jnp.zeros((), jnp.int32)
-    begin = _Point(
+    begin = _Iterate(
         q=start,
         r=jnp.full_like(start, jnp.inf),
         dq=jnp.zeros_like(start),

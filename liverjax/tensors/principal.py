@@ -101,21 +101,21 @@ def _counted(left: int, C: tuple) -> tuple:
 
 @_counted.defjvp
 def _(left, primals, tangents):
-    one = _one(left - 1, primals[0])
+    one = _counted_one(left - 1, primals[0])
     return _counted(left, *primals), tuple(one * t for t in tangents[0])
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _one(left: int, C: tuple) -> Any:
+def _counted_one(left: int, C: tuple) -> Any:
     """1, to be differentiated `left` times and no more: beyond, the expansion would be wrong without a word."""
     return jnp.ones_like(C[0])
 
 
-@_one.defjvp
+@_counted_one.defjvp
 def _(left, primals, tangents):
     if left == 0:
         raise NotImplementedError("stretch-based laws: derivatives with respect to positions go to the third order")
-    return _one(left, *primals), 0.0 * _one(left - 1, *primals) * sum(tangents[0])
+    return _counted_one(left, *primals), 0.0 * _counted_one(left - 1, *primals) * sum(tangents[0])
 
 
 # -- powers -----------------------------------------------------------------------------------------------------------
@@ -180,11 +180,11 @@ def divided_difference(p: Any, *logs: Any) -> Any:
     far = (divided_difference(p, middle, high) - divided_difference(p, low, middle)) / span
     centre = 0.5 * (low + high)
     return jnp.where(
-        wide, far, jnp.exp((p - 2) * centre) * _near(p, [jnp.expm1(x - centre) for x in (low, middle, high)])
+        wide, far, jnp.exp((p - 2) * centre) * _divided_power(p, [jnp.expm1(x - centre) for x in (low, middle, high)])
     )
 
 
-def _near(p: Any, y: list) -> Any:
+def _divided_power(p: Any, y: list) -> Any:
     """Divided difference of (1 + c)^p at three |c| < 0.11: its binomial series, cut at 0.11^16 = 5e-16."""
     homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes
     for node in y:

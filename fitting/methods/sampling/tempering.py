@@ -59,15 +59,19 @@ def run(density: Density, count: int, seed: int = 0) -> Chains:
         count: draws that each run keeps.
         seed: of the generators; the same seed gives the same draws.
     """
-    found = [_run(density, max(FEWEST, count + count % 2), np.random.default_rng([seed, k])) for k in range(CHAINS)]
+    found = [
+        _run_particles(density, max(FEWEST, count + count % 2), np.random.default_rng([seed, k])) for k in range(CHAINS)
+    ]
     draws, evidence, steps, moves, accepted, remembered = zip(*found, strict=True)
     kept = np.stack([u[:count] for u in draws])
     return Chains(kept, np.array(evidence), sum(steps), sum(moves), float(np.mean(accepted)), max(remembered))
 
 
-def _run(density: Density, count: int, rng: np.random.Generator) -> tuple[np.ndarray, float, int, int, float, float]:
+def _run_particles(
+    density: Density, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, float, int, int, float, float]:
     u = density.from_prior(rng, count)
-    now = _Particles(u, _finite(density.log_likelihood(u)), density.log_prior(u))
+    now = _Particles(u, _finite_only(density.log_likelihood(u)), density.log_prior(u))
     power, evidence, steps, moves = 0.0, 0.0, 0, 0
     accepted = remembered = 0.0
     while power < 1:
@@ -82,7 +86,7 @@ def _run(density: Density, count: int, rng: np.random.Generator) -> tuple[np.nda
     return now.u[rng.permutation(count)], evidence, steps, moves, accepted, remembered
 
 
-def _finite(values: np.ndarray) -> np.ndarray:
+def _finite_only(values: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(values), -np.inf, values)
 
 
@@ -138,7 +142,7 @@ def _half_moved(
     usual = 2.38 / np.sqrt(2 * size) * np.exp(rng.uniform(-1.5, 0.3, half))
     reach = np.where(rng.random(half) < LONG, 1.0, usual)[:, None]
     trial = own + reach * (other[first] - other[second]) + 1e-6 * rng.standard_normal(own.shape)
-    prior, likelihood = density.log_prior(trial), _finite(density.log_likelihood(trial))
+    prior, likelihood = density.log_prior(trial), _finite_only(density.log_likelihood(trial))
     with np.errstate(invalid="ignore"):  # a place without likelihood is not gone to
         gain = power * (likelihood - now.likelihood[halves[0]]) + prior - now.prior[halves[0]]
     take = np.log(rng.random(half)) < np.where(np.isnan(gain), -np.inf, gain)

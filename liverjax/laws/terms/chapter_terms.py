@@ -70,7 +70,7 @@ class _At(NamedTuple):
     groups: list  # (terms, phi', phi'')
 
 
-def _at(law: Any, F: Matrix) -> _At:
+def _state_at(law: Any, F: Matrix) -> _At:
     C, I = right_cauchy_green(F), invariants(("I1", "I2", "J"), F)
     B = tuple(tuple((I.I1 if r == c else 0.0) - C[r][c] for c in range(3)) for r in range(3))
     groups = []
@@ -84,18 +84,18 @@ def _at(law: Any, F: Matrix) -> _At:
     return _At(F, C, B, cofactor(F), I.J, groups)
 
 
-def _stress(t: _Term, s: _At) -> Matrix:
+def _stress_of_product(t: _Term, s: _At) -> Matrix:
     """S^k = 2 dg/dC, no inverse."""
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
 
 
 def first_piola(law: Any, F: Matrix) -> Matrix:
     """sum_k phi' (h' g cof F + h F S^k) [Pa]."""
-    s = _at(law, F)
+    s = _state_at(law, F)
     total = scale_matrix(0.0, F)
     for terms, phi1, _ in s.groups:
         for t in terms:
-            P = add_matrices(scale_matrix(t.h1 * t.g, s.cof), scale_matrix(t.h, matmul(F, _stress(t, s))))
+            P = add_matrices(scale_matrix(t.h1 * t.g, s.cof), scale_matrix(t.h, matmul(F, _stress_of_product(t, s))))
             total = add_matrices(total, scale_matrix(phi1, P))
     return total
 
@@ -127,10 +127,10 @@ def blocks(
     `regularised` changes the G of every product (not phi'').
     """
     keep = _written if layout.write else lambda values: values
-    s = keep(_at(law, F))
+    s = keep(_state_at(law, F))
     nodes = keep([_node(s, d) for d in D])
     constant = constant_matrices(D, pairs) if layout.constant is None else layout.constant
-    return [_block(s, nodes[i], nodes[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
+    return [_six_terms(s, nodes[i], nodes[j], c, regularised) for (i, j), c in zip(pairs, constant, strict=True)]
 
 
 class _Node(NamedTuple):
@@ -144,7 +144,7 @@ class _Node(NamedTuple):
 
 
 def _node(s: _At, D: Vector) -> _Node:
-    S = [[matvec(_stress(t, s), D) for t in terms] for terms, _, _ in s.groups]
+    S = [[matvec(_stress_of_product(t, s), D) for t in terms] for terms, _, _ in s.groups]
     return _Node(D, matvec(s.cof, D), matvec(s.B, D), S, [[matvec(s.F, v) for v in group] for group in S])
 
 
@@ -155,7 +155,7 @@ def _written(values: Any) -> Any:
     return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
 
 
-def _block(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
+def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
     K = scale_matrix(0.0, IDENTITY)
     for n, (terms, phi1, phi2) in enumerate(s.groups):
         for t, FSDi, FSDj, SDj in zip(terms, i.FS[n], j.FS[n], j.S[n], strict=True):

@@ -64,7 +64,7 @@ def material_axes(law: Any, like: Any) -> Matrix:
 def stress(law: Any, F: Matrix) -> Matrix:
     """Second Piola-Kirchhoff stress [Pa] of w alone."""
     A = material_axes(law, F[0][0])
-    return rotated(_stress(law, green_strain(matmul(F, A))), A)
+    return rotated(_stress_of_strain(law, green_strain(matmul(F, A))), A)
 
 
 def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
@@ -86,7 +86,7 @@ def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     ]
 
 
-def _stress(law: Any, E: Matrix) -> Matrix:
+def _stress_of_strain(law: Any, E: Matrix) -> Matrix:
     if law.green_derivatives is not None:
         return law.green_derivatives(E)[0]
     return symmetric(tuple(_slopes(lambda six: law.green_energy(symmetric(six)), six_of(E))))

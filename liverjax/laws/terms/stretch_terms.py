@@ -63,7 +63,7 @@ def stretch_slopes(law: Any, X: tuple) -> tuple[tuple, dict]:
     return tuple(slope(k)(*X) for k in range(n)), second
 
 
-def _at(law: Any, F: Matrix, frame: Frame) -> Principal:
+def _at_stretches(law: Any, F: Matrix, frame: Frame) -> Principal:
     logs, axes = frame
     mean_log = jnp.log(determinant(F)) / 3  # NaN for J < 0
     d = [e - mean_log for e in logs]
@@ -107,7 +107,7 @@ def stress(law: Any, F: Matrix, frame: Frame) -> Matrix:
 
 def moduli(law: Any, F: Matrix, frame: Frame) -> list[list]:
     """dS/dE [Pa] of w alone over six components each, in the coordinate axes, with `frame` = `principal(F)`."""
-    return _square(_moduli(_arrays(law, F), F, frame))
+    return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
 def blocks(law: Any, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
@@ -141,7 +141,7 @@ def stress_at_constant(law: Any, F: Matrix) -> Matrix:
 
 @jax.custom_jvp
 def _stress(law: Any, F: Matrix, frame: Frame) -> tuple:
-    s = _at(law, F, frame)
+    s = _at_stretches(law, F, frame)
     diagonal = tuple(t * c for t, c in zip(s.tau, s.inverse, strict=True))
     scaled_axes = tuple(tuple(n * d for n, d in zip(row, diagonal, strict=True)) for row in s.axes)
     return tuple(dot(scaled_axes[i], s.axes[j]) for i, j in SIX)
@@ -152,17 +152,19 @@ def _(primals, tangents):
     (law, F, frame), (law_dot, F_dot, _) = primals, tangents
     parts = []
     if _perturbed(F_dot):
-        half = matmul(transpose(F), _filled(F_dot, F))
+        half = matmul(transpose(F), _filled_matrix(F_dot, F))
         dE = tuple((1.0 if i == j else 2.0) * 0.5 * (half[i][j] + half[j][i]) for i, j in SIX)
-        parts.append(tuple(sum(c * e for c, e in zip(row, dE, strict=True)) for row in _square(_moduli(law, F, frame))))
+        parts.append(
+            tuple(sum(c * e for c, e in zip(row, dE, strict=True)) for row in _square(_moduli_of_axes(law, F, frame)))
+        )
     if _perturbed(law_dot):
-        parts.append(jax.jvp(lambda law: _expanded_stress(law, F, frame), (law,), (_filled(law_dot, law),))[1])
+        parts.append(jax.jvp(lambda law: _expanded_stress(law, F, frame), (law,), (_filled_matrix(law_dot, law),))[1])
     return _stress(law, F, frame), add(*parts)
 
 
 @jax.custom_jvp
-def _moduli(law: Any, F: Matrix, frame: Frame) -> tuple:
-    s = _at(law, F, frame)
+def _moduli_of_axes(law: Any, F: Matrix, frame: Frame) -> tuple:
+    s = _at_stretches(law, F, frame)
     normal, shear = _principal_moduli(s)
     n = transpose(s.axes)
     squares = [tuple(n[m][i] * n[m][j] for i, j in SIX) for m in range(3)]
@@ -172,29 +174,29 @@ def _moduli(law: Any, F: Matrix, frame: Frame) -> tuple:
     return tuple(sum(squares[m][a] * weighted[m][b] + mixed[m][a] * turned[m][b] for m in range(3)) for a, b in _UPPER)
 
 
-@partial(_moduli.defjvp, symbolic_zeros=True)
+@partial(_moduli_of_axes.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     (law, F, frame), (law_dot, F_dot, _) = primals, tangents
     parts = []
     if _perturbed(F_dot):
-        parts.append(jax.jvp(lambda F: _expanded_moduli(law, F, frame), (F,), (_filled(F_dot, F),))[1])
+        parts.append(jax.jvp(lambda F: _expanded_moduli(law, F, frame), (F,), (_filled_matrix(F_dot, F),))[1])
     if _perturbed(law_dot):
-        parts.append(jax.jvp(lambda law: _expanded_moduli(law, F, frame), (law,), (_filled(law_dot, law),))[1])
-    return _moduli(law, F, frame), add(*parts)
+        parts.append(jax.jvp(lambda law: _expanded_moduli(law, F, frame), (law,), (_filled_matrix(law_dot, law),))[1])
+    return _moduli_of_axes(law, F, frame), add(*parts)
 
 
 def _perturbed(tangents: Any) -> bool:
-    return not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents, is_leaf=_is_zero))
+    return not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents, is_leaf=_vanishes))
 
 
-def _filled(tangents: Any, like: Any) -> Any:
+def _filled_matrix(tangents: Any, like: Any) -> Any:
     def fill(t, v):
         return jnp.zeros_like(v) if isinstance(t, SymbolicZero) else t
 
-    return jax.tree.map(fill, tangents, like, is_leaf=_is_zero)
+    return jax.tree.map(fill, tangents, like, is_leaf=_vanishes)
 
 
-def _is_zero(t: Any) -> bool:
+def _vanishes(t: Any) -> bool:
     return isinstance(t, SymbolicZero)
 
 
@@ -210,14 +212,14 @@ def _expanded_energy(law: Any, logs: Vector, axes: Matrix, log_J0: Any, Y: tuple
     return law.stretch_energy(*(expanded_power_sum(a, logs, X, log_J) for a in law.exponents()))
 
 
-def _expansion(law: Any, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
+def _energy_of_change(law: Any, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
     """The energy as a function of a change Y of C, and Y: zero, `orders` times differentiable with respect to F."""
     logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))
     return partial(_expanded_energy, law, logs, axes, log_J0), change(F, orders)
 
 
-def _along(function: Any, Y: tuple) -> jax.Array:
+def _strain_derivatives(function: Any, Y: tuple) -> jax.Array:
     """Derivatives of `function` with respect to the six entries of E, first axis; dY = 2 dE, a shear is two entries."""
 
     def along(direction):
@@ -228,11 +230,11 @@ def _along(function: Any, Y: tuple) -> jax.Array:
 
 
 def _expanded_stress(law: Any, F: Matrix, frame: Frame) -> tuple:
-    energy, Y = _expansion(law, F, frame, 2)
-    return tuple(_along(energy, Y))
+    energy, Y = _energy_of_change(law, F, frame, 2)
+    return tuple(_strain_derivatives(energy, Y))
 
 
 def _expanded_moduli(law: Any, F: Matrix, frame: Frame) -> tuple:
-    energy, Y = _expansion(law, F, frame, 1)
-    C = _along(lambda Y: _along(energy, Y), Y)
+    energy, Y = _energy_of_change(law, F, frame, 1)
+    C = _strain_derivatives(lambda Y: _strain_derivatives(energy, Y), Y)
     return tuple(C[a, b] for a, b in _UPPER)
