@@ -6,4 +6,4 @@ from liverjax.core import addresses  # 64-bit mode and the check of the jax rele
 
 
 def __getattr__(name: str) -> ModuleType:
-    return addresses.moved("fitting", name)
+    return addresses.moved_module("fitting", name)

@@ -84,4 +84,4 @@ addresses.keep_loaded("liverjax")
 
 
 def __getattr__(name: str) -> ModuleType:
-    return addresses.moved("liverjax", name)
+    return addresses.moved_module("liverjax", name)

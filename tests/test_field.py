@@ -138,18 +138,18 @@ def test_the_prior_has_the_covariance_it_states():
     n, rng = mesh.number_of_nodes, np.random.default_rng(0)
     X = np.asarray(mesh.points)
     z, g = rng.normal(size=n), rng.normal(size=n)
-    assert np.isclose(prior.to_nodes(p, z) @ g, z @ prior.to_whitened(p, g), rtol=1e-12)
+    assert np.isclose(prior.field_at_nodes(p, z) @ g, z @ prior.to_whitened(p, g), rtol=1e-12)
     unit = np.zeros(n)
     centre = np.argmin(np.linalg.norm(X - 0.1, axis=1))
     unit[centre] = 1
-    covariance = prior.to_nodes(p, prior.to_whitened(p, unit))
+    covariance = prior.field_at_nodes(p, prior.to_whitened(p, unit))
     near = np.flatnonzero(np.linalg.norm(X - 0.1, axis=1) < 0.05)
     distance = np.linalg.norm(X[near] - X[centre], axis=1)
     # Cells of half a length: the kink at distance 0 is cut off by the mesh.
     np.testing.assert_allclose(covariance[near], np.exp(-distance / 0.04), atol=0.2)
     V = np.linalg.qr(rng.normal(size=(n, 3)))[0]
     before, after = prior.variances(p, V, np.array([0.1, 0.5, 0.9]))
-    T = prior.to_nodes(p, np.eye(n))
+    T = prior.field_at_nodes(p, np.eye(n))
     np.testing.assert_allclose(before, np.sum(T**2, axis=1), rtol=1e-9)
     kept = np.eye(n) - V @ np.diag([0.9, 0.5, 0.1]) @ V.T
     np.testing.assert_allclose(after, np.diag(T @ kept @ T.T), rtol=1e-8)
@@ -172,7 +172,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
 
     # Standard deviations against the dense Hessian of all directions.
     p, base = prior.prior(mesh, 0.02), field.start_of(problem, "law.mu")
-    T = found.deviation * prior.to_nodes(p, np.eye(mesh.number_of_nodes))
+    T = found.deviation * prior.field_at_nodes(p, np.eye(mesh.number_of_nodes))
     J = np.asarray(
         jax.jit(jax.jacfwd(lambda m: scene_numbers.misfit(problem, field.values_at(problem, "law.mu", base, m))[0]))(
             jnp.asarray(found.log_factor)
@@ -189,7 +189,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
 
     # What was written is the point reached: going on from it takes no iteration to speak of.
     with h5py.File(file) as f:
-        np.testing.assert_allclose(found.deviation * prior.to_nodes(p, f["z"][:]), found.log_factor, rtol=1e-12)
+        np.testing.assert_allclose(found.deviation * prior.field_at_nodes(p, f["z"][:]), found.log_factor, rtol=1e-12)
     again = field.estimate(problem, length=0.02, max_iterations=40, modes=5, file=file, resume=True)
     assert again.chi2 <= found.chi2 * 1.001 and again.deviation == found.deviation
     with pytest.raises(lj.InputError, match="of another fit"):

@@ -109,6 +109,34 @@ def test_functions_take_few_parameters_and_fit_a_screen(module):
         assert lines <= MOST_LINES, f"{function.name} has {lines} lines"
 
 
+#: Names that every file of a folder has, since they are what the folder is called for.
+PROTOCOL = {
+    "liverjax.commands": {"add", "run"},
+    "fitting.commands": {"parser", "run"},
+    "fitting.fits": {"fit", "estimate"},
+    "fitting.reports": {"figure", "summary", "table", "write"},
+    "liverjax.elements": {"energy", "internal_force", "stiffness_matrix"},
+    "liverjax.laws.terms": {"blocks", "first_piola", "stress"},
+    "liverjax.physics": {"blocks", "check", "first_piola"},
+    "liverjax.solvers": {"product", "solve"},
+}
+EVERYWHERE = {"__getattr__", "main", "_"}
+#: Names that several modules define nevertheless; a new one is to be named otherwise.
+MOST_HOMONYMS = 45
+
+
+def test_few_names_are_defined_in_several_modules():
+    places: dict[str, set[str]] = {}
+    for module, tree in TREES.items():
+        for node in tree.body:
+            if not isinstance(node, (ast.FunctionDef, ast.ClassDef)) or node.name in EVERYWHERE:
+                continue
+            if not any(module.startswith(f"{room}.") and node.name in names for room, names in PROTOCOL.items()):
+                places.setdefault(node.name, set()).add(module)
+    several = {name: sorted(found) for name, found in places.items() if len(found) > 1}
+    assert len(several) <= MOST_HOMONYMS, several
+
+
 def _public(tree: ast.Module) -> list:
     kinds = (ast.FunctionDef, ast.ClassDef)
     top = [n for n in tree.body if isinstance(n, kinds) and not n.name.startswith("_")]

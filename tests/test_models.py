@@ -182,7 +182,7 @@ def test_no_start_of_scipy_is_below_the_spectrum():
     s = read_sweep(ROOT / "data" / GIVEN["lion's mane"])
     found = relaxation_spectrum.fit(s)
     scales, data = np.concatenate(s.deviations), np.concatenate([s.storage, s.loss])
-    A = relaxation_spectrum.columns(s.angular_frequency, found.times) / scales[:, None]
+    A = relaxation_spectrum.mode_columns(s.angular_frequency, found.times) / scales[:, None]
     A, b = np.vstack([A, found.prior]), np.concatenate([data / scales, np.zeros(len(found.prior))])
     ours = 0.5 * np.sum((A @ np.concatenate([[found.equilibrium], found.strengths]) - b) ** 2)
     rng = np.random.default_rng(0)

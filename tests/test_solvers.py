@@ -60,7 +60,7 @@ def _solve(p, start=None, **options):
     """A x + p x^3 = b."""
     start = jnp.zeros_like(b) if start is None else start
     settings = newton.NewtonOptions(**({"tolerance": 1e-13} | options))
-    return newton.solve(lambda x: A @ x + p * x**3 - b, start, _none, jnp.linalg.norm(b), settings)
+    return newton.newton_root(lambda x: A @ x + p * x**3 - b, start, _none, jnp.linalg.norm(b), settings)
 
 
 def test_newton_converges_and_is_differentiable_both_ways():
@@ -78,13 +78,13 @@ def test_newton_converges_and_is_differentiable_both_ways():
 def test_newton_tells_the_truth_when_it_fails():
     _, s = _solve(10.0, max_iterations=1, tolerance=1e-16)
     assert s.status == status.STALLED and "smaller steps" in status.advice(s.status)
-    _, s = newton.solve(lambda x: jnp.log(x), jnp.array([-1.0]), _none, 1.0)
+    _, s = newton.newton_root(lambda x: jnp.log(x), jnp.array([-1.0]), _none, 1.0)
     assert s.status == status.NOT_FINITE and "inverted" in status.advice(s.status)
 
 
 def test_newton_halves_a_step_that_overshoots():
     # From 3 the full Newton step for atan leaves every bound.
-    x, s = newton.solve(jnp.arctan, jnp.array([3.0]), _none, 1.0, newton.NewtonOptions(tolerance=1e-12))
+    x, s = newton.newton_root(jnp.arctan, jnp.array([3.0]), _none, 1.0, newton.NewtonOptions(tolerance=1e-12))
     assert s.status == status.CONVERGED and abs(x[0]) < 1e-12
 
 

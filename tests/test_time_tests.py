@@ -31,7 +31,7 @@ def relaxation(model, t):
 def test_stress_is_the_convolution_of_quadrature(model):
     time = np.array([0.0, 0.1, 0.5, 0.6, 3.0, 20.0])
     strain = np.array([0.01, 0.05, 0.05, -0.02, 0.04, 0.04])  # begins with a jump
-    found = np.asarray(time_response.stress(model, time, strain))
+    found = np.asarray(time_response.stress_response(model, time, strain))
     for k, t in enumerate(time):
         exact = strain[0] * relaxation(model, t)
         for j in range(k):
@@ -80,7 +80,7 @@ def test_the_two_functions_of_a_step_keep_their_digits(x):
 def test_strain_of_a_driven_stress_is_that_of_steps_added_up():
     time = np.linspace(0, 4, 9)
     stress = np.interp(time, [0, 1, 2.5, 4], [20.0, 80.0, 80.0, 10.0])
-    found = np.asarray(time_response.strain(SOLID, time, stress))
+    found = np.asarray(time_response.strain_response(SOLID, time, stress))
     fine = np.linspace(0, 4, 4001)
     middle = 0.5 * (fine[1:] + fine[:-1])  # many small steps at the middle of each interval: second order
     rises = np.diff(np.interp(fine, time, stress))

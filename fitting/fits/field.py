@@ -104,7 +104,7 @@ class _Search:
     def cost(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """(chi^2 + |z|^2)/2 and its gradient."""
         deviation = DEVIATIONS[self.k]
-        m = deviation * smooth.to_nodes(self.p, z)
+        m = deviation * smooth.field_at_nodes(self.p, z)
         (half, codes), g = _cost_of_map(self.problem, self.base, jnp.asarray(m), self.name)
         half, g = float(half), np.asarray(g)
         self.evaluations += 1
@@ -183,7 +183,7 @@ def estimate(
         search.read()
     _deviations_in_turn(search, max_iterations)
     deviation = DEVIATIONS[search.k]
-    m = deviation * smooth.to_nodes(p, search.z)
+    m = deviation * smooth.field_at_nodes(p, search.z)
     search.cost(search.z)
     asked = _Asked.at(search, deviation, m)
     values, vectors = _measured_directions(asked, len(m), modes)
@@ -263,7 +263,7 @@ class _Asked(NamedTuple):
 
     def product(self, z: np.ndarray) -> np.ndarray:
         """J^T J z (V,)."""
-        dm = jnp.asarray(self.deviation * smooth.to_nodes(self.p, z.ravel()))
+        dm = jnp.asarray(self.deviation * smooth.field_at_nodes(self.p, z.ravel()))
         return self.gradient(self.push(dm))
 
 
@@ -294,7 +294,7 @@ def _bias_of_map(
     )
     # A correction of first order: a hundredth of it is far below its own error.
     z, _ = scipy.sparse.linalg.cg(hessian, asked.gradient(left_out), rtol=1e-2, maxiter=30, M=inverse)
-    return asked.deviation * smooth.to_nodes(asked.p, z)
+    return asked.deviation * smooth.field_at_nodes(asked.p, z)
 
 
 def bias_sentence(found: Field) -> str | None:

@@ -58,7 +58,7 @@ def spectrum(sweep: Sweep) -> Fit:
     prior = found.prior[:, 1 - solid :]
 
     def columns(omega):
-        return jnp.asarray(relaxation_spectrum.columns(np.asarray(omega), found.times)[:, 1 - solid :])
+        return jnp.asarray(relaxation_spectrum.mode_columns(np.asarray(omega), found.times)[:, 1 - solid :])
 
     def held(u):
         return jnp.asarray(prior) @ jnp.exp(u)

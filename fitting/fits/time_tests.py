@@ -169,7 +169,9 @@ def response(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax
     if kind == "sweep":
         return jax.numpy.concatenate(generalised_maxwell.moduli(model, at))
     driven, rows = drive
-    return (time_response.stress if kind == "relaxation" else time_response.strain)(model, at, driven)[rows]
+    return (time_response.stress_response if kind == "relaxation" else time_response.strain_response)(
+        model, at, driven
+    )[rows]
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:

@@ -37,14 +37,14 @@ def prior(mesh: TetMesh, length: float) -> Prior:
     return Prior(scipy.sparse.linalg.splu(A), np.sqrt(mass), math.sqrt(8 * math.pi * kappa))
 
 
-def to_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
+def field_at_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
     """m of z, (V,) or (V, k)."""
     root = p.root_mass if z.ndim == 1 else p.root_mass[:, None]
     return p.scale * p.solver.solve(root * z)
 
 
 def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
-    """The transpose of `to_nodes`: derivatives by z of derivatives by m."""
+    """The transpose of `field_at_nodes`: derivatives by z of derivatives by m."""
     root = p.root_mass if g.ndim == 1 else p.root_mass[:, None]
     return p.scale * root * p.solver.solve(g)
 
@@ -63,5 +63,5 @@ def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -
         unit[np.arange(first, first + unit.shape[1]), np.arange(unit.shape[1])] = 1
         # Row v of T = scale A^-1 M^(1/2), by the symmetry of A.
         before[first : first + unit.shape[1]] = np.sum(to_whitened(p, unit) ** 2, axis=0)
-    after = before - to_nodes(p, modes) ** 2 @ (1 - kept)
+    after = before - field_at_nodes(p, modes) ** 2 @ (1 - kept)
     return before, np.maximum(after, 0.0)

@@ -32,7 +32,7 @@ class GridSpectrum(NamedTuple):
     decades: float  # of relaxation times whose strengths the data carry
 
 
-def columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
+def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Moduli G' then G'' (2n, 1 + K) of an equilibrium modulus and of modes of 1 Pa."""
     x = omega[:, None] * times
     bottom = np.column_stack([np.zeros(len(omega)), x / (1 + x**2)])
@@ -52,7 +52,7 @@ def at(sweep: Sweep, per_decade: int, smoothing: float) -> GridSpectrum:
     size = np.exp(np.interp(-np.log(times), np.log(omega), np.log(np.hypot(sweep.storage, sweep.loss))))
     scales = np.concatenate(sweep.deviations)
     unit = np.concatenate([[sweep.storage.min()], size])
-    A = columns(omega, times) * unit / scales[:, None]
+    A = mode_columns(omega, times) * unit / scales[:, None]
     b = np.concatenate([sweep.storage, sweep.loss]) / scales
     L = np.sqrt(smoothing) * np.column_stack([np.zeros(len(times) - 2), np.diff(np.eye(len(times)), 2, axis=0)])
     x, _ = non_negative(np.vstack([A, L]), np.concatenate([b, np.zeros(len(L))]))

@@ -25,7 +25,7 @@ def _phi(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return one, two
 
 
-def stress(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.Array:
+def stress_response(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.Array:
     """Shear stress (n,) [Pa] of a strain (n,) that is linear between `time` (n,) [s]; strain[0] is reached at once."""
     rates = 1 / model.relaxation_times
 
@@ -49,7 +49,7 @@ def retardation(model: Maxwell) -> tuple[jax.Array, jax.Array]:
     return jnp.maximum(-minus, 0.0), (q.T @ b) ** 2
 
 
-def strain(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.Array:
+def strain_response(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.Array:
     """Shear strain (n,) of a stress (n,) [Pa] that is linear between `time` (n,) [s]; stress[0] is reached at once."""
     rates, weights = retardation(model)
 

@@ -69,7 +69,7 @@ def write(out: Path, mesh: TetMesh, content: dict[str, Any], found: Field | None
             f[name] = values
         f["eigenvalues"] = found.eigenvalues
         f.attrs["name"] = found.name
-    save(picture(mesh, found), out / "field.png")
+    save(map_figure(mesh, found), out / "field.png")
 
 
 def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n: int = 200) -> tuple[np.ndarray, tuple]:
@@ -85,7 +85,7 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
     return shown.reshape(n, n), tuple(100 * v for v in (low[a], high[a], low[b], high[b]))
 
 
-def picture(mesh: TetMesh, found: Field) -> Any:
+def map_figure(mesh: TetMesh, found: Field) -> Any:
     """Sections through the place of the largest departure: the factor on the scene's number, and its uncertainty."""
     middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")

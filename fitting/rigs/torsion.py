@@ -371,7 +371,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
         load = load.at[-1].set(o.amplitude * jnp.sin(o.omega * t) / rig.radius)
     # The linear solution moves on; what the last step deviated from it is kept.
     guess = cycle.at(o.omega, t) + (q_old - cycle.at(o.omega, t - o.dt))
-    q, statistics = newton.solve(
+    q, statistics = newton.newton_root(
         lambda v: o.solved_part(forces(o.full(v, t)) - load),
         o.solved_part(guess),
         lambda r: cycle.inverse @ r,

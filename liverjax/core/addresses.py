@@ -54,7 +54,7 @@ def keep_loaded(package: str) -> None:
             sys.modules.setdefault(old, sys.modules[new])
 
 
-def moved(package: str, name: str) -> ModuleType:
+def moved_module(package: str, name: str) -> ModuleType:
     """The module that was at PACKAGE.NAME.
 
     Raises:

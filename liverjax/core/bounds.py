@@ -26,7 +26,7 @@ def check(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
         InputError: one sentence with dotted name, value, bound and remedy.
     """
     for dotted, metadata, value in _fields(thing, name, leave):
-        check_value(dotted, metadata, value)
+        check_bound(dotted, metadata, value)
 
 
 def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, Any]]:
@@ -47,7 +47,7 @@ def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str
             yield dotted, field.metadata, value
 
 
-def check_value(where: str, metadata: Mapping, value: Any) -> None:
+def check_bound(where: str, metadata: Mapping, value: Any) -> None:
     """Refuse a value that a field's `metadata` does not allow, in one sentence that begins with `where`.
 
     Args:

@@ -19,7 +19,7 @@ def hint(word: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}?" if near else f"use one of {', '.join(words)}"
 
 
-class Step(NamedTuple):
+class PathStep(NamedTuple):
     """One step on the way to a number: from `owner` to what it holds at `key`."""
 
     owner: Any  # a struct, tuple, dictionary or array
@@ -60,7 +60,7 @@ def metadata(thing: Any, name: str, refusal: str) -> dict[str, Any]:
     return dict(last.owner.__dataclass_fields__[last.key].metadata)
 
 
-def walk(thing: Any, name: str, refusal: str) -> list[Step]:
+def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
     """All steps from `thing` to what a dotted name means.
 
     Args:
@@ -71,12 +71,12 @@ def walk(thing: Any, name: str, refusal: str) -> list[Step]:
     Raises:
         InputError: a name that leads nowhere, with a hint.
     """
-    steps: list[Step] = []
+    steps: list[PathStep] = []
     path = name.split(".")
     while path:
         keys, path = _keys(thing, path, refusal)
         for key in keys:
-            steps.append(Step(thing, key))
+            steps.append(PathStep(thing, key))
             thing = steps[-1].inside()
     return steps
 

@@ -106,7 +106,7 @@ def check_value(where: str, metadata: Any, value: Any) -> None:
     if metadata["each"] != several and not isinstance(value, (str, jax.core.Tracer)):
         shape = "a list of numbers" if metadata["each"] else "one number"
         raise InputError(f"{where} = {value} is not {shape}: give {shape} in {metadata['unit']}")
-    bounds.check_value(where, metadata, value)
+    bounds.check_bound(where, metadata, value)
 
 
 def typical(name: str) -> Law:

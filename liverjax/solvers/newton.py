@@ -30,7 +30,7 @@ class NewtonOptions(NamedTuple):
     max_halvings: int = 10
 
 
-def solve(
+def newton_root(
     residual: Callable[[jax.Array], jax.Array],
     start: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
