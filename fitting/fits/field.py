@@ -166,14 +166,14 @@ def estimate(
         name: dotted name of a positive number of the law; what the scenes have there is where the field begins.
         length: correlation length of the prior [m].
         max_iterations: of L-BFGS for each weight.
-        modes: most directions that the data are asked about, for the uncertainty.
+        modes: the most directions of the field that the uncertainty looks at.
         file: HDF5 file to which every iteration's point is written; None: nowhere.
         resume: begin from that file if it is there.
         progress: told of every iteration: number of the weight, chi^2 over the number of components.
         mesh_error: estimate what the meshes leave out, and how far that moves the field (`mesh_bias`).
 
     Raises:
-        InputError: see `start_of`; `file` of another fit.
+        InputError: as `start_of`; or `file` belongs to another fit.
     """
     begin = time.perf_counter()
     base = start_of(problem, name)

@@ -102,7 +102,7 @@ def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> conversion.Conversion
 
 
 def _finished(fit: Fit, made: conversion.Conversion) -> Fit:
-    """With the error of the conversion, and what is to be said about the model."""
+    """Add the error of the conversion, and the sentences about the model."""
     sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
     if made.error > conversion.ALLOWED:
         sentences.append(

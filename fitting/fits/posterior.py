@@ -281,7 +281,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
-    """Of a relaxation or creep test in closed form."""
+    """The density of a relaxation or creep test in closed form."""
     one, data = time_tests.residuals_of(test, fit.kind)
     residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])

@@ -185,7 +185,7 @@ def _one_test(tests: list[Measured], band: Band, modes: int, kind: Kind) -> Toge
 
 
 def _noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: int) -> np.ndarray:
-    """Relative noise of each test: root mean square of what is left, each test paying its part of the parameters."""
+    """Relative noise of each test: root mean square of its residuals, less its share of the degrees of freedom."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
     out = []

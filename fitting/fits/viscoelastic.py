@@ -84,7 +84,7 @@ def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
 
 @lru_cache(maxsize=16)
 def best_of(minimise: Callable, residuals: Callable, each: int = 0) -> Callable[..., Solution]:
-    """The lowest minimum over starting points (S, P); the first `each` of the data have a row for each start too."""
+    """The lowest minimum over starting points (S, P). The first `each` arrays of data have a row a start."""
 
     def best(starts, *data):
         rows, common = data[:each], data[each:]

@@ -2,7 +2,8 @@
 
 (kappa^2 - Laplace) m = white noise, kappa = 1 / length: in three dimensions a covariance sd^2 exp(-distance / length).
 With lumped mass M and stiffness L of linear tetrahedra, m = A^-1 M^(1/2) z for independent standard normal z, A =
-(kappa^2 M + L) / (sd sqrt(8 pi kappa)). At the boundary, where nothing flows out, sd is larger, in corners most.
+(kappa^2 M + L) / (sd sqrt(8 pi kappa)). Nothing flows out at the boundary, so
+sd is larger there. It is largest in corners.
 """
 
 import math

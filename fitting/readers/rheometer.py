@@ -82,7 +82,7 @@ def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.
     """Which rows are good in all columns of `values`, and a note on the others.
 
     Raises:
-        InputError: fewer than half of the points, or of three frequencies, are good.
+        InputError: fewer than half of the points or fewer than three frequencies are good.
     """
     good, faults = np.ones(len(table.rows), bool), []
     for k, number in enumerate(table.numbers):

@@ -22,7 +22,7 @@ class Table(NamedTuple):
 
     @property
     def frequencies(self) -> int:
-        """How many different ones it holds."""
+        """Number of different frequencies in the table."""
         place = next(j for j, c in enumerate(self.columns) if c.quantity == "frequency")
         return len({row[place] for row in self.rows})
 

@@ -151,7 +151,7 @@ def _own_table(kind: str) -> str:
 
 
 def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns in SI of the first table that has time and an answer, and notes."""
+    """The columns, in SI units, of the first table that has time and an answer; then notes."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found = _heading(cells)

@@ -100,7 +100,7 @@ def ansys(model: Maxwell) -> str:
 
 
 def sofa(model: Maxwell) -> str:
-    """A hyperelastic force field at the equilibrium modulus: SOFA itself has no Prony series, a comment holds it."""
+    """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment holds it."""
     G0, ratios, times = model
     rest = float(G0) * (1 - float(np.sum(ratios)))
     shear = rest if rest > 1e-6 * float(G0) else float(G0)

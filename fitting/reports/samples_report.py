@@ -24,7 +24,7 @@ def write(out: Path, found: Samples) -> dict[str, Any]:
 
 
 def _json_content(found: Samples) -> dict[str, Any]:
-    """On top the sample in the middle of the population, below it the population and every sample."""
+    """The sample in the middle of the population comes first; the population and all samples follow."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own = (
         {}

@@ -220,7 +220,7 @@ def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | N
 
 
 def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
-    """A sector with cells of given lengths at given radii and heights; whole, of one cell size, where that is given."""
+    """A sector with cells of given lengths at given radii and heights; with `cells.size`, the whole body of such."""
     radius, height = max(rings), max(layers)
     if cells.size is not None:
         rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))

@@ -201,7 +201,7 @@ class _Response(NamedTuple):
 
 
 def _response(column: jax.Array) -> _Response:
-    """From the displacements that a unit force along the arc causes."""
+    """The answer, from the coordinates (n,) that a unit force on the last of them causes."""
     return _Response(column / column[-1], 1 / column[-1])
 
 
@@ -312,12 +312,12 @@ class _Oscillation(NamedTuple):
         return jnp.append(q, self.rig.radius * self.amplitude * jnp.sin(self.omega * t))
 
     def solved_part(self, q: jax.Array) -> jax.Array:
-        """The coordinates that are solved for, of all."""
+        """Those of all coordinates that are solved for."""
         return q if self.by_torque else q[:-1]
 
 
 class _Cycle(NamedTuple):
-    """The steady cycle of the linearised discrete problem, and what its solution rests on."""
+    """The steady cycle of the linearised discrete problem, and the inverse stiffness for its solution."""
 
     steady: _Response
     arc: Any  # complex amplitude of the last coordinate [m]

@@ -83,7 +83,7 @@ def blocks(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """Blocks as `invariant_terms.blocks`, of which the element matrix has no negative eigenvalue.
+    """Blocks like those of `invariant_terms.blocks`; their element matrix has no negative eigenvalue.
 
     Args:
         parts: weights and laws that add up.

@@ -47,7 +47,7 @@ def run(
 
     Args:
         scene: `Scene`.
-        text: the scene file; results of another are not gone on with.
+        text: the scene file; results of another file are not continued.
         out: file of the results, which the caller writes before it removes `parts.beside(out)`.
         every: steps a part.
         resume: go on with the parts that are there.
@@ -75,7 +75,7 @@ def run(
 
 
 def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[int], None] | None) -> Ran:
-    """Parts found in the folder, and the others computed and written."""
+    """Read the parts that are in the folder; compute and write the others."""
     firsts = range(1, scene.solve.steps + 1, count)
     files = [None if folder is None else parts.part(folder, k) for k in range(len(firsts))]
     state, results, computed, run_time = initial_state(scene), [], 0, 0.0

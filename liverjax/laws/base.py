@@ -252,7 +252,7 @@ class Volumetric(Law):
 
 
 def _added(parts: list) -> Any:
-    """The sum of laws, or `None` of no law."""
+    """The sum of the laws; `None` if there are none."""
     return sum(parts) if parts else None
 
 

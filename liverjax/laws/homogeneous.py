@@ -1,4 +1,4 @@
-"""Homogeneous tests of an incompressible sample: deformation gradients and the nominal stress that they take."""
+"""Homogeneous tests of an incompressible sample: deformation gradients and nominal stresses."""
 
 from typing import Any
 

@@ -20,7 +20,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
     """Integrals over the reference volume of a density times the linear function of every vertex: (V,).
 
     Args:
-        density: one number a point of integration, (E,) of linear elements, else (Q, E); or (E,) for all of them.
+        density: one number for each quadrature point, (E,) or (Q, E), or one for each element (E,).
     """
     if density.ndim == 1:
         return to_nodes(mesh, mesh.volumes * density / 4)

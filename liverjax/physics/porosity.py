@@ -191,7 +191,7 @@ class CoupledSponge(Sponge):
     flow: Flow = param("1", "the equation of the pressure")
 
     def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """By the step's own volume change."""
+        """Pressures from the volume change of this step."""
         return pressure(self.porosity, mesh, self.fluid, self.flow, J)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:

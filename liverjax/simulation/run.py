@@ -117,8 +117,8 @@ def simulate(
     Args:
         scene: `Scene`.
         start: positions (V, 3) [m] to begin at, at rest, with the pressure and memory of the reference; None: the
-            reference positions. Inverted elements need robust = "projected", which takes the start of a static scene
-            for a guess: where it is inverted or leads nowhere, the load is followed from the reference positions.
+            reference positions. Inverted elements need robust = "projected". A static scene then takes the start as
+            a guess. If the guess is inverted or leads nowhere, the run begins at the reference positions.
         report: called on the host with the number of every finished step, for progress.
         store: of a derivative in reverse mode: "all" keeps what every step ended with; "sqrt", or a number, keeps as
             many states (the root of the number of steps) and runs what lies between a second time. Without a

@@ -131,7 +131,7 @@ def _moved(
 def _half_moved(
     density: Density, now: _Particles, power: float, halves: tuple[slice, slice], rng: np.random.Generator
 ) -> float:
-    """Move the first half in place by differences of the second; the part that was accepted.
+    """Move the first half in place by differences of the second; return the accepted fraction.
 
     These differences do not depend on the particles that they move, so the density stays as it is.
     """
