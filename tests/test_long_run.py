@@ -8,11 +8,13 @@ import time
 from pathlib import Path
 
 import h5py
+import jax
 import numpy as np
 import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
+from liverjax.core import programs
 from liverjax.jobs import parts
 from liverjax.scenes import scene_file
 
@@ -49,6 +51,19 @@ integrator = "newmark"
 dt = 0.02
 steps = 10
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _kept(tmp_path_factory):
+    """A command finds the program of the one before, as a user's does: it is compiled once for all tests here."""
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_logging_level")
+    before = {name: getattr(jax.config, name) for name in names}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+        patch.setenv(programs.SWITCH, str(tmp_path_factory.mktemp("programs")))
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 @pytest.fixture
@@ -102,7 +117,7 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
 
 
 def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys):
-    command = ["simulate", str(scene), "--every", "5", "--out", str(tmp_path)]
+    command = ["simulate", str(scene), "--every", "4", "--out", str(tmp_path)]
     with monkeypatch.context() as patch:
         _stop_after(patch, 1)
         assert main(command) == 130
