@@ -226,7 +226,7 @@ def _bogen() -> Candidate:
 
 def initial_modulus(curves: list[Curve]) -> float:
     """Scale of the shear modulus [Pa] for starts: median of the stress over that of a unit neo-Hookean law."""
-    unit = laws.NeoHookean(mu=1.0, bulk=None)
+    unit = laws.NeoHookean(mu=1.0, bulk=None)  # type: ignore[arg-type]  # the sample is incompressible
     ratios = []
     for c in curves:
         model = np.asarray(homogeneous.nominal_stress(unit, jnp.asarray(c.F)))[:, c.component[0], c.component[1]]

@@ -4,8 +4,11 @@ import dataclasses
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 T = TypeVar("T")
+#: One number, or an array of one for each element or sample; it may be traced.
+Number = float | np.ndarray | jax.Array
 
 
 def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:

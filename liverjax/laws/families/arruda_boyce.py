@@ -1,8 +1,8 @@
 """Arruda-Boyce, the eight-chain law of the chapter's liver."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 #: Series coefficients of the inverse Langevin function; the chapter's print lacks the numerators (11, 19, 519).
@@ -16,9 +16,9 @@ class ArrudaBoyce(Law):
     Chapter, Table 1 with its numerators mended; Arruda and Boyce 1993. mu = n k_B Theta, N = `chain_length`.
     """
 
-    mu: Any = param("Pa", "n k_B Theta", above=0.0, typical=730.0)
-    chain_length: Any = param("1", "rigid links of a chain, N", above=0.0, typical=8.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    mu: Number = param("Pa", "n k_B Theta", above=0.0, typical=730.0)
+    chain_length: Number = param("1", "rigid links of a chain, N", above=0.0, typical=8.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 

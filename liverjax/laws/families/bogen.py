@@ -3,9 +3,9 @@
 The chapter's Table 1 prints "- 1" in place of "- 3": then neither energy nor stress would be right at rest.
 """
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -16,9 +16,9 @@ class Bogen(Law):
     Chapter, Table 1 (with - 3 for its - 1); Bogen 1987. One term of Ogden's law.
     """
 
-    mu: Any = param("Pa", "mu; of alpha's sign for a stable law", typical=400.0)
-    alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    mu: Number = param("Pa", "mu; of alpha's sign for a stable law", typical=400.0)
+    alpha: Number = param("1", "exponent", nonzero=True, typical=4.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 from liverjax.laws.terms.green_terms import Moduli
 from liverjax.tensors.material_axes import SIX, symmetric
@@ -22,14 +22,14 @@ class Costa(Law):
     normal. Not an isochoric energy: it adds to the bulk modulus.
     """
 
-    c: Any = param("Pa", "scale", above=0.0, typical=200.0)
-    b_ff: Any = param("1", "along the fibre", above=0.0, typical=8.0)
-    b_ss: Any = param("1", "along the sheet", above=0.0, typical=4.0)
-    b_nn: Any = param("1", "along the normal", above=0.0, typical=3.0)
-    b_fs: Any = param("1", "shear fibre-sheet", above=0.0, typical=5.0)
-    b_fn: Any = param("1", "shear fibre-normal", above=0.0, typical=4.0)
-    b_sn: Any = param("1", "shear sheet-normal", above=0.0, typical=2.0)
-    bulk: Any = param("Pa", "bulk modulus of U(J)", above=0.0, typical=7700.0)
+    c: Number = param("Pa", "scale", above=0.0, typical=200.0)
+    b_ff: Number = param("1", "along the fibre", above=0.0, typical=8.0)
+    b_ss: Number = param("1", "along the sheet", above=0.0, typical=4.0)
+    b_nn: Number = param("1", "along the normal", above=0.0, typical=3.0)
+    b_fs: Number = param("1", "shear fibre-sheet", above=0.0, typical=5.0)
+    b_fn: Number = param("1", "shear fibre-normal", above=0.0, typical=4.0)
+    b_sn: Number = param("1", "shear sheet-normal", above=0.0, typical=2.0)
+    bulk: Number = param("Pa", "bulk modulus of U(J)", above=0.0, typical=7700.0)
     fibre: Any = param("1", "fibre direction, (3,) or (E, 3)", each=True, default=(1.0, 0.0, 0.0))
     sheet: Any = param("1", "sheet direction, (3,) or (E, 3)", each=True, default=(0.0, 1.0, 0.0))
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")

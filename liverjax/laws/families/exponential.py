@@ -3,11 +3,11 @@
 The chapter's Table 1 prints "- 1" in place of "- 3": then neither energy nor stress would be right at rest.
 """
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -18,10 +18,10 @@ class Exponential(Law):
     Chapter, Table 1 (with - 3 for its - 1).
     """
 
-    c1: Any = param("Pa", "scale", above=0.0, typical=385.0)
-    c2: Any = param("1", "exponent's factor", above=0.0, typical=0.25)
-    alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    c1: Number = param("Pa", "scale", above=0.0, typical=385.0)
+    c2: Number = param("1", "exponent's factor", above=0.0, typical=0.25)
+    alpha: Number = param("1", "exponent", nonzero=True, typical=4.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 

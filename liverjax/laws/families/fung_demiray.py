@@ -1,10 +1,10 @@
 """Fung-Demiray: an exponential of the first invariant."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -15,9 +15,9 @@ class FungDemiray(Law):
     Chapter, Table 1; Demiray 1972.
     """
 
-    c1: Any = param("Pa", "ground-state shear modulus", above=0.0, typical=770.0)
-    c2: Any = param("1", "exponent", above=0.0, typical=1.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    c1: Number = param("Pa", "ground-state shear modulus", above=0.0, typical=770.0)
+    c2: Number = param("1", "exponent", above=0.0, typical=1.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 

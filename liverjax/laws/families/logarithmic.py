@@ -1,10 +1,10 @@
 """Logarithm of a power of the principal stretches, infinite at a finite stretch."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -15,10 +15,10 @@ class Logarithmic(Law):
     Chapter, Table 1. Infinite where Xi(alpha) = 3 + 1/c2: NaN beyond.
     """
 
-    c1: Any = param("Pa", "scale", above=0.0, typical=1925.0)
-    c2: Any = param("1", "1 / (largest Xi - 3)", above=0.0, typical=0.05)
-    alpha: Any = param("1", "exponent", nonzero=True, typical=4.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    c1: Number = param("Pa", "scale", above=0.0, typical=1925.0)
+    c2: Number = param("1", "1 / (largest Xi - 3)", above=0.0, typical=0.05)
+    alpha: Number = param("1", "exponent", nonzero=True, typical=4.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 

@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 from liverjax.laws.derivatives import accumulate
 
@@ -30,8 +30,8 @@ class MooneyRivlin(Law):
     Chapter, Table 1. Coefficients that are not given do not exist: they cost nothing and cannot be fitted.
     """
 
-    c10: Any = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
-    c01: Any = param("Pa", "coefficient of (Ibar2 - 3)", typical=85.0)
+    c10: Number = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
+    c01: Number = param("Pa", "coefficient of (Ibar2 - 3)", typical=85.0)
     c20: Any = param("Pa", "coefficient of (Ibar1 - 3)^2", default=None)
     c11: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)", default=None)
     c02: Any = param("Pa", "coefficient of (Ibar2 - 3)^2", default=None)
@@ -39,7 +39,7 @@ class MooneyRivlin(Law):
     c21: Any = param("Pa", "coefficient of (Ibar1 - 3)^2 (Ibar2 - 3)", default=None)
     c12: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)^2", default=None)
     c03: Any = param("Pa", "coefficient of (Ibar2 - 3)^3", default=None)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "I2", "J")
 

@@ -1,10 +1,10 @@
 """Neo-Hookean laws: Table 1 of the chapter (with C1 = mu/2) and the plain compressible form."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -15,8 +15,8 @@ class NeoHookean(Law):
     Chapter, Table 1 (C1 = mu/2), written on isochoric invariants for compressible tetrahedra.
     """
 
-    mu: Any = param("Pa", "shear modulus", above=0.0, typical=770.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 
@@ -40,8 +40,8 @@ class NeoHookeanCompressible(Law):
     The compressible form of the literature (Bonet and Wood 2008, eq. 6.27), infinite at J = 0.
     """
 
-    mu: Any = param("Pa", "shear modulus", above=0.0, typical=770.0)
-    lame_lambda: Any = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
+    mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
+    lame_lambda: Number = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
     invariants: ClassVar = ("I1", "J")
 
     def strain_energy(self, I):

@@ -6,7 +6,7 @@ Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. A law of stretches receives X = Xi 
 from typing import Any, ClassVar
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -20,7 +20,7 @@ class Ogden(Law):
 
     mu: Any = param("Pa", "mu_k, one a term", each=True, typical=(700.0, -40.0))
     alpha: Any = param("1", "alpha_k, one a term", nonzero=True, each=True, typical=(2.5, -4.0))
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 

@@ -1,8 +1,8 @@
 """Saint Venant-Kirchhoff."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Number, param, struct
 from liverjax.laws.base import Law
 
 
@@ -14,8 +14,8 @@ class SaintVenantKirchhoff(Law):
     collapses in compression (stretch below about 0.6).
     """
 
-    mu: Any = param("Pa", "second Lame coefficient, the shear modulus", above=0.0, typical=770.0)
-    lame_lambda: Any = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
+    mu: Number = param("Pa", "second Lame coefficient, the shear modulus", above=0.0, typical=770.0)
+    lame_lambda: Number = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
     invariants: ClassVar = ("I1", "I2")
 
     def strain_energy(self, I):

@@ -1,11 +1,11 @@
 """Stable neo-Hookean: finite for every deformation gradient, inverted ones included."""
 
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Number, param, struct
 from liverjax.laws.base import Law
 
 
@@ -17,8 +17,8 @@ class StableNeoHookean(Law):
     lambda are the Lame coefficients of the ground state (their section 3.4).
     """
 
-    mu: Any = param("Pa", "shear modulus", above=0.0, typical=770.0)
-    lame_lambda: Any = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
+    mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
+    lame_lambda: Number = param("Pa", "first Lame coefficient", lower=0.0, typical=7000.0)
     invariants: ClassVar = ("I1", "J")
 
     def _constants(self):

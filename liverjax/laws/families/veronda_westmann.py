@@ -1,10 +1,10 @@
 """Veronda-Westmann: an exponential of the first invariant beside the second."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -15,9 +15,9 @@ class VerondaWestmann(Law):
     Veronda and Westmann 1970; the second term of the chapter's Table 1 has the units of a number.
     """
 
-    c1: Any = param("Pa", "scale of the exponential", above=0.0, typical=350.0)
-    c2: Any = param("1", "exponent", above=0.0, typical=2.2)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    c1: Number = param("Pa", "scale of the exponential", above=0.0, typical=350.0)
+    c2: Number = param("1", "exponent", above=0.0, typical=2.2)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "I2", "J")
 

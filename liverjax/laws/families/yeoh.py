@@ -1,8 +1,8 @@
 """Yeoh, the reduced polynomial."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -13,10 +13,10 @@ class Yeoh(Law):
     Chapter, Table 1 (reduced polynomial model).
     """
 
-    c1: Any = param("Pa", "coefficient of (Ibar1 - 3)", above=0.0, typical=385.0)
-    c2: Any = param("Pa", "coefficient of (Ibar1 - 3)^2", typical=150.0)
-    c3: Any = param("Pa", "coefficient of (Ibar1 - 3)^3", typical=40.0)
-    bulk: Any = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
+    c1: Number = param("Pa", "coefficient of (Ibar1 - 3)", above=0.0, typical=385.0)
+    c2: Number = param("Pa", "coefficient of (Ibar1 - 3)^2", typical=150.0)
+    c3: Number = param("Pa", "coefficient of (Ibar1 - 3)^3", typical=40.0)
+    bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "J")
 

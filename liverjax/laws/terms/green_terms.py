@@ -1,6 +1,6 @@
 """Hand-derived stress and stiffness of laws w(E) of Green's strain in the axes of the material."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,9 @@ from liverjax.tensors.matrices import (
     unit,
 )
 
+if TYPE_CHECKING:
+    from liverjax.laws.base import Law
+
 
 class Moduli(NamedTuple):
     """dS/dE = orthotropic moduli + `curvature` S (x) S, all in the axes of the material."""
@@ -52,7 +55,7 @@ def components(direction: Any, like: Any) -> Vector:
     return unit(tuple(direction[..., i] for i in range(3)))
 
 
-def material_axes(law: Any, like: Any) -> Matrix:
+def material_axes(law: "Law", like: Any) -> Matrix:
     """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes where a law has no fibre."""
     if law.fibre is None:
         return IDENTITY
@@ -61,13 +64,13 @@ def material_axes(law: Any, like: Any) -> Matrix:
     return transpose((f, s, cross(f, s)))
 
 
-def stress(law: Any, F: Matrix) -> Matrix:
+def stress(law: "Law", F: Matrix) -> Matrix:
     """Second Piola-Kirchhoff stress [Pa] of w alone."""
     A = material_axes(law, F[0][0])
     return rotated(_stress_of_strain(law, green_strain(matmul(F, A))), A)
 
 
-def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+def blocks(law: "Law", F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
     A = material_axes(law, F[0][0])
     FA = matmul(F, A)
@@ -86,7 +89,7 @@ def blocks(law: Any, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     ]
 
 
-def _stress_of_strain(law: Any, E: Matrix) -> Matrix:
+def _stress_of_strain(law: "Law", E: Matrix) -> Matrix:
     if law.green_derivatives is not None:
         return law.green_derivatives(E)[0]
     return symmetric(tuple(_slopes(lambda six: law.green_energy(symmetric(six)), six_of(E))))
@@ -102,7 +105,7 @@ def _slopes(function: Any, six: tuple) -> list:
     return result
 
 
-def _autodiff_moduli(law: Any, E: Matrix) -> list[list]:
+def _autodiff_moduli(law: "Law", E: Matrix) -> list[list]:
     six = six_of(E)
     return [
         _slopes(lambda six, a=a: _slopes(lambda six: law.green_energy(symmetric(six)), six)[a], six) for a in range(6)

@@ -7,7 +7,7 @@ Chapter, section 4.1.2, contracted: with J as one more invariant and v_a,i = dI_
 No matrix is inverted. Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -30,6 +30,9 @@ from liverjax.tensors.matrices import (
     transpose,
 )
 from liverjax.tensors.principal import principal
+
+if TYPE_CHECKING:
+    from liverjax.laws.base import Law
 
 
 class Stress(NamedTuple):
@@ -61,7 +64,7 @@ class State(NamedTuple):
     frame: Any  # principal stretches and axes, where a summand has an energy of stretches
 
 
-def state(law: Any, F: Matrix) -> State:
+def state(law: "Law", F: Matrix) -> State:
     """The law (`liverjax.laws.base.Law`) at F."""
     return _state(Scalars(*law.energy_derivatives(law.measures(F))), F, law.summands())
 
@@ -139,7 +142,7 @@ def second_piola(F: Matrix, resultant: Stress) -> Matrix:
     return tuple(tuple(entry(min(i, j), max(i, j)) for j in range(3)) for i in range(3))
 
 
-def first_piola(law: Any, F: Matrix) -> Matrix:
+def first_piola(law: "Law", F: Matrix) -> Matrix:
     """First Piola-Kirchhoff stress [Pa] of a tuple matrix F."""
     s = state(law, F)
     return piola(F, s.cof, stress(s))
