@@ -4,8 +4,6 @@ Vehtari, Gelman, Simpson, Carpenter and Buerkner (2021), Bayesian Analysis 16, 6
 """
 
 import numpy as np
-import scipy.special
-import scipy.stats
 
 
 def r_hat(draws: np.ndarray) -> float:
@@ -17,6 +15,9 @@ def r_hat(draws: np.ndarray) -> float:
 
 
 def _normal_scores(draws: np.ndarray) -> np.ndarray:
+    import scipy.special
+    import scipy.stats  # half a second, which a fit without samples need not wait
+
     ranks = scipy.stats.rankdata(draws, method="average").reshape(draws.shape)
     return scipy.special.ndtri((ranks - 0.375) / (draws.size + 0.25))
 
