@@ -1,0 +1,171 @@
+"""A rigid indenter on an elastic layer that is bonded to a rigid base: small strains, no friction, no adhesion.
+
+A layer of any thickness under a punch, a sphere or a cone has an exact solution. Its surface moves by K(xi h) times
+what a half-space would do, for every wave number xi. This makes one integral equation on the contact circle, which is
+solved at Gauss points. The force is linear in the modulus, so one table of force over depth serves a whole fit.
+
+Sources: Lebedev and Ufliand 1958, J. Appl. Math. Mech. 22:442; Hayes et al. 1972, J. Biomech. 5:541 (the layer);
+Sneddon 1965, Int. J. Eng. Sci. 3:47 (the half-space); Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.interpolate
+
+from liverjax.core.errors import InputError
+
+SHAPES = ("sphere", "cone", "punch")
+#: Largest contact radius over thickness that a table goes to.
+WIDEST = 8.0
+#: Beyond this, 1 - K(eta), which falls as eta^2 exp(-2 eta), is below 1e-13.
+_LAST_WAVE = 20.0
+_WAVES, _POINTS, _ROWS = 160, 48, 48
+
+
+class Factors(NamedTuple):
+    """How much more force a layer takes than a half-space at the same depth."""
+
+    reach: np.ndarray  # (n,) ascending from 0: size of the half-space's contact over the thickness, see `reach`
+    factor: np.ndarray  # (n,) force over that of the half-space
+
+
+def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
+    """1 - K(eta), with K the surface motion of a bonded layer over that of a half-space at wave number eta/h."""
+    c = 3 - 4 * poisson
+    # Divided by exp(2 eta), so that no hyperbolic function overflows.
+    e = np.exp(-2 * eta)
+    above = c * (1 - e**2) - 4 * eta * e
+    below = c * (1 + e**2) + (4 * eta**2 + 1 + c**2) * e
+    return 1 - above / below
+
+
+def _contact(width: float, poisson: float, shape: str) -> tuple[float, float]:
+    """Depth and force at contact radius over thickness `width`, over those of the half-space at the same radius."""
+    tau, w = np.polynomial.legendre.leggauss(_POINTS)
+    tau, w = np.append((tau + 1) / 2, 1.0), np.append(w / 2, 0.0)  # the edge of the contact has no weight
+    eta, v = np.polynomial.legendre.leggauss(_WAVES)
+    eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
+    waves = np.cos(width * np.outer(tau, eta))
+    kernel = 2 / np.pi * width * (waves * (v * stiffening(eta, poisson))) @ waves.T
+    profile = {"sphere": tau**2, "cone": np.pi / 2 * tau, "punch": 0 * tau}[shape]
+    level, dented = np.linalg.solve(np.eye(len(tau)) - kernel * w, np.stack([np.ones_like(tau), profile], axis=1)).T
+    if shape == "punch":
+        return 1.0, float(w @ level)
+    depth = dented[-1] / level[-1]  # the pressure ends without a jump
+    alone = w @ (profile[-1] - profile)
+    return float(depth / profile[-1]), float(w @ (depth * level - dented) / alone)
+
+
+def factors(poisson: float, shape: str) -> Factors:
+    """The table of a sphere or cone, by contact radius over thickness from 0 to 8.
+
+    Args:
+        poisson: 0 to 0.5.
+        shape: "sphere" or "cone".
+    """
+    power = {"sphere": 1.5, "cone": 2.0}[shape]
+    widths = np.geomspace(1e-3, WIDEST, _ROWS)
+    depth, force = np.array([_contact(width, poisson, shape) for width in widths]).T
+    size = widths * (np.sqrt(depth) if shape == "sphere" else np.pi / 2 * depth)
+    return Factors(np.append(0.0, size), np.append(1.0, force / depth**power))
+
+
+def punch_factor(radius: float, thickness: float, poisson: float) -> float:
+    """The factor that Hayes tabulates: force of a flat punch on a layer over that on a half-space."""
+    return _contact(radius / thickness, poisson, "punch")[1]
+
+
+class Indenter(NamedTuple):
+    """An indenter on a layer."""
+
+    shape: str  # one of `SHAPES`
+    thickness: float  # [m]
+    poisson: float
+    radius: float = 0.0  # [m] of sphere and punch
+    half_angle: float = 45.0  # [deg] of the cone, between axis and side
+
+
+def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
+    """Size of the half-space's contact over the thickness: sqrt(R d)/h of a sphere, d tan(angle)/h of a cone."""
+    depth = np.maximum(depth, 0.0)
+    if rig.shape == "sphere":
+        return np.sqrt(rig.radius * depth) / rig.thickness
+    return depth * np.tan(np.deg2rad(rig.half_angle)) / rig.thickness
+
+
+def half_space(rig: Indenter, depth: np.ndarray) -> np.ndarray:
+    """Force [N] per unit Young's modulus [Pa] at depths [m], 0 before contact; by Hertz and by Sneddon."""
+    depth, plane = np.maximum(depth, 0.0), 1 / (1 - rig.poisson**2)
+    if rig.shape == "sphere":
+        return 4 / 3 * plane * np.sqrt(rig.radius) * depth**1.5
+    if rig.shape == "cone":
+        return 2 / np.pi * plane * np.tan(np.deg2rad(rig.half_angle)) * depth**2
+    return 2 * plane * rig.radius * depth
+
+
+def check_indenter(rig: Indenter) -> None:
+    """Refuse what no layer can take.
+
+    Raises:
+        InputError: an unknown shape, a length that is not above 0, a Poisson's ratio or an angle out of bounds.
+    """
+    if rig.shape not in SHAPES:
+        raise InputError(f"shape = {rig.shape!r} is not known: use {', '.join(SHAPES)}")
+    for name in ("thickness",) if rig.shape == "cone" else ("thickness", "radius"):
+        value = getattr(rig, name)
+        if not 0 < value < np.inf:
+            raise InputError(f"{name} = {value} of the indentation must be above 0: give it in m")
+    if not 0 <= rig.poisson <= 0.5:
+        raise InputError(f"poisson = {rig.poisson} must be from 0 to 0.5: give 0.5 for an incompressible layer")
+    if rig.shape == "cone" and not 0 < rig.half_angle < 90:
+        raise InputError(f"half_angle = {rig.half_angle} of the cone must be between 0 and 90: give it in degrees")
+    if rig.shape == "punch" and rig.radius > WIDEST * rig.thickness:
+        raise InputError(
+            f"radius = {rig.radius} m of the punch is over {WIDEST:g} times the thickness: use a smaller one"
+        )
+
+
+class Layer:
+    """Force of an indenter on its layer; the table is made once.
+
+    Raises:
+        InputError: a rig that cannot be used, or depths beyond `deepest`.
+    """
+
+    def __init__(self, rig: Indenter) -> None:
+        check_indenter(rig)
+        self.rig = rig
+        if rig.shape == "punch":
+            self._punch, self.deepest = punch_factor(rig.radius, rig.thickness, rig.poisson), np.inf
+            return
+        table = factors(rig.poisson, rig.shape)
+        self._factor = scipy.interpolate.CubicSpline(table.reach, table.factor)
+        unit = reach(rig, np.ones(1))[0]
+        #: Depth [m] that the table goes to.
+        self.deepest = float((table.reach[-1] / unit) ** (2 if rig.shape == "sphere" else 1))
+
+    def force(self, depth: np.ndarray) -> np.ndarray:
+        """Force [N] per unit Young's modulus [Pa] at depths [m] up to `deepest`, 0 before contact."""
+        largest = float(np.max(depth, initial=0.0))
+        if largest > self.deepest:
+            raise InputError(
+                f"depth = {largest:.4g} m is more than the {self.deepest:.4g} m that the layer's table covers: leave "
+                "deeper points out"
+            )
+        alone = half_space(self.rig, depth)
+        return alone * (self._punch if self.rig.shape == "punch" else self._factor(reach(self.rig, depth)))
+
+
+def series(chi: np.ndarray, poisson: float) -> np.ndarray:
+    """The factor of a sphere to third order in chi = sqrt(R d)/h, from the same integral equation; for small chi."""
+    eta, v = np.polynomial.legendre.leggauss(_WAVES)
+    eta, v = _LAST_WAVE * (eta + 1) / 2, _LAST_WAVE * v / 2
+    missing = v * stiffening(eta, poisson)
+    c, b = 2 / np.pi * np.sum(missing), np.sum(missing * eta**2) / np.pi
+    return 1 + c * chi + 7 / 6 * c**2 * chi**2 + (40 / 27 * c**3 - 8 / 15 * b) * chi**3
+
+
+def dimitriadis(chi: np.ndarray) -> np.ndarray:
+    """The factor of a sphere on an incompressible layer as Dimitriadis et al. print it (equation 12); for small chi."""
+    return 1 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4
