@@ -69,6 +69,14 @@ def pressure_forces(triangles: jax.Array, x: jax.Array, mesh: TetMesh | None = N
     return force
 
 
+def slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (Q,) of points on a triangle; slopes (2, Q, n) of its functions towards its second and third vertex."""
+    if mesh.order == 1:
+        return np.ones(1), np.array([[[-1.0, 1.0, 0.0]], [[-1.0, 0.0, 1.0]]])
+    weights, l = triangle_rule()
+    return weights, np.swapaxes(np.stack(_quadratic(l)[1]), 1, 2)
+
+
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Six functions (6, Q) at barycentric coordinates l (3, Q), and their slopes towards the last vertices."""
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]

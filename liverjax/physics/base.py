@@ -25,6 +25,7 @@ import numpy as np
 
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector
 
@@ -173,6 +174,10 @@ class NodalForce:
 
     def stiffness(self) -> Block | None:
         """Diagonal blocks 3 x 3 of (V,) [N/m], an entry None where it is 0; None: the force is constant."""
+        return None
+
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached | None:
+        """Stiffness at x of elements of its own between nodes, beside that of `stiffness`; None: it has none."""
         return None
 
     def predicted(self) -> jax.Array | None:

@@ -4,6 +4,9 @@ from typing import Any
 
 from liverjax.laws.base import Law, isochoric_part
 from liverjax.physics import porosity
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.attached.membrane import Membrane
+from liverjax.physics.attached.vessel import Vessel
 from liverjax.physics.base import Physics
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.elasticity import Elasticity
@@ -18,6 +21,9 @@ from liverjax.physics.volumes.mixed import MixedVolume
 NAMED: tuple[type[Physics], ...] = (
     ElasticSupport,
     SlidingSupport,
+    Membrane,
+    Ligament,
+    Vessel,
 )
 
 

@@ -19,7 +19,8 @@ from liverjax.mesh.adjacency import PAIRS
 from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
-from liverjax.solvers import block_matrix, direct, point_matrix
+from liverjax.solvers import attached, block_matrix, direct, point_matrix
+from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.krylov import conjugate_gradients, refined, stabilised_biconjugate_gradients, true_residual
 from liverjax.solvers.point_matrix import PointMatrix
@@ -84,6 +85,18 @@ def node_blocks(e: Equations) -> Block | None:
     return total
 
 
+def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached, ...]:
+    """Stiffness of elements between nodes that the physics bring."""
+    found = (a.attached(e.mesh, x, s) for a in e.nodal)
+    return tuple(own if kind == "true" else attached.definite(own) for own in found if own is not None)
+
+
+def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -> Block:
+    for own in more:
+        diagonal = block_matrix.added(diagonal, attached.diagonal(own, e.mesh.number_of_nodes))
+    return diagonal
+
+
 def _shift(e: Equations) -> jax.Array | None:
     """Size (V,) [N/m] of what acts on every node, or None: it keeps slow motions small."""
     own = [a.stiffness() for a in e.nodal if a.everywhere]
@@ -104,6 +117,7 @@ class Tangent(NamedTuple):
     slow: Coarse
     x: jax.Array | None  # (V, 3) where it was made, for loads that follow
     s: Any  # part of the step there
+    attached: tuple[Attached, ...] = ()  # elements between nodes, not in the matrix
 
 
 def tangent(
@@ -120,28 +134,28 @@ def tangent(
     flag is set; `kind` is one of `KINDS`. Everything in the result is without derivative.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
-    matrix, inverse, below, A = _assembled(e, pressure, x, kind=kind)
+    matrix, inverse, below, A, more = _assembled(e, pressure, x, s, kind=kind)
 
     def new() -> Coarse:
         return _coarse(e, A)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     # Loads that follow the body need to know where.
-    return Tangent(matrix, inverse, below, slow, *((None, None) if e.conservative else (x, s)))
+    return Tangent(matrix, inverse, below, slow, *((None, None) if e.conservative else (x, s)), more)
 
 
-#: Matrix, inverse and vertices of a `Tangent`, and the matrix that its coarse space is made of.
-_Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix]
+#: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
+_Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix, tuple[Attached, ...]]
 
 # A program has the two functions below several times: within jit they are traced once.
 
 
 @partial(jax.jit, static_argnames="kind")
-def _assembled(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembled:
+def _assembled(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> _Assembled:
     """The tangent without its coarse space."""
     mesh, volume = e.mesh, _coupled(e)
     if mesh.order > 1:
-        return _of_points(e, pressure, x, kind)
+        return _of_points(e, pressure, x, s, kind)
     if volume is None:
         A = stiffness(e, pressure, x, kind)
         diagonal = A.diagonal
@@ -151,8 +165,9 @@ def _assembled(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembl
         pressures = volume.matrix(mesh, determinant(F), kind != "true")
         A = mixed_system.coupled(mesh, K, node_blocks(e), F, pressures)
         diagonal = mixed_system.undrained_diagonal(A, 1.0 if volume.flow is None else volume.flow.mask)
-    inverse = block_matrix.inverse_blocks(diagonal, e.free.mask, e.free.normals)
-    return A, inverse, None, A
+    more = _attached(e, x, s, kind)
+    inverse = block_matrix.inverse_blocks(_with_diagonals(e, diagonal, more), e.free.mask, e.free.normals)
+    return A, inverse, None, attached.with_attached(mesh, A, more), more
 
 
 @jax.jit
@@ -162,7 +177,7 @@ def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
     return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 
 
-def _of_points(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembled:
+def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> _Assembled:
     """The tangent of quadratic elements: moduli at their points, and two levels of a preconditioner."""
     mesh, volume = e.mesh, _coupled(e)
     F = deformation_gradient(mesh, x)
@@ -177,10 +192,11 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, kind: str) -> _Assembl
         g = mesh.weights * e.mixed.border(determinant(F))
         A = A._replace(border=stored([scale(g, v) for v in volume_gradients(mesh, F)[1:]]))
     own = point_matrix.levels(mesh, A, bulk)
-    inverse = block_matrix.inverse_blocks(own.diagonal, e.free.mask, e.free.normals)
-    free = _of_vertices(e)
-    vertices = block_matrix.inverse_blocks(own.vertices.diagonal, free.mask, free.normals)
-    return A, inverse, vertices, own.vertices
+    more = _attached(e, x, s, kind)
+    inverse = block_matrix.inverse_blocks(_with_diagonals(e, own.diagonal, more), e.free.mask, e.free.normals)
+    free, below = _of_vertices(e), attached.with_attached(mesh, own.vertices, more)
+    vertices = block_matrix.inverse_blocks(below.diagonal, free.mask, free.normals)
+    return A, inverse, vertices, below, more
 
 
 def _of_vertices(e: Equations) -> Free:
@@ -261,11 +277,13 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
             force = point_matrix.product(e.mesh, A, motion)
         else:
             force = mixed_system.eliminated_points(e.mesh, volume.flow, A, motion, exactly)
+        for own in K.attached:
+            force = block_matrix.sums(force, attached.product(own, motion))
         if following and K.x is not None:
             dx = jnp.stack(motion, axis=-1)
             for a in following:
                 change = a.product(e.mesh, K.x, K.s, dx)
-                force = tuple(f + c for f, c in zip(force, change.T, strict=True))
+                force = block_matrix.sums(force, change.T)
         return _flat(e, force) if balance is None else jnp.concatenate([_flat(e, force), balance])
 
     return apply
@@ -289,12 +307,12 @@ def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
     free, load, volume = e.free.mask.T, b.reshape(3, -1), _coupled(e)
     if isinstance(K.matrix, PointMatrix):
         known = jnp.ones(0) if volume is None or volume.flow is None else volume.flow.mask
-        return direct.solve_points(e.mesh, K.matrix, (free, known), load, e.free.normals).ravel()
+        return direct.solve_points(e.mesh, K.matrix, (free, known), load, e.free.normals, K.attached).ravel()
     if volume is not None:
         known = jnp.ones_like(free[:1]) if volume.flow is None else volume.flow.mask[None]
         free = jnp.concatenate([free, known])
         load = jnp.concatenate([load, jnp.zeros_like(load[:1])])
-    return direct.solve(K.matrix, free, load, e.free.normals)[:3].ravel()
+    return direct.solve(K.matrix, free, load, e.free.normals, K.attached)[:3].ravel()
 
 
 def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int) -> tuple[jax.Array, jax.Array]:

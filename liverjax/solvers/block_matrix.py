@@ -4,7 +4,7 @@ Each block of an edge is scattered once. Forces do not change under translation,
 the other blocks in its row. Callers give what else belongs on the diagonal.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -135,6 +135,11 @@ def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ..
 
 def _row(entries: Any, columns: Sequence[jax.Array]) -> jax.Array:
     return sum(entry * column for entry, column in zip(entries, columns, strict=False))
+
+
+def sums(a: Sequence[jax.Array], b: Iterable[jax.Array]) -> tuple[jax.Array, ...]:
+    """Sums of columns (V,)."""
+    return tuple(x + y for x, y in zip(a, b, strict=True))
 
 
 def columns(vector: jax.Array) -> tuple[jax.Array, ...]:

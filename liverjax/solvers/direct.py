@@ -12,6 +12,7 @@ import numpy as np
 
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
 
@@ -19,18 +20,22 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 
-def solve(A: BlockMatrix, free: jax.Array, b: jax.Array, normals: jax.Array | None = None) -> jax.Array:
+def solve(
+    A: BlockMatrix, free: jax.Array, b: jax.Array, normals: jax.Array | None = None, attached: tuple[Attached, ...] = ()
+) -> jax.Array:
     """Solution (m, V) of A x = b (m, V) for m x m blocks, 0 where `free` (m, V) is 0; NaN where A is singular.
 
-    With `normals` (V, 3), unit vectors or 0, the first three rows of x are 0 along them.
+    With `normals` (V, 3), unit vectors or 0, the first three rows of x are 0 along them. `attached` adds to A.
     """
     rows, diagonal = (jnp.stack([jnp.stack(row) for row in blocks]) for blocks in (A.rows, A.diagonal))
     shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
-    given = (rows, diagonal, A.nodes, free, b, normals)
+    given = (rows, diagonal, A.nodes, free, b, normals, attached)
     return jax.pure_callback(_solve, shape, *given, vmap_method="sequential")
 
 
-def solve_points(mesh: TetMesh, A: PointMatrix, free: Any, b: jax.Array, normals: Any = None) -> jax.Array:
+def solve_points(
+    mesh: TetMesh, A: PointMatrix, free: Any, b: jax.Array, normals: Any = None, attached: tuple[Attached, ...] = ()
+) -> jax.Array:
     """The same of quadratic elements, positions alone: b and the solution are (3, V).
 
     Pressures of the vertices, where A has them, are unknowns beside the positions; their row of the balance is 0.
@@ -45,7 +50,8 @@ def solve_points(mesh: TetMesh, A: PointMatrix, free: Any, b: jax.Array, normals
     nodes = jnp.stack(mesh.element_nodes)
     shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
     host = partial(_solve_points, mesh.order)
-    return jax.pure_callback(host, shape, blocks, nodes, own, coupled, free, b, normals, vmap_method="sequential")
+    given = (blocks, nodes, own, coupled, free, b, normals, attached)
+    return jax.pure_callback(host, shape, *given, vmap_method="sequential")
 
 
 def _filled(blocks: Block, like: jax.Array) -> jax.Array:
@@ -64,10 +70,19 @@ def _across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     return scipy.sparse.coo_array((values, (lines, columns)), shape=(size, size)).tocsr()
 
 
-def _solve(rows: Any, diagonal: Any, nodes: Any, free: Any, b: Any, normals: Any) -> np.ndarray:
+def _entries(attached: tuple[Attached, ...], n: int) -> list[tuple]:
+    """Values, lines and columns of elements between nodes, of unknowns in which all x of n nodes come first."""
+    found = []
+    for nodes, blocks in attached:
+        at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(-1, nodes.shape[1])
+        found.append((blocks.reshape(len(at), len(at), -1), at[:, None], at[None]))
+    return found
+
+
+def _solve(*given: Any) -> np.ndarray:
     import scipy.sparse
 
-    rows, diagonal, nodes, free, b = (np.asarray(a) for a in (rows, diagonal, nodes, free, b))
+    rows, diagonal, nodes, free, b, normals, attached = jax.tree.map(np.asarray, given)
     m, n = b.shape
     own = np.arange(n)
     lines, columns, values = [], [], []
@@ -76,6 +91,9 @@ def _solve(rows: Any, diagonal: Any, nodes: Any, free: Any, b: Any, normals: Any
             lines += [np.broadcast_to(r * n + own, nodes.shape).ravel(), r * n + own]
             columns += [(c * n + nodes).ravel(), c * n + own]
             values += [rows[r, c].ravel(), diagonal[r, c]]
+    for entry in _entries(attached, n):
+        more = [a.ravel() for a in np.broadcast_arrays(*entry)]
+        values, lines, columns = [*values, more[0]], [*lines, more[1]], [*columns, more[2]]
     A = scipy.sparse.coo_array((np.concatenate(values), (np.concatenate(lines), np.concatenate(columns))))
     return _factorised(A.tocsr(), free.ravel(), b.ravel(), normals, abs(diagonal[0, 0]).mean()).reshape(m, n)
 
@@ -83,7 +101,7 @@ def _solve(rows: Any, diagonal: Any, nodes: Any, free: Any, b: Any, normals: Any
 def _solve_points(order: int, *given: Any) -> np.ndarray:
     import scipy.sparse
 
-    blocks, nodes, own, coupled, free, b, normals = jax.tree.map(np.asarray, given)
+    blocks, nodes, own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
     n, c = b.shape[1], basis(order).c
     pairs = [(a, b) for a in (1, 2, 3) for b in (1, 2, 3) if a <= b]
     K = np.zeros((4, 4, 3, 3, *blocks.shape[-2:]))
@@ -93,7 +111,7 @@ def _solve_points(order: int, *given: Any) -> np.ndarray:
     K[:, 0] = -K[:, 1:].sum(axis=1)
     element = np.einsum("akq,klrsqe,blq->arbse", c, K, c, optimize=True).reshape(3 * len(nodes), 3 * len(nodes), -1)
     at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(3 * len(nodes), -1)
-    entries = [(element, at[:, None], at[None])]
+    entries = [(element, at[:, None], at[None]), *_entries(attached, n)]
     if own is not None:
         every = np.arange(n)
         entries += [(own[r, s], r * n + every, s * n + every) for r in range(3) for s in range(3)]

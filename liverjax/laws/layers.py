@@ -1,0 +1,88 @@
+"""Laws in thin parts of a body: layers without stress across them, and bars; isotropic ones."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.laws.base import Law
+from liverjax.laws.registry import create, find
+
+#: Iterations for the stretch of the thickness, and the most that its logarithm changes in one.
+_ITERATIONS, _LONGEST = 30, 0.5
+
+
+def read(table: Any, name: str) -> Law:
+    """The law of a thin part by its table; its bulk modulus may be left out, since it does not act.
+
+    Raises:
+        InputError: an unknown law or number, in a sentence that begins with `name`.
+    """
+    if not isinstance(table, dict) or "name" not in table:
+        raise InputError(f'{name} law needs name = "…": python -m liverjax laws lists them')
+    values = {key: value for key, value in table.items() if key != "name"}
+    fields = {f.name: f for f in dataclasses.fields(find(table["name"]))}  # type: ignore[arg-type]
+    without = "bulk" in fields and "bulk" not in values
+    try:
+        law = create(table["name"], **values | ({"bulk": 1.0} if without else {}))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    return replace(law, bulk=None) if without else law
+
+
+def check(law: Law, name: str) -> None:
+    """Refuse a law that has directions, or numbers that do not go together.
+
+    Raises:
+        InputError: one sentence that begins with `name`.
+    """
+    if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
+        raise InputError(f"{name}.law has directions, which a thin part does not know: take an isotropic law")
+    law.check()
+
+
+def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
+    """Energy density (Q, m) [Pa] of a layer without stress across it.
+
+    Args:
+        law: isotropic; at J = 1, or at the J that leaves no stress across where `solved`.
+        C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
+        solved: whether the stretch of the thickness is solved for.
+    """
+    f11 = jnp.sqrt(C[0])
+    f12 = C[1] / f11
+    f22 = jnp.sqrt(C[2] - f12 * f12)
+
+    def density(log_stretch: jax.Array) -> jax.Array:
+        zero = jnp.zeros_like(f11)
+        F = ((f11, f12, zero), (zero, f22, zero), (zero, zero, jnp.exp(log_stretch)))
+        return law.strain_energy(law.measures(F))
+
+    thinner = -jnp.log(f11 * f22)
+    return density(_thinned(density, thinner) if solved else thinner)
+
+
+def _thinned(density: Any, start: jax.Array) -> jax.Array:
+    """Logarithm (Q, m) of the thickness stretch that makes the energy least; its derivatives are those of the root."""
+
+    def slope(u: jax.Array) -> jax.Array:
+        return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]
+
+    def newton(u: jax.Array) -> jax.Array:
+        first, second = jax.jvp(slope, (u,), (jnp.ones_like(u),))
+        # Downhill also where the energy is not convex.
+        return u - jnp.clip(first / jnp.where(second == 0, 1.0, jnp.abs(second)), -_LONGEST, _LONGEST)
+
+    frozen = jax.lax.stop_gradient
+    u = jax.lax.fori_loop(0, _ITERATIONS, lambda _, u: frozen(newton(u)), frozen(start))
+    # At the root one iteration more carries the first derivative, a second one the next.
+    return newton(newton(u))
+
+
+def axial_energy(law: Law, stretch: jax.Array) -> jax.Array:
+    """Energy density [Pa] of a bar in tension at constant volume, at its stretch."""
+    side, zero = 1 / jnp.sqrt(stretch), jnp.zeros_like(stretch)
+    return law.strain_energy(law.measures(((stretch, zero, zero), (zero, side, zero), (zero, zero, side))))

@@ -1,0 +1,78 @@
+"""Points and lines inside a mesh: the tetrahedra that they lie in; host side."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.basis import functions
+from liverjax.mesh.tetrahedra import TetMesh
+
+#: Barycentric coordinate above minus this counts as inside.
+_INSIDE = 1e-9
+#: Pieces of a line that are shorter, over the line's length, are left out.
+_SHORTEST = 1e-9
+
+
+class Pieces(NamedTuple):
+    """Pieces of lines, each in one tetrahedron."""
+
+    element: np.ndarray  # (m,)
+    line: np.ndarray  # (m,) number of the line
+    begin: np.ndarray  # (m,) where on the line, 0 to 1
+    end: np.ndarray  # (m,)
+
+
+def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (4, n, E) of points (n, 3) in every tetrahedron."""
+    corners = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)]
+    inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+    rest = np.einsum("eij,nej->ine", inverse, points[:, None] - corners[None, :, 0])
+    return np.concatenate([1 - rest.sum(axis=0)[None], rest])
+
+
+def locate(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Elements (n,) of points (n, 3) [m] and barycentric coordinates (4, n) there.
+
+    Raises:
+        InputError: a point outside the mesh.
+    """
+    L = barycentric(mesh, points)
+    least = L.min(axis=0)
+    element = least.argmax(axis=1)
+    worst = int(least.max(axis=1).argmin())
+    if least[worst, element[worst]] < -_INSIDE:
+        raise InputError(f"{name}: the point {points[worst].tolist()} m is outside the body: move it inside")
+    return element, L[:, np.arange(len(points)), element]
+
+
+def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (n, m) of elements (m,), and the values of their functions at barycentric coordinates L (4, m)."""
+    nodes = np.stack([np.asarray(a) for a in mesh.element_nodes[: 4 if mesh.order == 1 else 10]])[:, element]
+    return nodes, L if mesh.order == 1 else functions(2, L)[0]
+
+
+def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
+    """Straight lines from `begin` to `end` (n, 3) cut at the faces of the tetrahedra; what lies outside is left out."""
+    found = []
+    first, last = barycentric(mesh, begin), barycentric(mesh, end)
+    for line in range(len(begin)):
+        a, b = first[:, line], last[:, line] - first[:, line]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cut = -a / b
+        cuts = np.unique(np.concatenate([[0.0, 1.0], cut[(cut > 0) & (cut < 1)]]))
+        cuts = cuts[np.concatenate([[True], np.diff(cuts) > _SHORTEST])]
+        cuts[-1] = 1.0
+        middle = 0.5 * (cuts[1:] + cuts[:-1])
+        least = (a[:, None] + b[:, None] * middle[None, :, None]).min(axis=0)
+        element = least.argmax(axis=1)
+        inside = least[np.arange(len(middle)), element] > -_INSIDE
+        # Cuts by planes of far elements split nothing: neighbours in one element are one piece.
+        start = np.flatnonzero(inside & ~np.concatenate([[False], (element[1:] == element[:-1]) & inside[:-1]]))
+        for k in start:
+            stop = k
+            while stop + 1 < len(middle) and inside[stop + 1] and element[stop + 1] == element[k]:
+                stop += 1
+            found.append((element[k], line, cuts[k], cuts[stop + 1]))
+    table = np.array(found, float).reshape(-1, 4)
+    return Pieces(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2], table[:, 3])

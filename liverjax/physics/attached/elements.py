@@ -1,0 +1,96 @@
+"""Elements between nodes of the body whose energy depends on their lengths and angles: membranes, springs, bars.
+
+At every point an element has d tangent vectors f_k = sum_a p_ka y_a of its nodes' positions y_a. Its energy is a
+function W of the metric C_kl = f_k . f_l. With T_kl = dW/dC_kl + dW/dC_lk forces and stiffness are
+
+    g_a = sum p_ka T_kl f_l,    K_ab = sum p_ka p_lb (T_kl I + d2W/dC_v dC_w (dC_v/df_k) (dC_w/df_l)).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import NodalForce
+from liverjax.solvers.attached import Attached
+
+
+class Elements(NodalForce):
+    """Acts between nodes, element by element."""
+
+    def nodes(self, mesh: TetMesh) -> jax.Array:
+        """Node numbers (n, m) of m elements."""
+        raise TypeError(f"{type(self).__name__} lacks nodes(mesh)")
+
+    def tangents(self, mesh: TetMesh) -> jax.Array:
+        """Factors p (d, n, Q, m) [1/m] of the nodes' positions in the tangent vectors."""
+        raise TypeError(f"{type(self).__name__} lacks tangents(mesh)")
+
+    def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
+        """Energy (Q, m) [J] of every point, at C_11 (Q, m); or C_11, C_12, C_22."""
+        raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
+
+    def away(self) -> jax.Array | None:
+        """What is taken off the tangent vectors (d, 3, Q, m): of ends that are no nodes; None: nothing is."""
+        return None
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Gradient of the energy."""
+        p, nodes = self.tangents(mesh), self.nodes(mesh)
+        f = self._vectors(p, x[nodes])
+        T = _tension(jax.grad(lambda C: jnp.sum(self.energies(mesh, C)))(_metric(f)))
+        pulls = jnp.stack([sum(t[None] * v for t, v in zip(row, f, strict=True)) for row in T])
+        own = jnp.einsum("kaqm,kiqm->ami", p, pulls)
+        return jnp.zeros_like(x).at[nodes].add(own)
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Sum over the elements."""
+        f = self._vectors(self.tangents(mesh), x[self.nodes(mesh)])
+        return jnp.sum(self.energies(mesh, _metric(f)))
+
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
+        """Second derivatives of the energy."""
+        p, nodes = self.tangents(mesh), self.nodes(mesh)
+        f = self._vectors(p, x[nodes])
+        C = _metric(f)
+        slopes = jax.grad(lambda C: jnp.sum(self.energies(mesh, C)))
+        units = [tuple(jnp.full_like(c, float(v == w)) for w, c in enumerate(C)) for v in range(len(C))]
+        curved = [jax.jvp(slopes, (C,), (unit,))[1] for unit in units]
+        T, G = _tension(slopes(C)), _changes(f)
+        rows = []
+        for k in range(len(f)):
+            for i in range(3):
+                bent = [sum(G[v][k][i] * row[w] for v, row in enumerate(curved)) for w in range(len(C))]
+                entry = [[sum(bent[w] * G[w][l][j] for w in range(len(C))) for j in range(3)] for l in range(len(f))]
+                for l in range(len(f)):
+                    entry[l][i] = entry[l][i] + T[k][l]
+                rows.append(jnp.stack([jnp.stack(e) for e in entry]))
+        H = jnp.stack(rows).reshape(len(f), 3, len(f), 3, *C[0].shape)
+        right = jnp.einsum("kiljqm,lbqm->kibjqm", H, p)
+        return Attached(nodes, jnp.einsum("kaqm,kibjqm->aibjm", p, right))
+
+    def _vectors(self, p: jax.Array, y: jax.Array) -> jax.Array:
+        """Tangent vectors (d, 3, Q, m)."""
+        f, away = jnp.einsum("kaqm,ami->kiqm", p, y), self.away()
+        return f if away is None else f - away
+
+
+def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
+    """C_kl (Q, m), k <= l."""
+    return tuple(jnp.sum(f[k] * f[l], axis=0) for k in range(len(f)) for l in range(k, len(f)))
+
+
+def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
+    """T from the slopes by C_11; or by C_11, C_12 and C_22."""
+    if len(slopes) == 1:
+        return [[2 * slopes[0]]]
+    return [[2 * slopes[0], slopes[1]], [slopes[1], 2 * slopes[2]]]
+
+
+def _changes(f: jax.Array) -> list[list[jax.Array]]:
+    """dC_v/df_k (3, Q, m)."""
+    if len(f) == 1:
+        return [[2 * f[0]]]
+    zero = jnp.zeros_like(f[0])
+    return [[2 * f[0], zero], [f[1], f[0]], [zero, 2 * f[1]]]

@@ -1,0 +1,145 @@
+"""A ligament: a cable with tension at rest, between two points of the body, or from a place of it to a point outside.
+
+Its tension is k (l - l0) of its length l, and 0 where it is slack: a ligament pulls and does not push. It is given a
+rest length l0, or the tension T0 in the reference shape, l0 = L - T0/k. From a place of n nodes it has n fibres, which
+share stiffness and tension.
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, struct
+from liverjax.mesh import locate, selection
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.attached.elements import Elements
+from liverjax.physics.base import Physics, Step
+
+
+@struct
+class Ligament(Physics):
+    """Fibres (m) that each pull at nodes of the body, and may end outside it."""
+
+    nodes: Any = param("1", "node numbers (n, m)", lower=0)
+    weights: Any = param("1", "of these nodes in the fibre's vector (n, m): they add up to 0, or to 1 with a wall")
+    to: Any = param("m", "where fibres end outside the body (3,); None: in it", default=None)
+    stiffness: Any = param("N/m", "of all fibres together", above=0.0)
+    pre_tension: Any = param("N", "of all fibres together, in the reference shape", lower=0.0, default=None)
+    rest_length: Any = param("m", "of each fibre", above=0.0, default=None)
+
+    section: ClassVar[str] = "ligament"
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "to", "points", "stiffness", "pre_tension", "rest_length")
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Ligament":
+        """From [[ligament]]: a place and a point of the wall, or two points of the body."""
+        if ("points" in table) == ("to" in table):
+            raise InputError(f"{name} needs either to = [x, y, z], with a place, or points = [[x, y, z], [x, y, z]]")
+        if "stiffness" not in table:
+            raise InputError(f"{name} needs stiffness in N/m: give a number")
+        given = {key: table[key] for key in ("stiffness", "pre_tension", "rest_length") if key in table}
+        if "to" in table:
+            to = jnp.asarray(_vector(table["to"], f"{name} to"))
+            nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
+            return cls(nodes=jnp.asarray(nodes[None], jnp.int32), weights=jnp.ones((1, len(nodes))), to=to, **given)
+        if "where" in table or "set" in table:
+            raise InputError(f"{name} has points and a place: leave one of them out")
+        ends = table["points"]
+        if not isinstance(ends, list) or len(ends) != 2:
+            raise InputError(f"{name} points = {ends!r} must be two points of the body: write [[x, y, z], [x, y, z]]")
+        return between(mesh, np.array([_vector(end, f"{name} points") for end in ends]), name, **given)
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Node numbers of the mesh, a length at rest, and fibres that have a direction."""
+        numbers = np.asarray(self.nodes)
+        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
+            raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
+        if (self.pre_tension is None) == (self.rest_length is None):
+            raise InputError(f"{name} needs either pre_tension in N or rest_length in m: give one of them")
+        if np.any(np.asarray(self._lengths(mesh)) <= 0):
+            raise InputError(f"{name} has a fibre without length: move its end")
+        if self.pre_tension is not None and np.any(np.asarray(self._rest(mesh)) <= 0):
+            most = float(self.stiffness * jnp.min(self._lengths(mesh)) * numbers.shape[1])
+            raise InputError(f"{name}.pre_tension = {self.pre_tension} N is more than it could have, {most:.3g} N")
+
+    def _vectors(self, mesh: TetMesh) -> jax.Array:
+        """Of the fibres in the reference shape (m, 3)."""
+        f = jnp.einsum("am,ami->mi", jnp.asarray(self.weights), mesh.points[self.nodes])
+        return f if self.to is None else f - jnp.asarray(self.to)[None]
+
+    def _lengths(self, mesh: TetMesh) -> jax.Array:
+        f = self._vectors(mesh)
+        return jnp.sqrt(jnp.sum(f * f, axis=1))
+
+    def _rest(self, mesh: TetMesh) -> jax.Array:
+        """Rest lengths (m,) [m]."""
+        L = self._lengths(mesh)
+        return jnp.full_like(L, self.rest_length) if self.pre_tension is None else L - self.pre_tension / self.stiffness
+
+    def freeze(self, memory: Any, step: Step) -> "Fibres":
+        """Rest lengths, and the stiffness of one fibre."""
+        rest = self._rest(step.mesh)
+        return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Along the fibres to a wall."""
+        if self.to is None:
+            return np.zeros(0, int), np.zeros((0, 3))
+        f = np.asarray(self._vectors(mesh))
+        return np.asarray(self.nodes)[0], f / np.linalg.norm(f, axis=1, keepdims=True)
+
+
+def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: Any) -> Ligament:
+    """A ligament between two points (2, 3) [m] of the body.
+
+    Raises:
+        InputError: a point outside it.
+    """
+    nodes, values = locate.weights(mesh, *locate.locate(mesh, points, f"{name} points"))
+    signed = values * np.array([[-1.0, 1.0]])
+    both = np.concatenate([nodes[:, 0], nodes[:, 1]])[:, None]
+    weights = np.concatenate([signed[:, 0], signed[:, 1]])[:, None]
+    return Ligament(nodes=jnp.asarray(both, jnp.int32), weights=jnp.asarray(weights), **given)
+
+
+def _vector(value: Any, name: str) -> np.ndarray:
+    try:
+        vector = np.array(value, float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise InputError(f"{name} = {value!r} is no point: give three numbers in m")
+    return vector
+
+
+@struct
+class Fibres(Elements):
+    """A ligament during a step."""
+
+    at: Any = param("1", "node numbers (n, m)")
+    weights: Any = param("1", "in the fibre's vector (n, m)")
+    to: Any = param("m", "end outside the body (3,), or None")
+    rest: Any = param("m", "rest lengths (m,)")
+    spring: Any = param("N/m", "stiffness of one fibre")
+
+    def nodes(self, mesh: TetMesh) -> jax.Array:
+        """Where the fibres pull."""
+        return self.at
+
+    def tangents(self, mesh: TetMesh) -> jax.Array:
+        """The whole fibre is its tangent vector."""
+        return jnp.asarray(self.weights)[None, :, None, :]
+
+    def away(self) -> jax.Array | None:
+        """The end outside."""
+        if self.to is None:
+            return None
+        return jnp.broadcast_to(jnp.asarray(self.to)[None, :, None, None], (1, 3, 1, len(self.rest)))
+
+    def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
+        """Half of stiffness times the square of the stretch, where that is above 0."""
+        longer = jnp.maximum(jnp.sqrt(C[0]) - self.rest[None], 0.0)
+        return 0.5 * self.spring * longer * longer

@@ -1,0 +1,104 @@
+"""A membrane on a part of the surface: a capsule that is stretched with it, and that bends without force.
+
+Its law acts in its plane. The stress across it is 0 (plane stress). A law with an isochoric part is taken as
+incompressible: the thickness is stretched by 1 over the change of area. Of another law the stretch of the thickness is
+solved for, at every point.
+
+Source: Holzapfel, Eberlein, Wriggers and Weizsaecker 1996, "A new axisymmetrical membrane element for anisotropic,
+finite strain analysis of arteries", and Bonet and Wood 2008, section 6.6 (plane stress).
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, struct
+from liverjax.laws import layers
+from liverjax.laws.base import Law
+from liverjax.mesh import selection, surface
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.attached.elements import Elements
+from liverjax.physics.base import Physics, Step
+
+
+@struct
+class Membrane(Physics):
+    """A thin layer on triangles of the surface, without tension in the reference shape."""
+
+    triangles: Any = param("1", "node numbers (m, 3)", lower=0)
+    thickness: Any = param("m", "of the layer: one number, or one a triangle (m,)", above=0.0)
+    law: Law = param("1", "of the layer; a number of it may be one a triangle (m,)")
+
+    section: ClassVar[str] = "membrane"
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "thickness", "law")
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Membrane":
+        """From [[membrane]]: a place (the whole surface where there is none), a thickness and a law."""
+        for key, example in (("thickness", "thickness = 5e-5, in m"), ("law", "[membrane.law] with name and numbers")):
+            if key not in table:
+                raise InputError(f"{name} needs {key}: write {example}")
+        whole = "where" not in table and "set" not in table
+        place = f"{name} where"
+        nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), place)
+        triangles = selection.boundary_triangles(mesh, nodes)
+        if not len(triangles):
+            raise InputError(f"{place} meets nodes but no boundary triangle: widen it to a whole face")
+        law = layers.read(table["law"], name)
+        return cls(triangles=jnp.asarray(triangles, jnp.int32), thickness=table["thickness"], law=law)
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Triangles of the mesh, one thickness or one each, and a law without directions."""
+        numbers = np.asarray(self.triangles)
+        if not numbers.size or numbers.max() >= mesh.number_of_vertices:
+            raise InputError(f"{name} names no node or one beyond {mesh.number_of_vertices - 1}: renumber them")
+        if np.shape(self.thickness) not in ((), (len(numbers),)):
+            shape = np.shape(self.thickness)
+            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one a triangle {len(numbers)}")
+        layers.check(self.law, name)
+
+    def freeze(self, memory: Any, step: Step) -> "Stretched":
+        """The incompressible part of the law, where it has one."""
+        isochoric = self.law.isochoric_part()
+        law, solved = (self.law, jnp.ones(0)) if isochoric is None else (isochoric, None)
+        return Stretched(triangles=self.triangles, thickness=self.thickness, law=law, solved=solved)
+
+
+@struct
+class Stretched(Elements):
+    """The membrane during a step."""
+
+    triangles: Any = param("1", "node numbers (m, 3)")
+    thickness: Any = param("m", "of the layer")
+    law: Law = param("1", "isochoric, or whole where the stretch of the thickness is solved for")
+    solved: Any = param("1", "not None: the stretch of the thickness is solved for", default=None)
+
+    def nodes(self, mesh: TetMesh) -> jax.Array:
+        """Of triangles with 3 nodes, or with 6."""
+        return jnp.stack(surface.triangle_nodes(mesh, self.triangles))
+
+    def tangents(self, mesh: TetMesh) -> jax.Array:
+        """Of two unit vectors in the plane of the reference triangle."""
+        _, along = surface.slopes(mesh)
+        r11, r12, r22 = (r[None, None] for r in self._edges(mesh))
+        first, second = (jnp.asarray(a.T, r11.dtype)[:, :, None] for a in along)
+        return jnp.stack([first / r11, (second - r12 / r11 * first) / r22])
+
+    def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
+        """Thickness times area times energy density."""
+        weights, _ = surface.slopes(mesh)
+        r11, _, r22 = self._edges(mesh)
+        law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
+        W = layers.in_plane_energy(law, C, self.solved is not None)
+        return (0.5 * self.thickness * r11 * r22)[None] * jnp.asarray(weights, W.dtype)[:, None] * W
+
+    def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Triangular root (m,) [m] of the metric of the reference triangles' edges."""
+        corners = jnp.moveaxis(mesh.points[self.triangles], 0, -1)
+        first, second = corners[1] - corners[0], corners[2] - corners[0]
+        r11 = jnp.sqrt(jnp.sum(first * first, axis=0))
+        r12 = jnp.sum(first * second, axis=0) / r11
+        return r11, r12, jnp.sqrt(jnp.sum(second * second, axis=0) - r12 * r12)

@@ -1,0 +1,148 @@
+"""A vessel: bars along a centre line, which stiffen the tetrahedra they cross. They bend without force.
+
+The line is cut at the faces of the tetrahedra. A piece has no unknowns of its own: its points move with the functions
+of its element, so that it ties nothing that the elements do not tie. Its section is a ring, or a disc without `wall`;
+its law acts in tension along it, at constant volume. The tissue that the wall displaces is not taken off.
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, struct
+from liverjax.laws import layers
+from liverjax.laws.base import Law
+from liverjax.mesh import locate
+from liverjax.mesh.basis import functions
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.attached.elements import Elements
+from liverjax.physics.base import Physics, Step
+
+#: Two points of Gauss on a piece: exact for the squares of the slopes of quadratic elements.
+_GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
+
+
+@struct
+class Vessel(Physics):
+    """Pieces (m) of a centre line, each in one element."""
+
+    element: Any = param("1", "element numbers (m,)", lower=0)
+    enters: Any = param("1", "barycentric coordinates where a piece begins (4, m)")
+    leaves: Any = param("1", "and where it ends (4, m)")
+    radius: Any = param("m", "outer radius, one number or one a piece (m,)", above=0.0)
+    wall: Any = param("m", "thickness of the wall; None: the section is a disc", above=0.0, default=None)
+    law: Law = param("1", "of the wall")
+
+    section: ClassVar[str] = "vessel"
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "line", "radius", "wall", "law")
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Vessel":
+        """From [[vessel]]: points of a centre line, a radius (or one a point), a law."""
+        for key in ("line", "radius", "law"):
+            if key not in table:
+                raise InputError(f"{name} needs {key}: write line = [[x, y, z], …], radius in m and [vessel.law]")
+        if "where" in table or "set" in table:
+            raise InputError(f"{name} has a place, but its line says where it is: leave the place out")
+        try:
+            line, radius = np.array(table["line"], float), np.array(table["radius"], float)
+        except (TypeError, ValueError):
+            line, radius = np.empty(0), np.empty(0)
+        if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
+            raise InputError(f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each")
+        given = {"wall": table["wall"]} if "wall" in table else {}
+        return along(mesh, line, radius, law=layers.read(table["law"], name), name=name, **given)
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Elements of the mesh, a wall within the radius, a law without directions."""
+        numbers = np.asarray(self.element)
+        if not numbers.size or numbers.max() >= mesh.number_of_elements:
+            raise InputError(
+                f"{name} crosses no element, or names one beyond {mesh.number_of_elements - 1}: mend its line"
+            )
+        if self.wall is not None and np.any(np.asarray(self.wall) > np.asarray(self.radius)):
+            raise InputError(
+                f"{name}.wall = {self.wall} m is thicker than the radius: leave wall out for a full section"
+            )
+        layers.check(self.law, name)
+
+    def freeze(self, memory: Any, step: Step) -> "Bars":
+        """The isochoric part of the law, where it has one."""
+        law = self.law.isochoric_part() or self.law
+        return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)
+
+    def area(self) -> Any:
+        """Of the section [m^2]."""
+        inner = 0.0 if self.wall is None else self.radius - self.wall
+        return jnp.pi * (jnp.asarray(self.radius) ** 2 - inner**2)
+
+
+def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: Any) -> Vessel:
+    """A vessel along a line (n, 3) [m] with one radius or one a point (n,) [m]; what lies outside is left out.
+
+    Raises:
+        InputError: a line outside the body.
+    """
+    cut = locate.pieces(mesh, line[:-1], line[1:])
+    if not len(cut.element):
+        raise InputError(f"{name} line lies outside the body: move it, or check its unit (m)")
+    ends = []
+    for at in (cut.begin, cut.end):
+        points = line[cut.line] + at[:, None] * (line[cut.line + 1] - line[cut.line])
+        L = locate.barycentric(mesh, points)
+        ends.append(jnp.asarray(L[:, np.arange(len(points)), cut.element]))
+    if np.ndim(radius):
+        middle = 0.5 * (cut.begin + cut.end)
+        radius = jnp.asarray(radius[cut.line] + middle * (radius[cut.line + 1] - radius[cut.line]))
+    else:
+        radius = float(radius)
+    element = jnp.asarray(cut.element, jnp.int32)
+    return Vessel(element=element, enters=ends[0], leaves=ends[1], radius=radius, law=law, **given)
+
+
+@struct
+class Bars(Elements):
+    """A vessel during a step."""
+
+    element: Any = param("1", "element numbers (m,)")
+    enters: Any = param("1", "barycentric (4, m)")
+    leaves: Any = param("1", "barycentric (4, m)")
+    section_area: Any = param("m^2", "one number, or one a piece (m,)")
+    law: Law = param("1", "of the wall")
+
+    def nodes(self, mesh: TetMesh) -> jax.Array:
+        """Of the elements that are crossed."""
+        count = 4 if mesh.order == 1 else 10
+        return jnp.stack([nodes[self.element] for nodes in mesh.element_nodes[:count]])
+
+    def _lengths(self, mesh: TetMesh) -> jax.Array:
+        corners = mesh.points[mesh.tetrahedra[self.element]]
+        f = jnp.einsum("am,mai->mi", self.leaves - self.enters, corners)
+        return jnp.sqrt(jnp.sum(f * f, axis=1))
+
+    def tangents(self, mesh: TetMesh) -> jax.Array:
+        """Slopes of the functions along the piece, at its points."""
+        along = (self.leaves - self.enters) / self._lengths(mesh)[None]
+        if mesh.order == 1:
+            return along[None, :, None, :]
+        rows = []
+        for at in _GAUSS:
+            L = self.enters + float(at) * (self.leaves - self.enters)
+            rows.append(_slopes(L, along))
+        return jnp.stack(rows, axis=1)[None]
+
+    def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
+        """Volume of the wall times the energy density of an incompressible sample in tension."""
+        law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
+        volume = self.section_area * self._lengths(mesh) / len(C[0])
+        return volume[None] * layers.axial_energy(law, jnp.sqrt(C[0]))
+
+
+def _slopes(L: jax.Array, along: jax.Array) -> jax.Array:
+    """Derivatives (10, m) of the quadratic functions at L (4, m) in a direction (4, m): they are linear in L."""
+    corners = np.eye(4)
+    table = functions(2, corners)[1]  # (10, 4, 4): by L_k, at every corner
+    return jnp.einsum("akc,cm,km->am", jnp.asarray(table, L.dtype), L, along)

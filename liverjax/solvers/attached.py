@@ -1,0 +1,72 @@
+"""Dense blocks of small elements that are attached to nodes of the body: membranes, springs between points, vessels."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.solvers.block_matrix import Block, BlockMatrix, added
+
+
+class Attached(NamedTuple):
+    """Stiffness of m elements between n nodes each."""
+
+    nodes: jax.Array  # (n, m)
+    blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric
+
+
+def product(A: Attached, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of a motion given by its columns (V,)."""
+    moved = jnp.stack([c[A.nodes] for c in columns], axis=1)
+    force = jnp.sum(A.blocks * moved[None, None], axis=(2, 3))
+    total = jnp.zeros((len(columns[0]), 3), force.dtype).at[A.nodes].add(jnp.swapaxes(force, 1, 2))
+    return tuple(total.T)
+
+
+def diagonal(A: Attached, number_of_nodes: int) -> Block:
+    """Diagonal blocks, 3 x 3 of (V,)."""
+    # Where two places of an element are one node, what lies between them is on the diagonal too.
+    same = A.nodes[:, None] == A.nodes[None]
+    own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)
+    own = jnp.zeros((number_of_nodes, 3, 3), own.dtype).at[A.nodes].add(jnp.transpose(own, (0, 3, 1, 2)))
+    return tuple(tuple(own[:, r, c] for c in range(3)) for r in range(3))
+
+
+def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
+    """A matrix of the vertices with elements added, as far as their vertices are neighbours in the body."""
+    if not attached:
+        return A
+    rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
+    total: Block = tuple(row[:3] for row in A.diagonal[:3])
+    for one in attached:
+        own = one if mesh.order == 1 else on_vertices(mesh, one)
+        near, other = own.nodes[:, None], own.nodes[None]
+        found = A.nodes[:, own.nodes][:, :, None] == other[None]  # (W, n, n, m)
+        there = jnp.any(found, axis=0) & (near != other)
+        values = jnp.where(there[:, None, :, None], own.blocks, 0.0)  # (n, 3, n, 3, m)
+        near = jnp.broadcast_to(near, there.shape)
+        rows = rows.at[:, :, jnp.argmax(found, axis=0), near].add(jnp.transpose(values, (1, 3, 0, 2, 4)))
+        total = added(total, diagonal(own, mesh.number_of_vertices))
+    return BlockMatrix(tuple(map(tuple, rows)), total, A.nodes)
+
+
+def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
+    """The same for motions that are linear in every element: half of a middle moves with either end of its edge."""
+    V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
+    edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
+    is_vertex = A.nodes < V
+    ends = [jnp.where(is_vertex, A.nodes, end[edge]) for end in (low, high)]
+    quarter = 0.25 * A.blocks
+    both = jnp.concatenate([quarter, quarter])
+    return Attached(jnp.concatenate(ends), jnp.concatenate([both, both], axis=2))
+
+
+def definite(A: Attached) -> Attached:
+    """Without negative eigenvalues."""
+    n, m = A.nodes.shape
+    K = jnp.moveaxis(A.blocks.reshape(3 * n, 3 * n, m), -1, 0)
+    size, axes = jnp.linalg.eigh(0.5 * (K + jnp.swapaxes(K, 1, 2)))
+    K = jnp.einsum("mik,mk,mjk->mij", axes, jnp.maximum(size, 0.0), axes)
+    return Attached(A.nodes, jnp.moveaxis(K, 0, -1).reshape(A.blocks.shape))
