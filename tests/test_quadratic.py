@@ -17,6 +17,8 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh import promotion
 from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import load_volumes, nodal_volumes
+from liverjax.physics.attached import ligament, vessel
+from liverjax.physics.attached.membrane import Membrane
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.sliding_support import on_plane
 from liverjax.physics.volumes import mixed
@@ -249,6 +251,11 @@ def test_points_do_not_see_a_fold_that_vertices_show():
 PRONY = lj.Prony(ratios=jnp.array([0.3, 0.2]), relaxation_times=jnp.array([0.3, 0.05]))
 
 
+TIMES = jnp.array([0.0, 0.1])
+#: Two points inside the cantilever.
+LINE = np.array([[0.002, 0.004, 0.003], [0.017, 0.006, 0.007]])
+
+
 def scene_of(mesh: lj.TetMesh, feature: str) -> lj.Scene:
     """A cantilever with a feature."""
     sponge = lj.Porosity(
@@ -274,6 +281,10 @@ def scene_of(mesh: lj.TetMesh, feature: str) -> lj.Scene:
         "pressure": {"traction": (lj.Traction(triangles=right, pressure=40.0),)},
         "support": {"physics": (ElasticSupport(triangles=below, normal=1e4, tangential=1e3),)},
         "sliding": {"physics": (on_plane(mesh, np.asarray(mesh.node_sets["y_min"])),)},
+        "membrane": {"physics": (Membrane(triangles=below, thickness=1e-4, law=lj.laws.NeoHookean(mu=1e4, bulk=1e5)),)},
+        "ligament": {"physics": (ligament.between(mesh, LINE, stiffness=5.0, pre_tension=1e-3),)},
+        "vessel": {"physics": (vessel.along(mesh, LINE, 5e-4, lj.laws.NeoHookean(mu=1e4, bulk=1e5)),)},
+        "history": {"traction": (lj.Traction(triangles=right, pressure=40.0, times=TIMES, history=TIMES / 0.1),)},
         "projected": {"solve": {"robust": "projected"}},
         "one step": {"solve": {"newton": "one_step", "tolerance": 1e-3, "kind": "dynamic"}},
         "region": {"region": (lj.Region(elements=jnp.array([0, 1]), law={"mu": jnp.array(2000.0)}),)},
@@ -294,7 +305,7 @@ def scene_of(mesh: lj.TetMesh, feature: str) -> lj.Scene:
 FEATURES = (
     *("elastic", "direct", "averaged", "dynamic", "newmark", "viscous", "isochoric", "porous", "porous direct"),
     *("lagged", "complete", "traction", "pressure", "support", "sliding", "projected", "one step", "region"),
-    *("stretches", "float32"),
+    *("stretches", "float32", "membrane", "ligament", "vessel", "history"),
 )
 #: By default only what has the most equations: other tests run elastic bodies of both orders.
 QUICK = {"porous"}
@@ -317,7 +328,7 @@ def test_every_feature_runs_on_both_orders(feature):
     assert 0.9 < shown[1] / shown[0] < 6
 
 
-@pytest.mark.parametrize("feature", ["elastic", "porous", "pressure", "isochoric", "sliding"])
+@pytest.mark.parametrize("feature", ["elastic", "porous", "pressure", "isochoric", "sliding", "membrane"])
 def test_the_tangent_is_the_derivative_of_the_forces(feature):
     scene = scene_of(MESH, feature)
     e = equations(scene, initial_state(scene), 1.0)

@@ -33,6 +33,8 @@ class Flow(NamedTuple):
     low: jax.Array  # about the least eigenvalue of D^-1 A beyond the coarse space
     high: jax.Array  # no eigenvalue of D^-1 A is above it
     tolerance: Any  # of a solve, relative to its right-hand side
+    given: Any = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
+    enters: Any = None  # (V,) [m^3] what enters during the step; None: nothing does
 
 
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, tolerance: Any) -> Flow:
@@ -41,6 +43,9 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, toleran
     if porosity.drained is not None:
         # Pressures belong to vertices: the middles of edges among the nodes are left out.
         mask = mask.at[porosity.drained].set(0.0, mode="drop")
+    for inlet in porosity.inlet:
+        if inlet.nodes is not None:
+            mask = mask.at[inlet.nodes].set(0.0, mode="drop")
     # Everything times dt: the storage term stays of the size of a volume whatever the step.
     J = jnp.maximum(J, _LEAST_J)
     store = integrals(mesh, J) / porosity.limit_bulk
@@ -57,6 +62,19 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, toleran
     slow = preconditioner.coarse(mesh, A0, mask[:, None], True)
     high = 1 + jnp.max(jnp.sum(jnp.abs(A0.rows[0][0]), axis=0) / A0.diagonal[0][0])  # Gershgorin
     return Flow(A, store, mask, slow, low, high, tolerance)
+
+
+def load(flow: Flow, b: jax.Array) -> jax.Array:
+    """The part of b (V,) that the free pressures answer for: with what enters, without what given pressures take."""
+    if flow.enters is not None:
+        b = b + flow.enters
+    return flow.mask * (b if flow.given is None else b - _product(flow, flow.given))
+
+
+def with_given(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
+    """All pressures (V,) [Pa], those that are given among them."""
+    P = solved(mesh, flow, load(flow, b))
+    return P if flow.given is None else P + flow.given
 
 
 def solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:

@@ -1,8 +1,9 @@
 """An elastic support: springs between the body and a wall that does not move, on nodes or on a part of the surface.
 
 Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
-(a Winkler foundation). They begin without tension. A third of every triangle counts at each of its nodes; of quadratic
-elements, at the middles of its edges.
+(a Winkler foundation). They begin without tension. With a history of factors their stiffness changes in time; with one
+of displacements the wall moves, and the springs with it. A third of every triangle counts at each of its nodes; of
+quadratic elements, at the middles of its edges.
 """
 
 from typing import Any, ClassVar
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import history
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.mesh import selection, surface
@@ -28,9 +30,11 @@ class ElasticSupport(Physics):
     tangential: Any = param("Pa/m", "stiffness per area along the surface", lower=0.0, default=0.0)
     nodes: Any = param("1", "node numbers (n,)", lower=0, default=None)
     stiffness: Any = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
+    times: Any = param("s", "times of a history (T,)", default=None)
+    history: Any = param("1", "factors of the stiffness (T,), or where the wall moves to (T, 3) [m]", default=None)
 
     section: ClassVar[str] = "support"
-    keys: ClassVar[tuple[str, ...]] = ("where", "set", "normal", "tangential", "stiffness")
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "normal", "tangential", "stiffness", "history")
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "ElasticSupport":
@@ -42,6 +46,8 @@ class ElasticSupport(Physics):
                 f"{name} needs either normal and tangential in Pa/m, for springs on the surface, or stiffness in N/m, "
                 "for springs on nodes: give one of them"
             )
+        if "history" in table:
+            given["times"], given["history"] = history.read(table["history"], name)
         if "stiffness" in given:
             return cls(nodes=jnp.asarray(nodes, jnp.int32), **given)
         triangles = selection.boundary_triangles(mesh, nodes)
@@ -50,7 +56,8 @@ class ElasticSupport(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Node numbers of the mesh, and a place."""
+        """Node numbers of the mesh, a place, and a history that goes with its times."""
+        history.check(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
         numbers = np.asarray(self.nodes if self.triangles is None else self.triangles)
@@ -59,7 +66,13 @@ class ElasticSupport(Physics):
 
     def freeze(self, memory: Any, step: Step) -> "Springs":
         """One symmetric block a node."""
-        return Springs(blocks=blocks(self, step.mesh))
+        own = blocks(self, step.mesh)
+        if self.history is None:
+            return Springs(blocks=own)
+        before, after = (history.at(n * step.dt, self.times, self.history) for n in (step.k - 1, step.k))
+        if after.ndim:
+            return Springs(blocks=own, wall=jnp.stack([before, after]))
+        return Springs(blocks=tuple(tuple(after * entry for entry in row) for row in own))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Along the axes of every node's block that have a stiffness."""
@@ -96,15 +109,22 @@ class Springs(NodalForce):
     """Springs during a step."""
 
     blocks: Block = param("N/m", "3 x 3 of (V,)")
+    wall: Any = param("m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None)
+
+    def _stretch(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Of the springs (V, 3) [m]."""
+        if self.wall is None:
+            return x - mesh.points
+        return x - mesh.points - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
         """Blocks times displacement."""
-        u = (x - mesh.points).T
+        u = self._stretch(mesh, x, s).T
         return jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks], axis=-1)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """Half of displacement times force."""
-        return 0.5 * jnp.sum((x - mesh.points) * self.force(mesh, x, 1.0))
+        return 0.5 * jnp.sum(self._stretch(mesh, x, 1.0) * self.force(mesh, x, 1.0))
 
     def stiffness(self) -> Block:
         """The blocks."""

@@ -5,7 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core import history
+from liverjax.core.struct import param, replace, static, struct
 from liverjax.mesh import surface
 from liverjax.mesh.nodal import load_volumes
 from liverjax.mesh.tetrahedra import TetMesh
@@ -19,6 +20,16 @@ class Traction:
     triangles: Any = param("1", "node numbers (m, 3), normals outwards", lower=0)
     value: Any = param("Pa", "force per reference area (3,); direction and reference area count", default=None)
     pressure: Any = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
+    times: Any = param("s", "times of a history (T,)", default=None)
+    history: Any = param("1", "factors of value or pressure (T,), or the value itself (T, 3) [Pa]", default=None)
+
+    def at(self, time: Any) -> "Traction":
+        """The load at a time [s], without a history."""
+        if self.history is None:
+            return self
+        now = history.scaled(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
+        key = "value" if self.pressure is None else "pressure"
+        return replace(self, times=None, history=None, **{key: now})
 
 
 def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
@@ -65,12 +76,25 @@ class Loads(Physics):
 
     density: Any = param("kg/m^3", "None: no weight", default=None)
     gravity: Any = param("m/s^2", "(3,)", default=None)
+    times: Any = param("s", "times of a history of gravity (T,)", default=None)
+    history: Any = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: Any, step: Step) -> "Loading":
         """Dead loads are summed once; which part of them acts depends on the part of the step."""
+        if self.history is not None or any(load.history is not None for load in self.traction):
+            begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))
+            return replace(end, before=begin)
+        return self._loading(step, "steps" if step.dt is None else "none" if step.inertia else "first")
+
+    def at(self, time: Any) -> "Loads":
+        """The loads at a time [s], without histories."""
+        traction = tuple(load.at(time) for load in self.traction)
+        gravity = history.scaled(self.gravity, time, self.times, self.history)
+        return replace(self, gravity=gravity, traction=traction, times=None, history=None)
+
+    def _loading(self, step: Step, growth: str) -> "Loading":
         dead = dead_loads(step.mesh, self.density, self.gravity, self.traction)
-        growth = "steps" if step.dt is None else "none" if step.inertia else "first"
         return Loading(dead=dead, traction=self.traction, k=step.k, steps=step.steps, growth=growth)
 
 
@@ -83,6 +107,7 @@ class Loading(NodalForce):
     k: Any = param("1", "number of the step")
     steps: int = static(default=1, about="of the run")
     growth: str = static(default="none", about="steps: with the load steps; first: within the first step; none")
+    before: "Loading | None" = param("1", "at the beginning of the step, where there is a history", default=None)
 
     @property
     def conservative(self) -> bool:  # type: ignore[override]
@@ -97,7 +122,10 @@ class Loading(NodalForce):
         return jnp.ones((), dtype) if self.growth == "none" else jnp.where(self.k == 1, s, 1.0).astype(dtype)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
-        """Minus the loads."""
+        """Minus the loads; with a history straight from those at the beginning of the step to those at its end."""
+        if self.before is not None:
+            end = replace(self, before=None)
+            return s * end.force(mesh, x, s) + (1 - s) * self.before.force(mesh, x, s)
         outer = self.fraction(s) * self.dead
         if follows(self.traction):
             outer = outer + self.fraction(s) * follower_forces(self.traction, x, mesh)
@@ -109,4 +137,7 @@ class Loading(NodalForce):
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
         """Of the pressures alone: dead loads do not change."""
+        if self.before is not None:
+            end = replace(self, before=None)
+            return s * end.product(mesh, x, s, dx) + (1 - s) * self.before.product(mesh, x, s, dx)
         return -jax.jvp(lambda x: self.fraction(s) * follower_forces(self.traction, x, mesh), (x,), (dx,))[1]

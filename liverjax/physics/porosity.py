@@ -17,12 +17,13 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from liverjax.core import bounds
+from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.laws.base import Law, isochoric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import integrals, interpolated
+from liverjax.mesh.surface import areas
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import darcy
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
@@ -34,6 +35,22 @@ SCHEMES = ("implicit", "lagged")
 
 
 @struct
+class Inlet:
+    """A part of the body with a given pressure of the fluid, or a given flux through its surface."""
+
+    nodes: Any = param("1", "nodes of the pressure (n,)", lower=0, default=None)
+    pressure: Any = param("Pa", "of the fluid at the nodes", default=None)
+    triangles: Any = param("1", "surface of the flux, node numbers (m, 3)", lower=0, default=None)
+    flux: Any = param("m/s", "volume that enters per reference area and time", default=None)
+    times: Any = param("s", "times of a history (T,)", default=None)
+    history: Any = param("1", "factors of pressure or flux (T,)", default=None)
+
+    def at(self, value: Any, time: Any) -> Any:
+        """Pressure or flux at a time [s]."""
+        return history.scaled(value, time, self.times, self.history)
+
+
+@struct
 class Porosity(Physics):
     """A sponge of bulk modulus K0 filled with a fluid that makes up the part r_w of its volume."""
 
@@ -42,6 +59,8 @@ class Porosity(Physics):
     fluid_fraction: Any = param("1", "r_w", above=0.0, upper=1.0)
     permeability: Any = param("m^4/(N s)", "kappa", lower=0.0)
     drained: Any = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
+    inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
+    initial_pressure: Any = param("Pa", "of the fluid at the beginning; None: 0", default=None)
     scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)")
     keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy beside that of the sponge")
 
@@ -58,6 +77,8 @@ class Porosity(Physics):
         """The equation of the pressure; where it does not depend on the step's end, it is solved here."""
         F = deformation_gradient(step.mesh, step.x)
         found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
+        if self.inlet:
+            found = found._replace(**inflow(self, step.mesh, step.k * step.dt, step.dt))
         if self.scheme == "implicit":
             return CoupledSponge(porosity=self, fluid=memory, flow=found)
         return LaggedSponge(porosity=self, fluid=memory, given=pressure(self, step.mesh, memory, found, determinant(F)))
@@ -92,6 +113,13 @@ def check(porosity: Porosity) -> None:
     if porosity.scheme not in SCHEMES:
         raise InputError(f"porosity scheme = {porosity.scheme!r} is not known: use {' or '.join(SCHEMES)}")
     bounds.check(porosity, "porosity")
+    for k, inlet in enumerate(porosity.inlet):
+        name = f"porosity.inlet.{k}"
+        history.check(inlet.times, inlet.history, name, (1,))
+        if (inlet.pressure is None) == (inlet.flux is None):
+            raise InputError(f"{name} needs either pressure in Pa or flux in m/s: give one of them")
+        if (inlet.nodes is None) != (inlet.pressure is None) or (inlet.triangles is None) != (inlet.flux is None):
+            raise InputError(f"{name} needs nodes with a pressure, triangles with a flux: give those")
     bulk, limit = float(porosity.bulk), float(porosity.limit_bulk)
     if limit <= bulk:
         raise InputError(f"porosity limit_bulk = {limit:g} must be above bulk = {bulk:g}: a sponge stiffens")
@@ -142,21 +170,39 @@ def volumetric_energy(porosity: Porosity, J: Any) -> Any:
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     """No pressure, reference volumes."""
     J = jnp.ones_like(mesh.weights)
-    return Fluid(jnp.zeros(mesh.number_of_vertices, J.dtype), J, J if porosity.scheme == "lagged" else None)
+    start = 0.0 if porosity.initial_pressure is None else porosity.initial_pressure
+    return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
+
+
+def inflow(porosity: Porosity, mesh: TetMesh, time: Any, dt: Any) -> dict[str, jax.Array]:
+    """Of `darcy.Flow` with inlets, at a time [s]: given pressures (V,) [Pa], and what enters in dt (V,) [m^3]."""
+    given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
+    for inlet in porosity.inlet:
+        if inlet.nodes is not None:
+            given = given.at[inlet.nodes].set(inlet.at(inlet.pressure, time), mode="drop")
+        else:
+            normal = areas(mesh.points, inlet.triangles)
+            volume = dt * inlet.at(inlet.flux, time) * jnp.sqrt(jnp.sum(normal * normal, axis=1)) / 3
+            for a in range(3):
+                enters = enters.at[inlet.triangles[:, a]].add(volume)
+    return {"given": given, "enters": enters}
 
 
 def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
     """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
-    rate = -integrals(mesh, increment)
-    return darcy.solved(mesh, flow, flow.mask * (flow.store * fluid.pressure + rate))
+    b = flow.store * fluid.pressure - integrals(mesh, increment)
+    return darcy.with_given(mesh, flow, b)
 
 
 def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
     """b . P / 2 [J] with P = A^-1 b the pressure at the end of a step that ends with volumes J_end (E,)."""
     b = flow.store * fluid.pressure - integrals(mesh, J_end - fluid.J)
-    return 0.5 * jnp.vdot(flow.mask * b, pressure(porosity, mesh, fluid, flow, J_end))
+    P = pressure(porosity, mesh, fluid, flow, J_end)
+    if flow.given is None:
+        return 0.5 * jnp.vdot(flow.mask * b, P)
+    return 0.5 * jnp.vdot(darcy.load(flow, b), P) + jnp.vdot(flow.given, b)
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.history import at
 from liverjax.core.struct import param, static, struct
 from liverjax.mesh.selection import AXES
 from liverjax.mesh.tetrahedra import TetMesh
@@ -20,12 +21,14 @@ class Fixed:
 
 @struct
 class Displaced:
-    """Nodes that are moved: by `by` at the last step, proportionally before, or along a history."""
+    """Nodes that are moved: by `by` at the last step, proportionally before; or along a history, a factor of `by`."""
 
     nodes: Any = param("1", "node numbers (n,)", lower=0)
     by: Any = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
     times: Any = param("s", "times of a history (T,)", default=None)
-    history: Any = param("m", "displacements at these times (T, 3), linear in between", default=None)
+    history: Any = param(
+        "m", "displacements at these times (T, 3), or factors of by (T,); linear in between", default=None
+    )
     axes: str = static(default="xyz", about="prescribed axes")
 
 
@@ -50,7 +53,8 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Any, fraction: Any) -> jax
         for axis in condition.axes:
             k = AXES.index(axis)
             if condition.by is not None:
-                value = jnp.asarray(condition.by, u.dtype)[..., k] * fraction
+                part = fraction if condition.history is None else at(time, condition.times, condition.history)
+                value = jnp.asarray(condition.by, u.dtype)[..., k] * part
             else:
                 value = jnp.interp(time, condition.times, jnp.asarray(condition.history)[:, k])
             u = u.at[condition.nodes, k].set(value)

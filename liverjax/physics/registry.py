@@ -51,6 +51,7 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
     if body is not None and scene.solve.kind == "dynamic":
         found.append(Inertia(density=body.density, integrator=scene.solve.integrator))
     if body is not None or scene.traction:
-        weight = {} if body is None else {"density": body.density, "gravity": body.gravity}
+        keys = ("density", "gravity", "times", "history")
+        weight = {} if body is None else {key: getattr(body, key) for key in keys}
         found.append(Loads(traction=scene.traction, **weight))
     return (*found, *scene.physics)

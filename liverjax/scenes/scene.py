@@ -25,6 +25,8 @@ class Body:
 
     density: Any = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0, typical=1060.0)
     gravity: Any = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
+    times: Any = param("s", "times of a history (T,)", default=None)
+    history: Any = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
 
 
 @struct
@@ -73,6 +75,7 @@ class Scene:
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     physics: tuple[Physics, ...] = param("1", "what else acts: supports, …", unnamed="named", default=())
     solve: Solve = param("1", "how", default=Solve())
+    points_are: str = static(default="reference", about="the mesh's points: reference; or loaded, under the loads")
 
     def named(self, section: str) -> list[int]:
         """Places in `physics` of those that scene files write as [[section]]."""

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from liverjax import laws
-from liverjax.core import bounds
+from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import boundary, porosity, viscosity
@@ -37,6 +37,10 @@ def check_choices(scene: Scene) -> None:
         value = getattr(scene.solve, key)
         if value not in allowed:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
+    if scene.points_are not in ("reference", "loaded"):
+        raise InputError(f"[mesh] is = {scene.points_are!r} is not known: use reference or loaded")
+    if scene.points_are == "loaded" and scene.porosity is not None:
+        raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
@@ -50,6 +54,11 @@ def check_choices(scene: Scene) -> None:
     if scene.solve.robust != "off" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] robust needs forces with an energy: leave it out where a pressure follows the body")
     for k, load in enumerate(scene.traction):
+        history.check(load.times, load.history, f"traction.{k}")
+        if np.ndim(load.history) == 2:
+            if load.value is not None or load.pressure is not None:
+                raise InputError(f"traction.{k} has a value and a history of values: leave one of them out")
+            continue
         if (load.value is None) == (load.pressure is None):
             raise InputError(f"traction.{k} needs either value (3,) or pressure, in Pa: give one of them")
         name, shape = ("pressure", ()) if load.value is None else ("value", (3,))
@@ -58,7 +67,8 @@ def check_choices(scene: Scene) -> None:
     if scene.body is not None:
         _body(scene.body, scene.mesh.number_of_nodes)
     for k, motion in enumerate(scene.displaced):
-        if (motion.by is None) == (motion.history is None):
+        history.check(motion.times, motion.history, f"displaced.{k}", (3,) if motion.by is None else (1,))
+        if motion.by is None and motion.history is None:
             raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
 
 
@@ -68,6 +78,7 @@ def _body(body: Body, nodes: int) -> None:
     density = np.shape(body.density)
     if density not in ((), (nodes,)):
         raise InputError(f"body density has shape {density}: give one number, or one a node ({nodes},), in kg/m^3")
+    history.check(body.times, body.history, "body")
     if gravity != (3,):
         raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")
 
@@ -133,7 +144,8 @@ def check_scene(scene: Scene) -> None:
         physics.check(scene.mesh, name)
     _no_two_normals(scene)
     solve = scene.solve
-    histories = any(d.history is not None for d in scene.displaced)
+    loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
+    histories = any(getattr(load, "history", None) is not None for load in loads)
     if solve.dt is None:
         for present, what in (
             (scene.viscosity is not None, "viscosity"),
@@ -153,7 +165,7 @@ def check_scene(scene: Scene) -> None:
             "nodes at and above it, {z_max = 0} those at and below",
             stacklevel=2,
         )
-    if solve.kind == "static":
+    if solve.kind == "static" or scene.points_are == "loaded":
         _held(scene)
 
 

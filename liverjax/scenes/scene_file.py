@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax import laws
+from liverjax.core import history
 from liverjax.core.errors import InputError
 from liverjax.core.names import hint
 from liverjax.laws import Law
@@ -21,7 +22,7 @@ from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.physics import boundary
 from liverjax.physics.base import Physics
 from liverjax.physics.boundary import Displaced, Fixed, Traction
-from liverjax.physics.porosity import Porosity
+from liverjax.physics.porosity import Inlet, Porosity
 from liverjax.physics.registry import NAMED
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes import regions
@@ -32,15 +33,26 @@ from liverjax.scenes.scene_checks import CHOICES, check_scene
 #: Of a cylinder: what it needs, then what it may have.
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
-    "mesh": ("file", "unit", "order", "shape", "size", "cells", *_CYLINDER),
+    "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
     "region": ("where", "set", "law"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
-    "porosity": ("bulk", "limit_bulk", "fluid_fraction", "permeability", "drained", "scheme", "keep_bulk"),
-    "body": ("density", "gravity"),
+    "porosity": (
+        "bulk",
+        "limit_bulk",
+        "fluid_fraction",
+        "permeability",
+        "drained",
+        "scheme",
+        "keep_bulk",
+        "inlet",
+        "initial_pressure",
+    ),
+    "body": ("density", "gravity", "history"),
     "fixed": ("where", "set", "axes"),
     "displaced": ("where", "set", "axes", "by", "history"),
-    "traction": ("where", "set", "value", "pressure"),
+    "traction": ("where", "set", "value", "pressure", "history"),
     "solve": tuple(f.name for f in dataclasses.fields(Solve)),
+    "output": ("fields", "reactions"),
 } | {
     section: tuple(dict.fromkeys(key for p in NAMED if p.section == section for key in p.keys))
     for section in dict.fromkeys(p.section for p in NAMED)
@@ -74,9 +86,11 @@ def load_scene(path: str | Path) -> Scene:
 def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
     """A scene from the content of a scene file as nested dictionaries."""
     _known("scene", content, _SECTIONS)
+    content = _with_paths(content, folder)
     for name in ("mesh", "law"):
         if name not in content:
             raise InputError(f"the scene has no [{name}]: add it")
+    output_of(content)
     mesh = _mesh(_table("mesh", content["mesh"]), folder)
     prony = _section(content, "viscosity", _prony)
     scene = Scene(
@@ -87,13 +101,29 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
         porosity=_section(content, "porosity", lambda table: _porosity(mesh, table)),
         body=_section(content, "body", _body),
         fixed=tuple(_fixed(mesh, k, t) for k, t in enumerate(_tables(content, "fixed"))),
-        displaced=tuple(_displaced(mesh, k, t, folder) for k, t in enumerate(_tables(content, "displaced"))),
+        displaced=tuple(_displaced(mesh, k, t) for k, t in enumerate(_tables(content, "displaced"))),
         traction=tuple(_traction(mesh, k, t) for k, t in enumerate(_tables(content, "traction"))),
         physics=tuple(_physics(mesh, content)),
         solve=_solve(_table("solve", content.get("solve", {}))),
+        points_are=content["mesh"].get("is", "reference"),
     )
     check_scene(scene)
     return scene
+
+
+def output_of(content: dict[str, Any]) -> tuple[list[str], bool]:
+    """What [output] of a scene file asks for: names of fields, and whether reactions are written as a table.
+
+    Raises:
+        InputError: keys or values of another kind.
+    """
+    table = _table("output", content.get("output", {}))
+    names, reactions = table.get("fields", []), table.get("reactions", False)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f'[output] fields = {names!r} must be a list of names: write fields = ["cauchy_stress"]')
+    if not isinstance(reactions, bool):
+        raise InputError(f"[output] reactions = {reactions!r} must be true or false: give one of them")
+    return names, reactions
 
 
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
@@ -106,6 +136,18 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
                 known = " or ".join(", ".join(p.keys[2:]) for p in NAMED if p.section == section)
                 raise InputError(f"{name} has {', '.join(sorted(own)) or 'a place alone'}: give {known}")
             yield kinds[0].read(mesh, table, name)
+
+
+def _with_paths(content: Any, folder: Path) -> Any:
+    """With files of histories relative to the folder of the scene file."""
+    if isinstance(content, list):
+        return [_with_paths(value, folder) for value in content]
+    if not isinstance(content, dict):
+        return content
+    return {
+        key: str(folder / value) if key == "history" and isinstance(value, str) else _with_paths(value, folder)
+        for key, value in content.items()
+    }
 
 
 def _known(name: str, table: dict, keys: tuple) -> None:
@@ -240,7 +282,28 @@ def _porosity(mesh: Any, table: dict) -> Porosity:
     if "drained" in table:
         values["drained"] = _drained(mesh, table["drained"])
     values |= {k: table[k] for k in ("scheme", "keep_bulk") if k in table}
-    return Porosity(**values)
+    if "initial_pressure" in table:
+        values["initial_pressure"] = _number("[porosity] initial_pressure", table["initial_pressure"])
+    given = table.get("inlet", [])
+    given = given if isinstance(given, list) else [given]
+    return Porosity(**values, inlet=tuple(_inlet(mesh, f"porosity.inlet.{k}", t) for k, t in enumerate(given)))
+
+
+def _inlet(mesh: TetMesh, name: str, table: Any) -> Inlet:
+    """A part with a given pressure of the fluid, or a flux through its surface."""
+    if not isinstance(table, dict):
+        raise InputError(f"{name} must be a table: write [[porosity.inlet]] and its keys below")
+    _known(name, table, ("where", "set", "pressure", "flux", "history"))
+    if ("pressure" in table) == ("flux" in table):
+        raise InputError(f"{name} needs either pressure in Pa or flux in m/s: give one of them")
+    nodes, times = _nodes(mesh, name, table), _history(name, table, (1,))
+    if "pressure" in table:
+        return Inlet(nodes=nodes, pressure=_number(f"{name} pressure", table["pressure"]), **times)
+    triangles = boundary.boundary_triangles(mesh, nodes)
+    if not len(triangles):
+        raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
+    flux = _number(f"{name} flux", table["flux"])
+    return Inlet(triangles=jnp.asarray(triangles, jnp.int32), flux=flux, **times)
 
 
 def _drained(mesh: Any, given: Any) -> jax.Array:
@@ -260,7 +323,16 @@ def _body(table: dict) -> Body:
     if "density" not in table:
         raise InputError("[body] needs density in kg/m^3: give e.g. density = 1060.0")
     gravity = _numbers("[body] gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3)
-    return Body(density=_number("[body] density", table["density"]), gravity=jnp.asarray(gravity))
+    density = _number("[body] density", table["density"])
+    return Body(density=density, gravity=jnp.asarray(gravity), **_history("[body]", table))
+
+
+def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, Any]:
+    """Times and numbers of a table's history, where it has one."""
+    if "history" not in table:
+        return {}
+    times, numbers = history.read(table["history"], name, forms)
+    return {"times": times, "history": numbers}
 
 
 def _nodes(mesh: TetMesh, name: str, table: dict) -> jax.Array:
@@ -282,37 +354,30 @@ def _fixed(mesh: TetMesh, k: int, table: dict) -> Fixed:
     return Fixed(nodes=_nodes(mesh, name, table), axes=_axes(name, table))
 
 
-def _displaced(mesh: TetMesh, k: int, table: dict, folder: Path) -> Displaced:
+def _displaced(mesh: TetMesh, k: int, table: dict) -> Displaced:
     name = f"displaced.{k}"
-    if ("by" in table) == ("history" in table):
-        raise InputError(f'{name} needs either by = [x, y, z] or history = "ramp.csv": give one of them')
+    if "by" not in table and "history" not in table:
+        raise InputError(f'{name} needs by = [x, y, z], or history = "ramp.csv" of displacements: give one of them')
     nodes, axes = _nodes(mesh, name, table), _axes(name, table)
-    if "by" in table:
-        return Displaced(nodes=nodes, by=jnp.asarray(_numbers(f"{name} by", table["by"], 3)), axes=axes)
-    file = folder / str(table["history"])
-    try:
-        data = np.atleast_1d(np.genfromtxt(file, delimiter=",", names=True, comments="#"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{name} history {file} cannot be read ({error}): give columns time,x,y,z") from None
-    if not data.dtype.names or not {"time", "x", "y", "z"} <= set(data.dtype.names):
-        raise InputError(f"{name} history {file} has columns {data.dtype.names}: give time,x,y,z")
-    times, values = data["time"], np.stack([data[a] for a in "xyz"], axis=1)
-    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values)) and np.all(np.diff(times) > 0)):
-        raise InputError(f"{name} history {file} must hold finite numbers at increasing times: sort and fill it")
-    return Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(values), axes=axes)
+    by = jnp.asarray(_numbers(f"{name} by", table["by"], 3)) if "by" in table else None
+    given = _history(name, table, (3,) if by is None else (1,))
+    return Displaced(nodes=nodes, by=by, axes=axes, **given)
 
 
 def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     name = f"traction.{k}"
-    if ("value" in table) == ("pressure" in table):
+    given = _history(name, table)
+    vectors = bool(given) and given["history"].ndim == 2
+    if ("value" in table) + ("pressure" in table) + vectors != 1:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
     triangles: Any = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
     if len(triangles) == 0:
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
     triangles = jnp.asarray(triangles, jnp.int32)
     if "pressure" in table:
-        return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]))
-    return Traction(triangles=triangles, value=jnp.asarray(_numbers(f"{name} value", table["value"], 3)))
+        return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]), **given)
+    value = None if vectors else jnp.asarray(_numbers(f"{name} value", table["value"], 3))
+    return Traction(triangles=triangles, value=value, **given)
 
 
 def _solve(table: dict) -> Solve:

@@ -106,7 +106,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
         """What acts on the nodes at x, without inertia, which begins with it."""
         begin = _first_step(scene, x, free)
         acting = [p.freeze(None, begin) for p in physics if type(p).begin is Physics.begin]
-        forces = [a.force(scene.mesh, x, 1.0) for a in acting if isinstance(a, NodalForce)]
+        forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce)]
         return sum(forces, jnp.zeros_like(x))
 
     begin = Start(scene.mesh, x, free, force)

@@ -1,0 +1,92 @@
+"""Tables of time: numbers at increasing times, linear in between, the first before and the last after them.
+
+A table with one number a time is a factor of what it belongs to; one with three is the vector itself.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+#: Columns of a file: a factor, or a vector.
+_FACTOR, _VECTOR = ("time", "factor"), ("time", "x", "y", "z")
+
+
+def read(value: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> tuple[jax.Array, jax.Array]:
+    """Times (T,) [s], and factors (T,) or vectors (T, 3), from a scene file's `history`.
+
+    Args:
+        value: rows `[[t, factor], …]` or `[[t, x, y, z], …]`; or a CSV file with columns time,factor or time,x,y,z.
+        name: of what has the history, for messages.
+        forms: how many numbers a time it may have.
+
+    Raises:
+        InputError: a file that cannot be read, wrong columns, numbers that are not finite, times that do not increase.
+    """
+    wanted = " or ".join("[[time, factor], …]" if n == 1 else "[[time, x, y, z], …]" for n in forms)
+    if isinstance(value, (str, Path)):
+        data, where = _file(Path(value), name, forms), f"{name} history {value}"
+    else:
+        where = f"{name} history"
+        try:
+            data = np.array(value, float)
+        except (TypeError, ValueError):
+            data = np.empty(0)
+        if data.ndim != 2 or data.shape[1] - 1 not in forms:
+            raise InputError(f"{where} is no table of numbers: write {wanted}, or name a CSV file")
+    if not len(data) or not np.all(np.isfinite(data)) or not np.all(np.diff(data[:, 0]) > 0):
+        raise InputError(f"{where} must hold finite numbers at increasing times: sort and fill it")
+    numbers = data[:, 1] if data.shape[1] == 2 else data[:, 1:]
+    return jnp.asarray(data[:, 0]), jnp.asarray(numbers)
+
+
+def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
+    kinds = [_FACTOR if n == 1 else _VECTOR for n in forms]
+    wanted = " or ".join(",".join(kind) for kind in kinds)
+    try:
+        # NumPy takes a comment on the first line for the names.
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
+        data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
+    except (OSError, ValueError, IndexError, StopIteration) as error:
+        raise InputError(f"{name} history {path} cannot be read ({error}): give columns {wanted}") from None
+    found = next((kind for kind in kinds if set(kind) <= set(data.dtype.names or ())), None)
+    if found is None:
+        raise InputError(f"{name} history {path} has columns {data.dtype.names}: give {wanted}")
+    return np.stack([data[column] for column in found], axis=1)
+
+
+def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
+    """Refuse a history made in Python that means nothing; traced numbers pass.
+
+    Raises:
+        InputError: one of times and history without the other, shapes that do not go together.
+    """
+    if (times is None) != (history is None):
+        raise InputError(f"{name} needs both times and history, or none of them: give the other")
+    if history is None:
+        return
+    count = np.shape(times)
+    allowed = [count if n == 1 else (*count, n) for n in forms]
+    if len(count) != 1 or np.shape(history) not in allowed:
+        shapes = " or ".join(map(str, allowed))
+        raise InputError(f"{name} history has shape {np.shape(history)}, its times {count}: give {shapes}")
+
+
+def at(time: Any, times: Any, history: Any) -> jax.Array:
+    """The factor (), or the vector (3,), at a time [s]."""
+    values = jnp.asarray(history)
+    if values.ndim == 1:
+        return jnp.interp(time, times, values)
+    return jnp.stack([jnp.interp(time, times, values[:, k]) for k in range(values.shape[1])])
+
+
+def scaled(value: Any, time: Any, times: Any, history: Any) -> Any:
+    """A value at a time [s]: times the factor, or the vector in its place; as it is where there is no history."""
+    if history is None:
+        return value
+    now = at(time, times, history)
+    return now if now.ndim else jnp.asarray(value, now.dtype) * now

@@ -1,0 +1,106 @@
+"""Pressure and flux of the fluid at parts of the body: steady flow through a stiff sponge, and what has entered."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.errors import InputError
+from liverjax.mesh.nodal import integrals
+from liverjax.physics import porosity
+from liverjax.physics.base import Step
+from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation.equations import free_directions
+
+pytestmark = pytest.mark.quick_to_compile
+
+LOW, TOP = {"x_max": 0.0}, {"x_min": 0.1}
+
+
+def content(inlet: list, order: int = 1, **more) -> dict:
+    sponge = {"bulk": 4e8, "limit_bulk": 1e9, "fluid_fraction": 0.5, "permeability": 2e-6, "inlet": inlet}
+    return {
+        "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [3, 1, 1], "order": order},
+        "law": {"name": "neo_hookean", "mu": 8e8, "bulk": 4e9},
+        "porosity": sponge | more,
+        "fixed": [{"where": LOW}],
+        "solve": {"dt": 10.0, "steps": 2},
+    }
+
+
+def pressures(scene: lj.Scene, steps: int = 1) -> np.ndarray:
+    """Of a sponge so stiff that it does not move (V,)."""
+    mesh, sponge = scene.mesh, scene.porosity
+    memory, J = porosity.initial_fluid(sponge, mesh), jnp.ones_like(mesh.weights)
+    for k in range(1, steps + 1):
+        step = Step(mesh, mesh.points, float(k), steps, scene.solve.dt, False, 1e-10, free_directions(scene))
+        acting = sponge.freeze(memory, step)
+        memory = porosity.Fluid(acting.pressure(mesh, J), J, None)
+    return np.asarray(memory.pressure)
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_fluid_is_driven_through(order):
+    """Steady: linear from one given pressure to the other; with a flux v/kappa is the slope."""
+    scene = scene_from(content([{"where": LOW, "pressure": 300.0}, {"where": TOP, "pressure": 100.0}], order))
+    x = np.asarray(scene.mesh.points)[: scene.mesh.number_of_vertices, 0]
+    assert np.allclose(pressures(scene), 300.0 - 2000.0 * x, rtol=1e-6)
+    driven = scene_from(content([{"where": LOW, "flux": 1e-3}, {"where": TOP, "pressure": 100.0}], order))
+    assert np.allclose(pressures(driven), 100.0 + 500.0 * (0.1 - x), rtol=1e-6)
+
+
+def test_a_sealed_sponge_keeps_what_enters():
+    """Storage 1/K_lim: the mean pressure rises by K_lim v A dt/V; a history is a factor, a start is kept."""
+    inlet = [{"where": LOW, "flux": 1e-9, "history": [[0.0, 0.0], [10.0, 2.0], [20.0, 1.0]]}]
+    scene = scene_from(content(inlet, initial_pressure=7.0))
+    P = pressures(scene, 2)
+    mean = float(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)) @ P / np.sum(scene.mesh.volumes))
+    assert np.isclose(mean, 7.0 + 1e9 * 1e-9 * 10.0 * (2.0 + 1.0) / 0.1, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_energy_has_the_force_for_its_gradient():
+    """Robust steps need it: given pressures push as they are, free ones by what is left."""
+    import jax
+
+    from liverjax.simulation.equations import energy, equations, initial_state, residual, unknowns
+
+    scene = scene_from(
+        content(
+            [{"where": LOW, "pressure": 300.0}, {"where": {"z_min": 0.1}, "flux": 1e-3}], bulk=400.0, limit_bulk=2200.0
+        )
+    )
+    e = equations(scene, initial_state(scene), 1.0)
+    q = unknowns(e, scene.mesh.points * (1 + 0.02 * jnp.sin(40 * scene.mesh.points[:, :1])))
+    r = residual(e, q, 1.0)[0]
+    assert np.allclose(jax.grad(lambda q: energy(e, q))(q) - r, 0.0, atol=1e-6 * np.abs(r).max())
+
+
+@pytest.mark.slow
+def test_perfusion_swells_a_soft_sponge():
+    """Pressure p on all sides of a free sponge: in the end sigma(J) = p of the drained sponge."""
+    table = content([{"where": w, "pressure": 50.0} for w in (LOW, TOP)], bulk=400.0, limit_bulk=2200.0)
+    table |= {"law": {"name": "neo_hookean", "mu": 1e-3, "bulk": 1e-2}, "solve": {"dt": 50.0, "steps": 4}}
+    table["fixed"] = [
+        {"where": LOW, "axes": "x"},
+        {"where": {"y_max": 0.0}, "axes": "y"},
+        {"where": {"z_max": 0.0}, "axes": "z"},
+    ]
+    scene = scene_from(table)
+    x = np.asarray(lj.simulate(scene).check().positions[-1])
+    J = np.prod(np.ptp(x, axis=0)) / 1e-3
+    assert np.isclose(porosity.volumetric_stress(scene.porosity, J), 50.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("inlet", "words"),
+    [
+        ({"where": LOW}, "porosity.inlet.0 needs either pressure"),
+        ({"where": LOW, "pressure": 1.0, "flux": 1.0}, "porosity.inlet.0 needs either pressure"),
+        ({"where": LOW, "presure": 1.0}, "did you mean pressure"),
+        ({"where": LOW, "pressure": 1.0, "history": [[0, 0, 0, 0]]}, "porosity.inlet.0 history is no table"),
+    ],
+)
+def test_bad_inlets_are_refused(inlet, words):
+    with pytest.raises(InputError, match=words):
+        scene_from(content([inlet]))
