@@ -22,6 +22,8 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("--png", action="store_true", help="draw the last state as well")
     command.add_argument("--every", type=int, default=50, metavar="N", help="steps between two writes (50)")
     command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
+    command.add_argument("--fields", metavar="NAMES", help="fields to write, with commas: cauchy_stress,volume_ratio,…")
+    command.add_argument("--reactions", action="store_true", help="write the forces of held parts over time as CSV")
     command.add_argument("--mesh-error", action="store_true", help="estimate what the mesh leaves out of the result")
     add_out(command)
     command.set_defaults(run=run)
@@ -33,10 +35,14 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from liverjax.core import status
-    from liverjax.jobs import long_run, output
+    from liverjax.jobs import fields, long_run, output
     from liverjax.scenes import scene_file
+    from liverjax.simulation.run import unloaded
 
     scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8")
+    names, reactions = _asked_for(options, scene, text)
+    if scene.points_are == "loaded":
+        scene = unloaded(scene).scene
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
@@ -50,10 +56,14 @@ def run(options: argparse.Namespace) -> int:
         bar.close()
     if options.mesh_error:
         ran = ran._replace(result=_with_mesh_error(scene, ran.result))
-    _write_and_tell(scene, text, ran, target)
+    found = fields.fields(scene, ran.result, names) if names else {}
+    _write_and_tell(scene, text, ran, target, found)
     written = [str(target)]
+    if reactions:
+        output.write_reactions(options.out / "reactions.csv", scene, ran.result)
+        written.append(str(options.out / "reactions.csv"))
     if options.vtu:
-        written.append(str(output.write_vtu(options.out / "vtu", scene, ran.result)))
+        written.append(str(output.write_vtu(options.out / "vtu", scene, ran.result, found)))
     if options.png:
         output.picture(options.out / "result.png", scene, ran.result)
         written.append(str(options.out / "result.png"))
@@ -62,6 +72,20 @@ def run(options: argparse.Namespace) -> int:
     for step in np.flatnonzero(codes != status.CONVERGED)[:5]:
         print(f"failed: step {step + 1}: {status.advice(codes[step])}", file=sys.stderr)
     return 1 if np.any(codes != status.CONVERGED) else 0
+
+
+def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[list[str], bool]:
+    """Names of fields and whether reactions are written: of the command line and of [output] together."""
+    import tomllib
+
+    from liverjax.jobs import fields
+    from liverjax.scenes.scene_file import output_of
+
+    names, reactions = output_of(tomllib.loads(text))
+    if options.fields:
+        names = list(dict.fromkeys([*names, *options.fields.split(",")]))
+    fields.check(names, scene)
+    return names, reactions or options.reactions
 
 
 def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
@@ -75,7 +99,7 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
     return replace(result, mesh_error=whole)
 
 
-def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path) -> None:
+def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: dict) -> None:
     """Write the results in place of the parts of the run; print what it took and what to be cautious of."""
     import numpy as np
 
@@ -89,7 +113,7 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path) -> None
         attributes["bulk"] = porosity.bulk_in_force(scene.porosity, scene.law)
         print(attributes["bulk"])
     said = cautions(scene, ran.result)
-    output.write_hdf5(target, scene, ran.result, attributes | {"warnings": said, "versions": versions()})
+    output.write_hdf5(target, scene, ran.result, attributes | {"warnings": said, "versions": versions()}, found)
     if parts.beside(target).exists():
         parts.remove(parts.beside(target))
     s, steps = ran.result.statistics, len(ran.result.times)

@@ -9,14 +9,17 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.files import whole
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
+from liverjax.jobs.fields import FIELDS, at_vertices, reaction_table
 from liverjax.mesh.files import meshio_cells
 from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result
 
 
-def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, Any]) -> None:
-    """Rows and mesh as datasets; status, iterations and `attributes` as attributes.
+def write_hdf5(
+    file: Path, scene: Scene, result: Result, attributes: dict[str, Any], fields: dict[str, np.ndarray] | None = None
+) -> None:
+    """Rows, mesh and `fields` (T, E, …) as datasets; status, iterations and `attributes` as attributes.
 
     The nodes of quadratic tetrahedra (E, 10) stand in the order of VTK.
     """
@@ -33,6 +36,10 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
             for name, unit in (("positions", "m"), ("reactions", "N"), ("found", "1")):
                 out[f"mesh_error/{name}"] = np.asarray(getattr(result.mesh_error, name))
                 out[f"mesh_error/{name}"].attrs["unit"] = unit
+        for name, values in (fields or {}).items():
+            for place, numbers in (("elements", values), ("vertices", at_vertices(scene.mesh, values))):
+                out[f"fields/{place}/{name}"] = numbers
+                out[f"fields/{place}/{name}"].attrs["unit"] = FIELDS[name]
         out["times"].attrs["unit"] = "s" if scene.solve.dt is not None else "load step"
         out["reference"] = np.asarray(scene.mesh.points)
         out["reference"].attrs["unit"] = "m"
@@ -46,8 +53,16 @@ def write_hdf5(file: Path, scene: Scene, result: Result, attributes: dict[str, A
             out.attrs[name] = value if isinstance(value, (str, int, float)) else json.dumps(value)
 
 
-def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
-    """One VTU file a step with displacements and reactions, and the series that ParaView opens."""
+def write_reactions(file: Path, scene: Scene, result: Result) -> None:
+    """Forces of the held and moved parts over time, as CSV."""
+    names, rows = reaction_table(scene, result)
+    lines = [",".join(names), *(",".join(f"{number:.10g}" for number in row) for row in rows)]
+    with whole(file) as new:
+        Path(new).write_text("\n".join(lines) + "\n")
+
+
+def write_vtu(folder: Path, scene: Scene, result: Result, fields: dict[str, np.ndarray] | None = None) -> Path:
+    """One VTU file a step with displacements, reactions and fields, and the series that ParaView opens."""
     import meshio
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -60,7 +75,8 @@ def write_vtu(folder: Path, scene: Scene, result: Result) -> Path:
         data = {"displacement": x - reference, "reaction": f}
         if result.pressure is not None:
             data["pressure"] = np.asarray(result.pressure[k])
-        meshio.Mesh(reference, cells, point_data=data).write(folder / name)
+        own = {key: [values[k].reshape(len(values[k]), -1)] for key, values in (fields or {}).items()}
+        meshio.Mesh(reference, cells, point_data=data, cell_data=own).write(folder / name)
         entries.append({"name": name, "time": float(time)})
     series = folder / "result.vtu.series"
     series.write_text(json.dumps({"file-series-version": "1.0", "files": entries}, indent=1) + "\n")

@@ -43,6 +43,8 @@ def check_choices(scene: Scene) -> None:
         raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
+    if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
+        raise InputError('[mesh] is = "loaded" knows no nodes that move together: leave the rigid plate out')
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
         raise InputError(
             "[solve] linear_solver = 'direct' knows no nodes that move together: use cg with a rigid plate"

@@ -1,0 +1,153 @@
+"""Fields of a finished run, on demand: stress, strain, stretches, volume ratio, energy, the fluid's velocity.
+
+The positions of every step are put into the equations of that step again, so that memories (viscosity, fluid) are what
+they were; nothing is solved for.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.names import hint
+from liverjax.elements.gradients import volume_gradients
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import End
+from liverjax.physics.registry import law_at_rest
+from liverjax.scenes.scene import Scene
+from liverjax.simulation import automatic
+from liverjax.simulation.equations import Equations, State, advanced, equations, force_sizes, initial_state
+from liverjax.simulation.run import Result, prepared
+from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, pack
+
+#: Name -> unit.
+FIELDS = {
+    "cauchy_stress": "Pa",
+    "green_strain": "1",
+    "principal_stretches": "1",
+    "volume_ratio": "1",
+    "energy": "Pa",
+    "fluid_velocity": "m/s",
+}
+
+
+def check(names: list[str], scene: Scene) -> None:
+    """Refuse fields that are not known, or that the scene does not have.
+
+    Raises:
+        InputError: one sentence.
+    """
+    for name in names:
+        if name not in FIELDS:
+            raise InputError(f"[output] fields: {name!r} is not known: {hint(name, FIELDS)}")
+    if "fluid_velocity" in names and scene.porosity is None:
+        raise InputError("[output] fields: fluid_velocity needs [porosity]: leave it out")
+    if automatic.volumetric(scene) == "mixed" and "cauchy_stress" in names:
+        raise InputError(
+            "[output] fields: cauchy_stress lacks the pressures of volumetric = 'mixed', which no result keeps: take "
+            "'element' or 'nodal', or leave it out"
+        )
+
+
+def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:
+    """Fields (T, E, …) of the elements of a finished run: means over an element.
+
+    cauchy_stress (3, 3) [Pa] with the pressure of a fluid, green_strain (3, 3), principal_stretches (3,) from the
+    largest, volume_ratio J, energy [Pa] of the law per reference volume, fluid_velocity (3,) [m/s] through the body.
+
+    Args:
+        scene: of the run.
+        result: of the run.
+        names: some of `FIELDS`.
+
+    Raises:
+        InputError: see `check`.
+    """
+    check(names, scene)
+    scene = prepared(scene)
+    sizes, state = force_sizes(scene), initial_state(scene)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for k, x in enumerate(np.asarray(result.positions)):
+        pressure = None if result.pressure is None else jnp.asarray(result.pressure[k])
+        state, at = _step(scene, sizes, state, (jnp.asarray(k + 1.0), jnp.asarray(x), pressure))
+        P, F, energy, velocity = (np.asarray(a) for a in at)
+        found = _of_points(P, F, energy, velocity, names)
+        for name in names:
+            rows[name].append(found[name])
+    return {name: np.stack(values) for name, values in rows.items()}
+
+
+@jax.jit
+def _step(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[State, tuple]:
+    """The state after a step that ended at x; stress, F, energy and the fluid's velocity at the points (…, Q, E)."""
+    k, x, pressure = given
+    mesh, e = scene.mesh, equations(scene, state, k, sizes)
+    F = deformation_gradient(mesh, x)
+    P = _stress(e, F, pressure)
+    law = law_at_rest(scene)
+    energy = law.strain_energy(law.measures(F))
+    vertices = None if pressure is None else pressure[: mesh.number_of_vertices]
+    velocity = jnp.zeros((3, *determinant(F).shape)) if vertices is None else _velocity(scene, F, vertices)
+    at = (pack(P), pack(F), jnp.broadcast_to(energy, determinant(F).shape), velocity)
+    return advanced(e, End(x, F, vertices)), at
+
+
+def _stress(e: Equations, F: Matrix, pressure: Any) -> Matrix:
+    first, *rest = [solid.stress(F) for solid in e.solids]
+    for more in rest:
+        first = add_matrices(first, more)
+    if e.volume is None or e.mixed is not None:
+        return first
+    own = e.volume.pressure(e.mesh, determinant(F)) if pressure is None else pressure[: e.mesh.number_of_vertices]
+    return add_matrices(first, e.volume.stress(e.mesh, own, F))
+
+
+def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
+    """Darcy's: minus permeability times the gradient of the pressure in space, (3, Q, E) [m/s]."""
+    mesh: TetMesh = scene.mesh
+    corner, g, J = pressure[mesh.tetrahedra.T], volume_gradients(mesh, F), determinant(F)
+    of = corner if mesh.order == 1 else corner[:, None]
+    slope = [sum(of[a] * g[a][i] for a in range(4)) / J for i in range(3)]
+    return -jnp.asarray(scene.porosity.permeability) * jnp.stack(slope)  # type: ignore[union-attr]
+
+
+def _of_points(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarray, names: list[str]) -> dict:
+    """Fields of the elements (E, …) from values at points."""
+    turned, J = np.swapaxes(F, -1, -2), np.linalg.det(F)
+    make = {
+        "cauchy_stress": lambda: P @ turned / J[..., None, None],
+        "green_strain": lambda: 0.5 * (turned @ F - np.eye(3)),
+        "principal_stretches": lambda: np.linalg.svd(F, compute_uv=False),
+        "volume_ratio": lambda: J,
+        "energy": lambda: energy,
+        "fluid_velocity": lambda: np.moveaxis(velocity, 0, -1),
+    }
+    found = {name: make[name]() for name in names}
+    # Points of a quadratic element have the same weight.
+    return {name: value if J.ndim == 1 else value.mean(axis=0) for name, value in found.items()}
+
+
+def at_vertices(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
+    """Fields (T, E, …) of the elements at the vertices (T, V, …): means by volume of the elements around."""
+    tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
+    total = np.zeros((len(values), mesh.number_of_vertices, *values.shape[2:]))
+    weight = np.zeros(mesh.number_of_vertices)
+    weighted = values * volumes.reshape(1, -1, *[1] * (values.ndim - 2))
+    for corner in tets.T:
+        np.add.at(weight, corner, volumes)
+        for t in range(len(values)):
+            np.add.at(total[t], corner, weighted[t])
+    return total / weight.reshape(1, -1, *[1] * (values.ndim - 2))
+
+
+def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
+    """Time, and the force of each `fixed` and `displaced` part on the body over time: column names and rows."""
+    names, columns = ["time"], [np.asarray(result.times)]
+    for kind in ("fixed", "displaced"):
+        for k, part in enumerate(getattr(scene, kind)):
+            force = np.asarray(result.reactions)[:, np.unique(np.asarray(part.nodes))].sum(axis=1)
+            names += [f"{kind}.{k}.{axis}_N" for axis in "xyz"]
+            columns += list(force.T)
+    return names, np.stack(columns, axis=1)

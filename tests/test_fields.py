@@ -1,0 +1,136 @@
+"""Fields of a run against a body in uniform strain, and forces over time as a table."""
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.errors import InputError
+from liverjax.jobs import fields
+from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation.run import Result
+
+pytestmark = pytest.mark.quick_to_compile
+
+SCENE = """
+[mesh]
+shape = "box"
+size = [0.1, 0.1, 0.1]
+cells = [1, 1, 1]
+[law]
+name = "neo_hookean"
+mu = 800.0
+bulk = 4000.0
+[[fixed]]
+where = {z_max = 0.0}
+[[displaced]]
+where = {z_min = 0.1}
+by = [0.01, 0.0, 0.0]
+[solve]
+steps = 2
+[output]
+fields = ["cauchy_stress", "volume_ratio"]
+reactions = true
+"""
+NAMES = ["cauchy_stress", "green_strain", "principal_stretches", "volume_ratio", "energy"]
+
+
+def content(**more) -> dict:
+    return {
+        "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [1, 1, 1]},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "fixed": [{"where": {"z_max": 0.0}}],
+        "solve": {"dt": 0.1, "steps": 2},
+    } | more
+
+
+def shown(scene: lj.Scene, positions, names, pressure=None) -> dict:
+    """Fields at given positions (T, V, 3), as of a run."""
+    T = len(positions)
+    zero = np.zeros(np.shape(positions))
+    result = Result(
+        times=np.arange(T), positions=positions, reactions=zero, status=np.zeros(T), pressure=pressure, statistics=None
+    )
+    return fields.fields(scene, result, names)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_uniform_strain_has_the_fields_of_one_point(order):
+    scene = scene_from(content(mesh=content()["mesh"] | {"order": order}, solve={"steps": 1}))
+    F = np.array([[1.2, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, 0.0, 1.1]])
+    x = np.asarray(scene.mesh.points) @ F.T
+    found, J = shown(scene, x[None], NAMES), np.linalg.det(F)
+    exact = {
+        "cauchy_stress": np.asarray(scene.law.first_piola(F)) @ F.T / J,
+        "green_strain": 0.5 * (F.T @ F - np.eye(3)),
+        "principal_stretches": np.sqrt(np.linalg.eigvalsh(F.T @ F))[::-1],
+        "volume_ratio": J,
+        "energy": float(scene.law.energy(F)),
+    }
+    for name, value in exact.items():
+        assert found[name].shape[:2] == (1, scene.mesh.number_of_elements)
+        assert np.allclose(found[name][0], value, rtol=1e-10, atol=1e-12)
+        nodes = fields.at_vertices(scene.mesh, found[name])
+        assert nodes.shape[:2] == (1, scene.mesh.number_of_vertices) and np.allclose(
+            nodes[0], value, rtol=1e-10, atol=1e-12
+        )
+
+
+def test_a_held_viscous_body_relaxes():
+    """Strained at once and held: the stress of the second step is that of the first, relaxed by the series."""
+    prony = {"ratios": [0.5], "relaxation_times": [0.1]}
+    viscous, plain = scene_from(content(viscosity=prony)), scene_from(content())
+    F = np.diag([1.3, 0.9, 0.95])
+    x = np.asarray(viscous.mesh.points) @ F.T
+    stress, elastic = (shown(s, np.stack([x, x]), ["cauchy_stress"])["cauchy_stress"] for s in (viscous, plain))
+    h = 0.1 / 0.1
+    # A ramp over the first step, then rest (exponential recursion).
+    first = 0.5 + 0.5 * (1 - np.exp(-h)) / h
+    second = 0.5 + 0.5 * (1 - np.exp(-h)) / h * np.exp(-h)
+    assert np.allclose(stress[0], first * elastic[0], rtol=1e-9, atol=1e-9)
+    assert np.allclose(stress[1], second * elastic[1], rtol=1e-9, atol=1e-9)
+
+
+def test_fluid_flows_down_the_pressure():
+    sponge = {"bulk": 400.0, "limit_bulk": 2200.0, "fluid_fraction": 0.5, "permeability": 2e-6}
+    scene = scene_from(content(porosity=sponge))
+    F = np.diag([1.2, 1.0, 0.8])
+    X = np.asarray(scene.mesh.points)
+    pressure = 50.0 + 300.0 * (X @ F.T)[:, 0]
+    found = shown(scene, (X @ F.T)[None], ["fluid_velocity"], pressure[None])
+    assert np.allclose(found["fluid_velocity"][0], [-2e-6 * 300.0, 0.0, 0.0], atol=1e-16)
+
+
+@pytest.mark.slow
+def test_what_a_command_writes(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    from liverjax.__main__ import main
+
+    assert (
+        main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path), "--vtu", "--fields", "green_strain"])
+        == 0
+    )
+    with h5py.File(tmp_path / "result.h5") as file:
+        assert set(file["fields/elements"]) == {"cauchy_stress", "volume_ratio", "green_strain"}
+        assert file["fields/vertices/cauchy_stress"].shape == (2, 8, 3, 3)
+        assert file["fields/elements/cauchy_stress"].attrs["unit"] == "Pa"
+        reactions = file["reactions"][:]
+    table = np.genfromtxt(tmp_path / "reactions.csv", delimiter=",", names=True)
+    assert np.allclose(
+        table["fixed0x_N"], reactions[:, :, 0][:, np.isin(np.arange(8), [0, 2, 4, 6])].sum(axis=1), rtol=1e-6
+    )
+    assert np.allclose(table["fixed0x_N"], -table["displaced0x_N"], rtol=1e-6)
+    assert meshio.read(tmp_path / "vtu" / "step_00002.vtu").cell_data["green_strain"][0].shape == (6, 9)
+
+
+def test_bad_fields_are_refused():
+    scene = scene_from(content())
+    for names, words in (
+        (["cauchy_stres"], "did you mean cauchy_stress"),
+        (["fluid_velocity"], "needs \\[porosity\\]"),
+    ):
+        with pytest.raises(InputError, match=words):
+            fields.check(names, scene)
+    with pytest.raises(InputError, match="must be a list of names"):
+        scene_from(content(output={"fields": "cauchy_stress"}))
