@@ -78,7 +78,8 @@ class Porosity(Physics):
         F = deformation_gradient(step.mesh, step.x)
         found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
-            found = found._replace(**inflow(self, step.mesh, step.k * step.dt, step.dt))
+            given, enters = inflow(self, step.mesh, step.k * step.dt, step.dt)
+            found = found._replace(given=given, enters=enters)
         if self.scheme == "implicit":
             return CoupledSponge(porosity=self, fluid=memory, flow=found)
         return LaggedSponge(porosity=self, fluid=memory, given=pressure(self, step.mesh, memory, found, determinant(F)))
@@ -174,7 +175,7 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
 
 
-def inflow(porosity: Porosity, mesh: TetMesh, time: Any, dt: Any) -> dict[str, jax.Array]:
+def inflow(porosity: Porosity, mesh: TetMesh, time: Any, dt: Any) -> tuple[jax.Array, jax.Array]:
     """Of `darcy.Flow` with inlets, at a time [s]: given pressures (V,) [Pa], and what enters in dt (V,) [m^3]."""
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:
@@ -185,7 +186,7 @@ def inflow(porosity: Porosity, mesh: TetMesh, time: Any, dt: Any) -> dict[str, j
             volume = dt * inlet.at(inlet.flux, time) * jnp.sqrt(jnp.sum(normal * normal, axis=1)) / 3
             for a in range(3):
                 enters = enters.at[inlet.triangles[:, a]].add(volume)
-    return {"given": given, "enters": enters}
+    return given, enters
 
 
 def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:

@@ -141,7 +141,8 @@ def tangent(
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     # Loads that follow the body need to know where.
-    return Tangent(matrix, inverse, below, slow, *((None, None) if e.conservative else (x, s)), more)
+    where, part = (None, None) if e.conservative else (x, s)
+    return Tangent(matrix, inverse, below, slow, where, part, more)
 
 
 #: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
