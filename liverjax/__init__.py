@@ -37,7 +37,7 @@ from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import Batch, simulate_batch
 from liverjax.simulation.gradients import Gradient, value_and_gradient
-from liverjax.simulation.run import Result, simulate, unloaded
+from liverjax.simulation.run import Result, simulate
 
 __version__ = "0.1.0"
 
@@ -74,7 +74,6 @@ __all__ = [
     "static",
     "struct",
     "tet_mesh",
-    "unloaded",
     "value_and_gradient",
     "viscosity",
     "with_parameters",

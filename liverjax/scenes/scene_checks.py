@@ -37,14 +37,8 @@ def check_choices(scene: Scene) -> None:
         value = getattr(scene.solve, key)
         if value not in allowed:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
-    if scene.points_are not in ("reference", "loaded"):
-        raise InputError(f"[mesh] is = {scene.points_are!r} is not known: use reference or loaded")
-    if scene.points_are == "loaded" and scene.porosity is not None:
-        raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
-    if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
-        raise InputError('[mesh] is = "loaded" knows no nodes that move together: leave the rigid plate out')
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
         raise InputError(
             "[solve] linear_solver = 'direct' knows no nodes that move together: use cg with a rigid plate"
@@ -167,7 +161,7 @@ def check_scene(scene: Scene) -> None:
             "nodes at and above it, {z_max = 0} those at and below",
             stacklevel=2,
         )
-    if solve.kind == "static" or scene.points_are == "loaded":
+    if solve.kind == "static":
         _held(scene)
 
 
