@@ -47,7 +47,7 @@ def test_a_line_is_cut_where_it_leaves_an_element():
 def test_functions_at_points_are_those_of_the_elements(order):
     mesh = box(order)
     points = np.array([[0.013, 0.021, 0.034], [0.077, 0.061, 0.09]])
-    nodes, values = locate.weights(mesh, *locate.locate(mesh, points, "points"))
+    nodes, values = locate.weights(mesh, *locate.elements_at(mesh, points, "points"))
     field = (
         np.asarray(mesh.points) @ [1.0, 2.0, -1.0] + (0.0 if order == 1 else 1.0) * np.asarray(mesh.points)[:, 0] ** 2
     )

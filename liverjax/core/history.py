@@ -76,7 +76,7 @@ def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) 
         raise InputError(f"{name} history has shape {np.shape(history)}, its times {count}: give {shapes}")
 
 
-def at(time: Any, times: Any, history: Any) -> jax.Array:
+def entry_at(time: Any, times: Any, history: Any) -> jax.Array:
     """The factor (), or the vector (3,), at a time [s]."""
     values = jnp.asarray(history)
     if values.ndim == 1:
@@ -84,9 +84,9 @@ def at(time: Any, times: Any, history: Any) -> jax.Array:
     return jnp.stack([jnp.interp(time, times, values[:, k]) for k in range(values.shape[1])])
 
 
-def scaled(value: Any, time: Any, times: Any, history: Any) -> Any:
+def value_at(value: Any, time: Any, times: Any, history: Any) -> Any:
     """A value at a time [s]: times the factor, or the vector in its place; as it is where there is no history."""
     if history is None:
         return value
-    now = at(time, times, history)
+    now = entry_at(time, times, history)
     return now if now.ndim else jnp.asarray(value, now.dtype) * now

@@ -71,21 +71,21 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
     rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for k, x in enumerate(np.asarray(result.positions)):
         pressure = None if result.pressure is None else jnp.asarray(result.pressure[k])
-        state, at = _step(scene, sizes, state, (jnp.asarray(k + 1.0), jnp.asarray(x), pressure))
+        state, at = _put_again(scene, sizes, state, (jnp.asarray(k + 1.0), jnp.asarray(x), pressure))
         P, F, energy, velocity = (np.asarray(a) for a in at)
-        found = _of_points(P, F, energy, velocity, names)
+        found = _means(P, F, energy, velocity, names)
         for name in names:
             rows[name].append(found[name])
     return {name: np.stack(values) for name, values in rows.items()}
 
 
 @jax.jit
-def _step(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[State, tuple]:
+def _put_again(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[State, tuple]:
     """The state after a step that ended at x; stress, F, energy and the fluid's velocity at the points (…, Q, E)."""
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
-    P = _stress(e, F, pressure)
+    P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)
     energy = law.strain_energy(law.measures(F))
     vertices = None if pressure is None else pressure[: mesh.number_of_vertices]
@@ -94,7 +94,7 @@ def _step(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[State, tu
     return advanced(e, End(x, F, vertices)), at
 
 
-def _stress(e: Equations, F: Matrix, pressure: Any) -> Matrix:
+def _whole_stress(e: Equations, F: Matrix, pressure: Any) -> Matrix:
     first, *rest = [solid.stress(F) for solid in e.solids]
     for more in rest:
         first = add_matrices(first, more)
@@ -113,7 +113,7 @@ def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
     return -jnp.asarray(scene.porosity.permeability) * jnp.stack(slope)  # type: ignore[union-attr]
 
 
-def _of_points(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarray, names: list[str]) -> dict:
+def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarray, names: list[str]) -> dict:
     """Fields of the elements (E, …) from values at points."""
     turned, J = np.swapaxes(F, -1, -2), np.linalg.det(F)
     make = {

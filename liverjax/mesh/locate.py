@@ -31,7 +31,7 @@ def barycentric(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
     return np.concatenate([1 - rest.sum(axis=0)[None], rest])
 
 
-def locate(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Elements (n,) of points (n, 3) [m] and barycentric coordinates (4, n) there.
 
     Raises:

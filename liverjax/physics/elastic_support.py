@@ -69,7 +69,7 @@ class ElasticSupport(Physics):
         own = blocks(self, step.mesh)
         if self.history is None:
             return Springs(blocks=own)
-        before, after = (history.at(n * step.dt, self.times, self.history) for n in (step.k - 1, step.k))
+        before, after = (history.entry_at(n * step.dt, self.times, self.history) for n in (step.k - 1, step.k))
         if after.ndim:
             return Springs(blocks=own, wall=jnp.stack([before, after]))
         return Springs(blocks=tuple(tuple(after * entry for entry in row) for row in own))

@@ -27,7 +27,7 @@ class Traction:
         """The load at a time [s], without a history."""
         if self.history is None:
             return self
-        now = history.scaled(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
+        now = history.value_at(self.value if self.pressure is None else self.pressure, time, self.times, self.history)
         key = "value" if self.pressure is None else "pressure"
         return replace(self, times=None, history=None, **{key: now})
 
@@ -90,7 +90,7 @@ class Loads(Physics):
     def at(self, time: Any) -> "Loads":
         """The loads at a time [s], without histories."""
         traction = tuple(load.at(time) for load in self.traction)
-        gravity = history.scaled(self.gravity, time, self.times, self.history)
+        gravity = history.value_at(self.gravity, time, self.times, self.history)
         return replace(self, gravity=gravity, traction=traction, times=None, history=None)
 
     def _loading(self, step: Step, growth: str) -> "Loading":

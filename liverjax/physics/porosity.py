@@ -47,7 +47,7 @@ class Inlet:
 
     def at(self, value: Any, time: Any) -> Any:
         """Pressure or flux at a time [s]."""
-        return history.scaled(value, time, self.times, self.history)
+        return history.value_at(value, time, self.times, self.history)
 
 
 @struct

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from liverjax.core.history import at
+from liverjax.core.history import entry_at
 from liverjax.core.struct import param, static, struct
 from liverjax.mesh.selection import AXES
 from liverjax.mesh.tetrahedra import TetMesh
@@ -53,7 +53,7 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Any, fraction: Any) -> jax
         for axis in condition.axes:
             k = AXES.index(axis)
             if condition.by is not None:
-                part = fraction if condition.history is None else at(time, condition.times, condition.history)
+                part = fraction if condition.history is None else entry_at(time, condition.times, condition.history)
                 value = jnp.asarray(condition.by, u.dtype)[..., k] * part
             else:
                 value = jnp.interp(time, condition.times, jnp.asarray(condition.history)[:, k])

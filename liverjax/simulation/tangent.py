@@ -93,7 +93,7 @@ def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached, 
 
 def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -> Block:
     for own in more:
-        diagonal = block_matrix.added(diagonal, attached.diagonal(own, e.mesh.number_of_nodes))
+        diagonal = block_matrix.added(diagonal, attached.own_diagonal(own, e.mesh.number_of_nodes))
     return diagonal
 
 

@@ -25,7 +25,7 @@ def product(A: Attached, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
     return tuple(total.T)
 
 
-def diagonal(A: Attached, number_of_nodes: int) -> Block:
+def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
     """Diagonal blocks, 3 x 3 of (V,)."""
     # Where two places of an element are one node, what lies between them is on the diagonal too.
     same = A.nodes[:, None] == A.nodes[None]
@@ -48,7 +48,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
         values = jnp.where(there[:, None, :, None], own.blocks, 0.0)  # (n, 3, n, 3, m)
         near = jnp.broadcast_to(near, there.shape)
         rows = rows.at[:, :, jnp.argmax(found, axis=0), near].add(jnp.transpose(values, (1, 3, 0, 2, 4)))
-        total = added(total, diagonal(own, mesh.number_of_vertices))
+        total = added(total, own_diagonal(own, mesh.number_of_vertices))
     return BlockMatrix(tuple(map(tuple, rows)), total, A.nodes)
 
 

@@ -98,7 +98,7 @@ def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: 
     Raises:
         InputError: a point outside it.
     """
-    nodes, values = locate.weights(mesh, *locate.locate(mesh, points, f"{name} points"))
+    nodes, values = locate.weights(mesh, *locate.elements_at(mesh, points, f"{name} points"))
     signed = values * np.array([[-1.0, 1.0]])
     both = np.concatenate([nodes[:, 0], nodes[:, 1]])[:, None]
     weights = np.concatenate([signed[:, 0], signed[:, 1]])[:, None]

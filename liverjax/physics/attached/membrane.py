@@ -47,7 +47,7 @@ class Membrane(Physics):
         triangles = selection.boundary_triangles(mesh, nodes)
         if not len(triangles):
             raise InputError(f"{place} meets nodes but no boundary triangle: widen it to a whole face")
-        law = layers.read(table["law"], name)
+        law = layers.read_layer(table["law"], name)
         return cls(triangles=jnp.asarray(triangles, jnp.int32), thickness=table["thickness"], law=law)
 
     def check(self, mesh: TetMesh, name: str) -> None:

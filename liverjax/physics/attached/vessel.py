@@ -54,7 +54,7 @@ class Vessel(Physics):
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
             raise InputError(f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each")
         given = {"wall": table["wall"]} if "wall" in table else {}
-        return along(mesh, line, radius, law=layers.read(table["law"], name), name=name, **given)
+        return along(mesh, line, radius, law=layers.read_layer(table["law"], name), name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
         """Elements of the mesh, a wall within the radius, a law without directions."""
@@ -131,7 +131,7 @@ class Bars(Elements):
         rows = []
         for at in _GAUSS:
             L = self.enters + float(at) * (self.leaves - self.enters)
-            rows.append(_slopes(L, along))
+            rows.append(_slopes_along(L, along))
         return jnp.stack(rows, axis=1)[None]
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
@@ -141,7 +141,7 @@ class Bars(Elements):
         return volume[None] * layers.axial_energy(law, jnp.sqrt(C[0]))
 
 
-def _slopes(L: jax.Array, along: jax.Array) -> jax.Array:
+def _slopes_along(L: jax.Array, along: jax.Array) -> jax.Array:
     """Derivatives (10, m) of the quadratic functions at L (4, m) in a direction (4, m): they are linear in L."""
     corners = np.eye(4)
     table = functions(2, corners)[1]  # (10, 4, 4): by L_k, at every corner
