@@ -29,6 +29,7 @@ from liverjax.mesh.refinement import refined
 from liverjax.mesh.tetrahedra import TetMesh, check_mesh, tet_mesh
 from liverjax.physics import boundary, viscosity
 from liverjax.physics.boundary import Displaced, Fixed, Traction
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes.regions import Region
@@ -37,6 +38,7 @@ from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import Batch, simulate_batch
 from liverjax.simulation.gradients import Gradient, value_and_gradient
+from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result, simulate
 
 __version__ = "0.1.0"
@@ -49,6 +51,7 @@ __all__ = [
     "Gradient",
     "InputError",
     "Law",
+    "Obstacle",
     "Porosity",
     "Prony",
     "Region",
@@ -63,6 +66,7 @@ __all__ = [
     "laws",
     "load_scene",
     "mjed",
+    "obstacle_forces",
     "param",
     "quadratic",
     "read_mesh",

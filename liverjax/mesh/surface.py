@@ -77,6 +77,11 @@ def slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     return weights, np.swapaxes(np.stack(_quadratic(l)[1]), 1, 2)
 
 
+def functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
+    """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q)."""
+    return l if mesh.order == 1 else _quadratic(l)[0]
+
+
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Six functions (6, Q) at barycentric coordinates l (3, Q), and their slopes towards the last vertices."""
     N = [l[k] * (2 * l[k] - 1) for k in range(3)] + [4 * l[a] * l[b] for a, b in _EDGES]

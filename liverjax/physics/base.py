@@ -214,6 +214,10 @@ class Physics:
             InputError: one sentence that begins with `name`.
         """
 
+    def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
+        """The same beside this law, for numbers that follow from it."""
+        return self
+
     def begin(self, start: Start) -> Any:
         """Memory at the beginning of a run; None: it remembers nothing."""
         return None

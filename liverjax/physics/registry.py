@@ -8,6 +8,7 @@ from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.attached.membrane import Membrane
 from liverjax.physics.attached.vessel import Vessel
 from liverjax.physics.base import Physics
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.inertia import Inertia
@@ -24,6 +25,7 @@ NAMED: tuple[type[Physics], ...] = (
     Membrane,
     Ligament,
     Vessel,
+    Obstacle,
 )
 
 
@@ -54,4 +56,4 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
         keys = ("density", "gravity", "times", "history")
         weight = {} if body is None else {key: getattr(body, key) for key in keys}
         found.append(Loads(traction=scene.traction, **weight))
-    return (*found, *scene.physics)
+    return (*found, *(p.in_body(scene.mesh, scene.law) for p in scene.physics))

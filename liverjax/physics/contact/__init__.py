@@ -1,0 +1,1 @@
+"""Contact of the body's surface with rigid obstacles."""

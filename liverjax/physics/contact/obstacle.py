@@ -1,0 +1,229 @@
+"""A rigid obstacle that the surface of the body does not enter: a plane, a sphere, a cylinder or a cone.
+
+At three points of every triangle a pressure `stiffness` times the depth acts along the obstacle's normal, per reference
+area; where the surface is outside, nothing acts, so nothing sticks. There is no friction. The energy is half of
+pressure times depth, its gradient and second derivative are exact. The depth that is left is the pressure over the
+stiffness: `HARDNESS` times the body's own stiffness over the size of a triangle keeps it below a hundredth of the
+triangle's size at a pressure of that stiffness. `lj.obstacle_forces` tells force and largest depth.
+
+Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
+"""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import history
+from liverjax.core.errors import InputError
+from liverjax.core.names import hint
+from liverjax.core.struct import param, replace, static, struct
+from liverjax.laws.base import Law
+from liverjax.mesh import selection, surface
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import NodalForce, Physics, Step
+from liverjax.physics.contact.shapes import SHAPES, Distance, distance
+from liverjax.solvers.attached import Attached
+
+#: Stiffness of the contact over that of the body's material in a layer as thick as a triangle is wide.
+HARDNESS = 100.0
+#: Distance that counts as touching, over the size of a triangle.
+_TOUCHING = 1e-9
+#: Points of a triangle: barycentric coordinates (3, Q), equal weights; exact to degree 2.
+_POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
+
+
+@struct
+class Obstacle(Physics):
+    """One rigid shape that stands still, moves `by` a vector within the run, or follows a history."""
+
+    triangles: Any = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
+    shape: str = static(default="plane", about="plane, sphere, cylinder or cone")
+    position: Any = param(
+        "m", "point of the plane or of the cylinder's axis, centre, tip (3,)", default=(0.0, 0.0, 0.0)
+    )
+    axis: Any = param("1", "normal to the free side; axis; from the cone's tip inwards (3,)", default=(0.0, 0.0, 1.0))
+    radius: Any = param("m", "of sphere and cylinder; of a cone's rounded tip", lower=0.0, default=0.0)
+    half_angle: Any = param("deg", "of the cone, between axis and side", above=0.0, default=45.0)
+    by: Any = param("m", "displacement (3,), reached at the last step", default=None)
+    times: Any = param("s", "times of a history (T,)", default=None)
+    history: Any = param("m", "displacements at these times (T, 3), or factors of by (T,)", default=None)
+    stiffness: Any = param(
+        "Pa/m", "pressure over depth, one or one a triangle (m,); None: by the body's own", above=0.0, default=None
+    )
+
+    section: ClassVar[str] = "obstacle"
+    keys: ClassVar[tuple[str, ...]] = (
+        *("shape", "where", "set", "position", "axis", "radius", "half_angle", "by", "history", "stiffness"),
+    )
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Obstacle":
+        """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
+        shape = table.get("shape")
+        if shape not in SHAPES:
+            raise InputError(
+                f"{name} shape = {shape!r} is not known{hint(str(shape), SHAPES)}: use {', '.join(SHAPES)}"
+            )
+        for key in ("position", *SHAPES[shape]):
+            if key not in table:
+                raise InputError(f"{name} is a {shape} without {key}: give it")
+        whole = "where" not in table and "set" not in table
+        nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
+        triangles = selection.boundary_triangles(mesh, nodes)
+        given: dict[str, Any] = {key: table[key] for key in ("radius", "half_angle", "stiffness") if key in table}
+        given |= {k: _three_numbers(table[k], f"{name} {k}") for k in ("position", "axis", "by") if k in table}
+        if "axis" in given:
+            given["axis"] = given["axis"] / max(float(jnp.linalg.norm(given["axis"])), 1e-300)
+        if "history" in table:
+            given["times"], given["history"] = history.read(table["history"], name)
+        return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """A known shape, numbers that make one, triangles of the mesh, and a body that is outside at the beginning."""
+        if self.shape not in SHAPES:
+            raise InputError(f"{name} shape = {self.shape!r} is not known: use {', '.join(SHAPES)}")
+        numbers = np.asarray(self.triangles)
+        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
+            raise InputError(f"{name} names no triangle or a node beyond {mesh.number_of_nodes - 1}: give some")
+        if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
+            raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
+        if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):
+            raise InputError(f"{name} half_angle = {self.half_angle} must be below 90 degrees: a plane has 90")
+        if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
+            raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
+        history.check(self.times, self.history, name)
+        if self.history is not None and np.ndim(self.history) == 1 and self.by is None:
+            raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
+        size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        first = self.displacement(0, 1, 0.0)
+        deepest = -float(np.min(np.asarray(_distances(self, mesh, mesh.points, first).value)))
+        if deepest > 1e-9 * size:
+            raise InputError(
+                f"{name} position = {np.asarray(self.position).tolist()} begins {deepest:.3g} m inside the body: move "
+                "it out"
+            )
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Along the normal, where the surface touches the obstacle at the beginning."""
+        d = _distances(self, mesh, mesh.points, self.displacement(0, 1, 0.0))
+        near = np.asarray(d.value <= 1e3 * _TOUCHING * jnp.sqrt(_triangle_areas(self, mesh))[None])
+        _, touching = np.nonzero(near)
+        nodes = np.asarray(self.triangles)[touching]
+        normals = np.stack([np.asarray(n)[near] for n in d.normal], axis=-1)
+        return nodes.ravel(), np.repeat(normals, nodes.shape[1], axis=0)
+
+    def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
+        """With the stiffness that follows from the law: of a layer with K + 4/3 mu, where K counts up to 3 mu."""
+        if self.stiffness is not None:
+            return self
+        # A surface gives way to the side: a bulk modulus far above shear would make the contact needlessly hard.
+        shear = law.shear_modulus()
+        modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
+        return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
+
+    def displacement(self, k: Any, steps: int, dt: Any) -> jax.Array:
+        """(3,) [m] at the end of step k; step 0 is the beginning of the run."""
+        zero = jnp.zeros(3)
+        if self.history is not None:
+            return zero + history.value_at(self.by, k * dt, self.times, self.history)
+        return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
+
+    def freeze(self, memory: Any, step: Step) -> "Touching":
+        """Where it is at the beginning and at the end of the step."""
+        dt = 0.0 if step.dt is None else step.dt
+        moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
+        return Touching(obstacle=self, moved=moved.astype(step.x.dtype))
+
+
+@struct
+class Touching(NodalForce):
+    """The obstacle during a step."""
+
+    obstacle: Obstacle = param("1", "shape and stiffness")
+    moved: Any = param("m", "its displacement at the beginning and at the end (2, 3)")
+
+    def _now(self, s: Any) -> jax.Array:
+        return self.moved[0] + s * (self.moved[1] - self.moved[0])
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Minus the pressures, shared out to the nodes of their triangles."""
+        return contact_force(self.obstacle, mesh, x, self._now(s))
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Half of stiffness times depth squared."""
+        depth = jnp.minimum(_distances(self.obstacle, mesh, x, self._now(1.0)).value, 0.0)
+        return 0.5 * jnp.sum(_weighted_stiffness(self.obstacle, mesh) * depth**2)
+
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
+        """Second derivative of the energy: along the normal, and of the normal."""
+        d, k = _distances(self.obstacle, mesh, x, self._now(s)), _weighted_stiffness(self.obstacle, mesh)
+        depth = jnp.minimum(d.value, 0.0)
+        # A surface that just touches counts as pressed: else a body that lies on a plane begins with nothing below it.
+        inside = (d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(self.obstacle, mesh))[None]).astype(x.dtype)
+        H = jnp.stack(
+            [
+                jnp.stack([k * (inside * d.normal[i] * d.normal[j] + depth * d.bent[i][j]) for j in range(3)])
+                for i in range(3)
+            ]
+        )
+        N = _at_points(mesh, x.dtype)
+        both = jnp.einsum("aq,bq->abq", N, N)
+        return Attached(_touching_nodes(self.obstacle, mesh), jnp.einsum("abq,ijqm->aibjm", both, H))
+
+
+def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
+    """Gradient of the energy (V, 3) [N] at positions x (V, 3): the force of the nodes on the obstacle, `moved` (3,)."""
+    d = _distances(obstacle, mesh, x, moved)
+    push = _weighted_stiffness(obstacle, mesh) * jnp.minimum(d.value, 0.0)  # (Q, m), negative
+    N = _at_points(mesh, x.dtype)
+    own = jnp.stack([jnp.einsum("aq,qm->am", N, push * n) for n in d.normal], axis=-1)
+    return jnp.zeros_like(x).at[_touching_nodes(obstacle, mesh)].add(own)
+
+
+def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
+    """Largest depth () [m] of the surface at positions x (V, 3) in the obstacle; 0 where it is outside."""
+    return jnp.maximum(-jnp.min(_distances(obstacle, mesh, x, moved).value), 0.0)
+
+
+def _touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+    """Of the triangles (n, m), with 3 nodes each or 6."""
+    return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
+
+
+def _at_points(mesh: TetMesh, dtype: Any) -> jax.Array:
+    """Of a triangle's nodes at its points (n, Q)."""
+    return jnp.asarray(surface.functions(mesh, _POINTS), dtype)
+
+
+def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
+    """Of the points of the triangles (Q, m)."""
+    at = jnp.einsum("aq,ami->iqm", _at_points(mesh, x.dtype), x[_touching_nodes(obstacle, mesh)])
+    place = jnp.asarray(obstacle.position, x.dtype) + moved
+    axis, angle = jnp.asarray(obstacle.axis, x.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, x.dtype))
+    y = [at[i] - place[i] for i in range(3)]
+    return distance(obstacle.shape, y, [axis[0], axis[1], axis[2]], obstacle.radius, angle)
+
+
+def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+    """Of the triangles in the reference shape (m,) [m^2]."""
+    normal = surface.areas(mesh.points, obstacle.triangles)
+    return jnp.sqrt(jnp.sum(normal * normal, axis=1))
+
+
+def _weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+    """Stiffness times reference area of every point (Q, m) [N/m]."""
+    whole = _triangle_areas(obstacle, mesh) * obstacle.stiffness
+    return jnp.broadcast_to(whole / _POINTS.shape[1], (_POINTS.shape[1], *whole.shape))
+
+
+def _three_numbers(value: Any, name: str) -> jax.Array:
+    given = np.asarray(value, object)
+    try:
+        vector = np.array(given, float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise InputError(f"{name} = {value!r} must be three numbers: write [x, y, z]")
+    return jnp.asarray(vector)

@@ -1,0 +1,81 @@
+"""Rigid shapes: signed distance of points, its gradient (the normal) and its second derivative.
+
+A point is given from the shape's own place: a point of the plane, the centre of a sphere, a point on the axis of a
+cylinder, the tip of a cone. Distances are positive outside. All functions take columns of any shape.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+#: What a scene may name, and the numbers that each needs.
+SHAPES: dict[str, tuple[str, ...]] = {
+    "plane": ("axis",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "axis"),
+    "cone": ("half_angle", "axis"),
+}
+
+
+class Distance(NamedTuple):
+    """Of points, to second order."""
+
+    value: jax.Array  # (…) [m]
+    normal: list[jax.Array]  # 3 of (…): gradient, of length 1
+    bent: list[list[jax.Array]]  # 3 x 3 of (…) [1/m]: second derivative
+
+
+def distance(shape: str, y: list[jax.Array], axis: Any, radius: Any, half_angle: Any) -> Distance:
+    """Signed distance of points y (3 of any shape) [m] from the shape.
+
+    Args:
+        shape: one of `SHAPES`.
+        y: columns, from the place of the shape.
+        axis: unit vector (3,): the plane's normal to the free side, the cylinder's axis, the cone's from its tip in.
+        radius: [m] of sphere and cylinder; of the cone's rounded tip, whose lowest point is at its place.
+        half_angle: [rad] of the cone, between axis and side.
+    """
+    if shape == "plane":
+        zero = jnp.zeros_like(y[0])
+        along = sum(a * c for a, c in zip(axis, y, strict=True))
+        return Distance(along, [a + zero for a in axis], [[zero] * 3 for _ in range(3)])
+    if shape == "sphere":
+        return _round(y, radius)
+    if shape == "cylinder":
+        return _round(_across(y, axis), radius, axis)
+    return _cone(y, axis, radius, half_angle)
+
+
+def _across(y: list[jax.Array], axis: Any) -> list[jax.Array]:
+    """The part of y normal to the axis."""
+    along = sum(a * c for a, c in zip(axis, y, strict=True))
+    return [c - along * a for a, c in zip(axis, y, strict=True)]
+
+
+def _round(y: list[jax.Array], radius: Any, axis: Any = None) -> Distance:
+    """From a point, or from an axis that y is normal to."""
+    # On the centre itself no direction is nearest: any will do, without a division by 0.
+    r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
+    n = [c / r for c in y]
+    held = [[0.0] * 3 for _ in range(3)] if axis is None else [[a * b for b in axis] for a in axis]
+    bent = [[((i == j) - held[i][j] - n[i] * n[j]) / r for j in range(3)] for i in range(3)]
+    return Distance(r - radius, n, bent)
+
+
+def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Any) -> Distance:
+    """From its side, or from its tip where that is nearest; with a round tip, from a sharp cone further in."""
+    c, s = jnp.cos(half_angle), jnp.sin(half_angle)
+    y = [v - radius * a for v, a in zip(y, axis, strict=True)]
+    along, tip, side = (
+        sum(a * v for a, v in zip(axis, y, strict=True)),
+        _round(y, radius),
+        _round(_across(y, axis), 0.0, axis),
+    )
+    lateral = Distance(
+        c * side.value - s * along - radius,
+        [c * n - s * a for n, a in zip(side.normal, axis, strict=True)],
+        [[c * b for b in row] for row in side.bent],
+    )
+    near_tip = s * side.value + c * along < 0
+    return jax.tree.map(lambda a, b: jnp.where(near_tip, a, b), tip, lateral)

@@ -1,0 +1,220 @@
+"""Rigid obstacles: distances against difference quotients, Hertz, weights on planes, energy, gradients, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.contact.shapes import SHAPES, distance
+from liverjax.scenes.scene_file import scene_from
+
+pytestmark = pytest.mark.quick_to_compile
+
+LAW = lj.laws.NeoHookean(mu=800.0, bulk=4000.0)
+SIDE = 0.1
+
+
+def surface(mesh: lj.TetMesh, **where) -> jax.Array:
+    """Triangles of a place."""
+    return jnp.asarray(lj.boundary.boundary_triangles(mesh, lj.boundary.select(mesh, where)))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_distances_and_their_derivatives(shape):
+    """Normals of length 1 and second derivatives, against automatic differentiation of the distance."""
+    axis = jnp.array([2.0, -1.0, 2.0]) / 3
+    y = jnp.asarray(np.random.default_rng(0).normal(size=(40, 3)))
+
+    def of(y):
+        return distance(shape, list(y), axis, 0.3, 0.6)
+
+    found = jax.vmap(of)(y)
+    slope = jax.vmap(jax.grad(lambda y: of(y).value))(y)
+    bent = jax.vmap(jax.hessian(lambda y: of(y).value))(y)
+    normal = jnp.stack(found.normal, axis=-1)
+    assert np.allclose(jnp.linalg.norm(normal, axis=1), 1.0, atol=1e-14)
+    assert np.allclose(normal, slope, atol=1e-13)
+    assert np.allclose(jnp.stack([jnp.stack(row, -1) for row in found.bent], -2), bent, atol=1e-11)
+
+
+def test_a_cone_with_a_round_tip_begins_at_its_place():
+    """Along the axis the distance is that to the tip; far away beside it, that of the sharp cone moved by rho/sin."""
+    up, angle, rho = jnp.array([0.0, 0.0, 1.0]), 0.7, 0.01
+    below = distance("cone", list(jnp.array([0.0, 0.0, -0.2])), up, rho, angle)
+    assert np.isclose(below.value, 0.2, atol=1e-12) and np.allclose(jnp.stack(below.normal), [0, 0, -1], atol=1e-12)
+    beside = distance("cone", list(jnp.array([1.0, 0.0, 1.0])), up, rho, angle)
+    moved = rho / np.sin(angle) - rho
+    assert np.isclose(beside.value, np.cos(angle) - np.sin(angle) * (1.0 + moved), atol=1e-12)
+
+
+def lying(order: int = 1, **changes) -> lj.Scene:
+    """A cube that lies on a plane, pressed on it by a traction; its sides slide, so its stress is uniform."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    sides = tuple(lj.Fixed(nodes=jnp.asarray(lj.boundary.select(mesh, {f"{a}_max": 0.0})), axes=a) for a in "xy")
+    plane = Obstacle(triangles=surface(mesh, z_max=0.0), stiffness=1e6)
+    push = lj.Traction(triangles=surface(mesh, z_min=SIDE), value=jnp.array([0.0, 0.0, -50.0]))
+    return lj.Scene(mesh=mesh, law=LAW, fixed=sides, traction=(push,), physics=(plane,), solve=lj.Solve(**changes))
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
+    scene = lying(order)
+    lj.check_scene(scene)
+
+    def sunk(k):
+        found = lj.simulate(lj.with_parameters(scene, {"obstacle.0.stiffness": k}))
+        sole = np.flatnonzero(np.isclose(np.asarray(scene.mesh.points)[:, 2], 0.0))
+        return found.positions[-1, sole, 2], found.status
+
+    depth, status = sunk(1e6)
+    # Residual 1e-8 of the forces at work.
+    assert status.max() == 0 and np.allclose(depth, -50.0 / 1e6, rtol=1e-6)
+    slope = jax.jacfwd(lambda k: sunk(k)[0])(1e6)
+    assert np.allclose(slope, 50.0 / 1e12, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "volumetric", "limit"),
+    [(3.0, "element", 0.01), pytest.param(1e3, "mixed", 0.02, marks=pytest.mark.slow)],
+)
+def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, volumetric, limit):
+    """A contact as wide as a tenth of the sphere, 1 % of the layer deep: half a thousand quadratic elements."""
+    from fitting.rigs.thin_layer import Indenter, Layer
+    from liverjax.mesh import cylinders
+    from liverjax.physics.sliding_support import SlidingSupport
+
+    R, h, depth, mu = 5e-3, 10e-3, 5e-5, 800.0
+    a = np.sqrt(R * depth)
+    radii = cylinders.graded(h, {0.0: a / 3, a: a / 6, h: h / 4}, h / 4, cylinders.GROWTH)
+    heights = cylinders.graded(h, {0.0: h / 4, h: a / 6}, h / 4, cylinders.GROWTH)
+    mesh, normal, parts, _ = cylinders.sector(radii, heights, 24)
+    mesh = lj.quadratic(mesh)
+    sets = {name: np.asarray(nodes) for name, nodes in mesh.node_sets.items()}
+    fixed = [(sets["bottom"], "xyz"), (sets["start"], "y"), (np.intersect1d(sets["start"], sets["end"]), "xy")]
+    top = lj.boundary.boundary_triangles(mesh, sets["top"])
+    near = np.hypot(*np.asarray(mesh.points)[top].mean(axis=1)[:, :2].T) < 4 * a
+    place, by = jnp.array([0.0, 0.0, h + R]), jnp.array([0.0, 0.0, -depth])
+    sphere = Obstacle(triangles=jnp.asarray(top[near]), shape="sphere", radius=R, position=place, by=by)
+    slides = SlidingSupport(nodes=jnp.asarray(sets["end"]), normal=jnp.asarray(normal))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=mu, bulk=ratio * mu),
+        fixed=tuple(lj.Fixed(nodes=jnp.asarray(n), axes=axes) for n, axes in fixed),
+        physics=(slides, sphere),
+        solve=lj.Solve(steps=2, volumetric=volumetric),
+    )
+    found = lj.obstacle_forces(scene, lj.simulate(scene).check())
+    poisson = (3 * ratio - 2) / (2 * (3 * ratio + 1))
+    layer = Layer(Indenter(shape="sphere", radius=R, thickness=h, poisson=poisson))
+    exact = 2 * mu * (1 + poisson) * float(layer.force(np.array([depth]))[0])
+    assert np.isclose(parts * float(found.force[0, -1, 2]), exact, rtol=limit)
+    assert found.depth[0, -1] < 2e-3 * depth
+
+
+def test_a_falling_cube_bounces_and_keeps_its_energy():
+    """Newmark without damping: height and speed after the bounce are those before, as far as the steps resolve it."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
+    plane = Obstacle(triangles=surface(mesh, z_max=0.0), position=jnp.array([0.0, 0.0, -0.005]), stiffness=4e6)
+    stiff = lj.laws.NeoHookean(mu=1e8, bulk=1e8)
+    dt, steps = 5e-4, 170
+    scene = lj.Scene(
+        mesh=mesh,
+        law=stiff,
+        body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -9.81])),
+        physics=(plane,),
+        solve=lj.Solve(kind="dynamic", dt=dt, steps=steps, integrator="newmark"),
+    )
+    lj.check_scene(scene)
+    result = lj.simulate(scene).check()
+    z = np.asarray(result.positions)[:, :, 2].mean(axis=1) - SIDE / 2
+    # A stiff cube of 1 kg on a spring of stiffness times area, 40,000 N/m: it falls 5 mm and bounces.
+    fall = np.sqrt(2 * 0.005 / 9.81)
+    w = np.sqrt(40000.0 / 1.0)
+    touching = np.asarray(lj.obstacle_forces(scene, result).force)[0, :, 2] < -1e-9
+    first, last = np.flatnonzero(touching)[[0, -1]]
+    contact = (np.pi + 2 * np.arctan(9.81 / w / (9.81 * fall))) / w
+    assert abs(first * dt - fall) < 2 * dt and abs((last - first + 1) * dt - contact) < 3 * dt
+    again = z[last:].max()
+    assert abs(again) < 0.05 * 0.005
+
+
+@pytest.mark.slow
+def test_gradients_through_closing_contact():
+    """Force on a sphere by its depth and by the law's modulus: difference quotients fall, bottom out and rise."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
+    sphere = Obstacle(
+        triangles=surface(mesh, z_min=SIDE),
+        shape="sphere",
+        radius=0.2,
+        position=jnp.array([0.045, 0.055, SIDE + 0.201]),
+        by=jnp.array([0.0, 0.0, -0.01]),
+    )
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LAW,
+        fixed=(lj.Fixed(nodes=jnp.asarray(lj.boundary.select(mesh, {"z_max": 0.0}))),),
+        physics=(sphere,),
+        solve=lj.Solve(steps=2, tolerance=1e-12),
+    )
+
+    @jax.jit
+    def force(p):
+        changed = lj.with_parameters(
+            scene, {"law.mu": p[0], "obstacle.0.by": jnp.stack([0.0 * p[1], 0.0 * p[1], p[1]])}
+        )
+        return lj.obstacle_forces(changed, lj.simulate(changed)).force[0, -1, 2]
+
+    p = jnp.array([800.0, -0.01])
+    assert force(p) > 0  # the body pushes the sphere up
+    forward, backward = jax.jacfwd(force)(p), jax.grad(force)(p)
+    assert np.allclose(forward, backward, rtol=1e-7)
+    for k in range(2):
+        unit = np.eye(2)[k] * np.asarray(p)
+        errors = [
+            abs((force(p + h * unit) - force(p - h * unit)) / (2 * h * p[k]) / forward[k] - 1)
+            for h in (1e-3, 1e-4, 1e-5)
+        ]
+        assert min(errors) < 1e-6
+
+
+def test_a_scene_without_obstacles_has_none_in_its_program():
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
+    scene = lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))
+    far = replace(scene, physics=(Obstacle(triangles=surface(mesh), position=jnp.array([0.0, 0.0, -1.0])),))
+    with_, without = (len(str(jax.make_jaxpr(lj.simulate)(s))) for s in (far, scene))
+    assert with_ > 1.02 * without
+    assert lj.obstacle_forces(scene, lj.simulate(scene)).force.shape == (0, 1, 3)
+
+
+SCENE = {
+    "mesh": {"shape": "box", "size": [SIDE] * 3, "cells": [1, 1, 1]},
+    "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+    "fixed": [{"where": {"z_max": 0.0}}],
+}
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"shape": "ball", "position": [0, 0, 1]}, "shape = 'ball' is not known"),
+        ({"shape": "sphere", "position": [0, 0, 1]}, "is a sphere without radius: give it"),
+        ({"shape": "sphere", "radius": 0.1}, "is a sphere without position: give it"),
+        ({"shape": "sphere", "radius": 0.0, "position": [0, 0, 1]}, "must be above 0"),
+        (
+            {"shape": "sphere", "radius": 0.1, "position": [0, 0, 0.15]},
+            "begins 0.0[0-9]* m inside the body: move it out",
+        ),
+        ({"shape": "plane", "axis": [0, 0, 0], "position": [0, 0, -1]}, "must be of length 1"),
+        ({"shape": "cone", "half_angle": 95.0, "axis": [0, 0, 1], "position": [0, 0, 1]}, "must be below 90"),
+        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0]}, "must be three numbers"),
+    ],
+)
+def test_bad_obstacles_are_one_sentence(table, words):
+    with pytest.raises(InputError, match=words) as error:
+        scene_from(SCENE | {"obstacle": [table]})
+    assert "obstacle.0" in str(error.value) and "\n" not in str(error.value)
