@@ -155,7 +155,10 @@ def test_supports_of_a_scene_file():
 @pytest.mark.parametrize(
     ("support", "words"),
     [
-        ({"where": {"z_max": 0.0}}, "support.0 has a place alone: give normal, tangential, stiffness or sliding"),
+        (
+            {"where": {"z_max": 0.0}},
+            "support.0 has a place alone: give normal, tangential, stiffness, history or sliding",
+        ),
         ({"where": {"z_max": 0.0}, "normal": -1.0}, "support.0.normal = -1.0 must be at least 0 Pa/m"),
         ({"where": {"z_max": 0.0}, "normal": "soft"}, "support.0.normal = 'soft' is not a number"),
         ({"where": {"z_max": 0.0}, "normal": 1.0, "stiffness": 1.0}, "support.0 needs either normal and tangential"),

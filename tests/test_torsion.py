@@ -178,7 +178,7 @@ def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatc
     monkeypatch.setattr(torsion, "moduli", moduli)
     simulation = viscoelastic.Simulation()
     r, J, _ = viscoelastic.with_jacobian(u, data, simulation, kind)
-    G = _discrete(viscoelastic._law_and_prony(kind.maxwell(u), law, simulation)[1], OMEGA, simulation.steps)
+    G = _discrete(viscoelastic.law_and_prony(kind.maxwell(u), law, simulation)[1], OMEGA, simulation.steps)
     expected = np.concatenate([G.real, G.imag]) * np.exp(6.0) / 770 - np.linspace(300, 100, 6)
     assert np.allclose(r[:6], expected / 7, rtol=1e-9) and np.allclose(r[6:], 3 * u[1:] ** 2)
     whole = jax.jacfwd(lambda u: viscoelastic.simulated_residuals(u, data, simulation, kind)[0])(u)
