@@ -1,0 +1,84 @@
+"""Indentation curves from files: depth and force of a loading."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers.text_tables import find_delimiter, split_cells, text_of, to_number
+from liverjax.core.errors import InputError
+
+#: First words of the two columns, and what their units are in m and N.
+_WORDS = {"depth": ("depth", "displacement", "indentation"), "force": ("force", "load")}
+_UNITS = {
+    "depth": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
+    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "nN": 1e-9},
+}
+_FEWEST = 6
+
+
+class IndentationCurve(NamedTuple):
+    """What was measured while the indenter went in."""
+
+    depth: np.ndarray  # (n,) [m] of the indenter, from anywhere, larger further in
+    force: np.ndarray  # (n,) [N]
+    source: str
+    notes: tuple[str, ...] = ()
+
+
+def read_indentation(path: str | Path) -> IndentationCurve:
+    """Read the loading part of a curve: up to the deepest point.
+
+    Args:
+        path: text with a header that names depth (or displacement, indentation) and force (or load), with units m, mm,
+            um, nm and N, mN, uN, nN: `depth_um,force_mN`; or a workbook.
+
+    Raises:
+        InputError: one sentence naming file, column or line, value and remedy.
+    """
+    lines = text_of(Path(path), "an indentation curve").splitlines()
+    head = next((k for k, line in enumerate(lines) if all(_depth_and_force(line).values())), None)
+    if head is None:
+        raise InputError(f"{path}: no header names depth and force with units; write depth_mm,force_mN above the rows")
+    delimiter = find_delimiter(lines[head])
+    columns = {
+        quantity: _in_si_units(str(path), lines[head + 1 :], head + 2, delimiter, *place)
+        for quantity, place in _depth_and_force(lines[head]).items()
+        if place is not None
+    }
+    depth, force = columns["depth"], columns["force"]
+    last = int(np.argmax(depth)) + 1
+    notes = () if last == len(depth) else (f"{len(depth) - last} points after the deepest one are left out",)
+    if last < _FEWEST or np.ptp(depth[:last]) == 0:
+        raise InputError(f"{path}: {last} points go in; a fit needs {_FEWEST} or more, at different depths")
+    return IndentationCurve(depth[:last], force[:last], str(path), notes)
+
+
+def _depth_and_force(line: str) -> dict[str, tuple[int, float] | None]:
+    """Places of both columns in a line, None where it does not name one."""
+    cells = split_cells(line, find_delimiter(line))
+    return {quantity: _place_and_factor(cells, quantity) for quantity in _WORDS}
+
+
+def _place_and_factor(cells: list[str], quantity: str) -> tuple[int, float] | None:
+    """Column and factor to SI of the heading that names a quantity with its unit."""
+    for j, cell in enumerate(cells):
+        words = [w for w in re.split(r"[\s_()\[\]#\"]+", cell) if w]
+        if len(words) > 1 and words[0].lower() in _WORDS[quantity] and words[-1] in _UNITS[quantity]:
+            return j, _UNITS[quantity][words[-1]]
+    return None
+
+
+def _in_si_units(path: str, lines: list[str], first: int, delimiter: str, place: int, factor: float) -> np.ndarray:
+    values = []
+    for number, line in enumerate(lines, first):
+        if not line.strip(f"{delimiter} \t") or line.lstrip().startswith("#"):
+            continue
+        cells = split_cells(line, delimiter)
+        value = to_number(cells[place], delimiter) if place < len(cells) else None
+        if value is None or not np.isfinite(value):
+            shown = repr(cells[place]) if place < len(cells) else "missing"
+            raise InputError(f"{path}: line {number}: {shown} is not a finite number; correct or remove the line")
+        values.append(factor * value)
+    return np.array(values)

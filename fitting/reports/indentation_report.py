@@ -1,0 +1,109 @@
+"""What a fit of an indentation curve leaves behind: fit.json, fit.png, and a table on the terminal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.methods.consistency import runs_probability
+from fitting.methods.contact_point import ContactFit
+from fitting.readers.indentation_curves import IndentationCurve
+from fitting.reports.sweep_report import numbers
+from fitting.rigs.thin_layer import Indenter, half_space
+from liverjax.core.plotting import BLUE, GREY, pyplot, save
+from liverjax.core.versions import versions
+
+#: Contact over the radius of a sphere, and depth over the thickness, beyond which small strains are in doubt.
+_WIDE, _DEEP = 0.4, 0.2
+
+
+def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> dict[str, Any]:
+    """Write both files; returns the JSON."""
+    out.mkdir(parents=True, exist_ok=True)
+    G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
+    alone = half_space(rig, curve.depth - fit.contact_point)
+    content = numbers(
+        {
+            "method": "indentation",
+            "shape": rig.shape,
+            "young_modulus": fit.modulus,
+            "shear_modulus": G,
+            "contact_point": fit.contact_point,
+            "standard_errors": {
+                "young_modulus": errors[0],
+                "shear_modulus": errors[0] * G / fit.modulus if fit.modulus else None,
+                "contact_point": errors[1],
+            },
+            "interval_quantile_95": fit.quantile,
+            "correlation": fit.correlation,
+            "noise_N": fit.noise,
+            "mean_relative_error": float(np.mean(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
+            "max_relative_error": float(np.max(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
+            "half_space_young_modulus": float(alone @ curve.force / max(float(alone @ alone), 1e-300)),
+            "poisson": rig.poisson,
+            "thickness": rig.thickness,
+            "points_before_contact": fit.before,
+            "warnings": indentation_warnings(curve, rig, fit),
+            "data": curve.source,
+            "notes": list(curve.notes),
+            "versions": versions(),
+        }
+    )
+    (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    save(figure(curve, rig, fit), out / "fit.png")
+    return content
+
+
+def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> list[str]:
+    """What a reader of the modulus should know."""
+    told, deepest = [], float(curve.depth.max() - fit.contact_point)
+    if fit.before < 3:
+        told.append(f"{fit.before} points are before contact: measure the approach too, it fixes the contact point")
+    width = np.sqrt(deepest / rig.radius) if rig.shape == "sphere" else 0.0
+    if width > _WIDE or deepest > _DEEP * rig.thickness:
+        told.append(
+            f"the indenter goes {deepest:.3g} m deep, {deepest / rig.thickness:.0%} of the thickness: the theory is of "
+            "small strains; fit a part of the curve as well and compare"
+        )
+    if fit.modulus <= 0:
+        told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
+    runs, chance = runs_probability(np.sign(fit.residuals))
+    if chance < 1e-3:
+        told.append(
+            f"structured misfit: residuals change sign {runs - 1} times over {len(fit.residuals)} points (by chance: "
+            f"{chance:.1g}); standard errors are too small then"
+        )
+    if curve.force.min() < -5 * fit.noise:
+        told.append("forces are negative, which adhesion does; it is left out here")
+    return told
+
+
+def table(rig: Indenter, fit: ContactFit, content: dict[str, Any]) -> str:
+    """Modulus and contact point ± standard error."""
+    e = content["standard_errors"]
+    return "\n".join(
+        [
+            f"{rig.shape} on a bonded layer of {1e3 * rig.thickness:g} mm, Poisson's ratio {rig.poisson:g}",
+            f"E   {fit.modulus:11.5g} ± {e['young_modulus']:<9.2g} Pa",
+            f"G   {content['shear_modulus']:11.5g} ± {e['shear_modulus']:<9.2g} Pa",
+            f"d0  {fit.contact_point:11.5g} ± {e['contact_point']:<9.2g} m",
+            f"a half-space would have E = {content['half_space_young_modulus']:.5g} Pa; no friction, no adhesion",
+        ]
+    )
+
+
+def figure(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> Any:
+    """The curve and what is left of it."""
+    fig, (above, below) = pyplot().subplots(
+        2, 1, figsize=(6, 5), sharex=True, height_ratios=(3, 1), layout="constrained"
+    )
+    depth = 1e3 * (curve.depth - fit.contact_point)
+    above.plot(depth, 1e3 * curve.force, ".", color=GREY, label="measured")
+    above.plot(depth, 1e3 * (curve.force - fit.residuals), "-", color=BLUE, label=f"E = {fit.modulus:.3g} Pa")
+    above.set(ylabel="force [mN]", title=f"{rig.shape} on a layer")
+    above.legend()
+    below.plot(depth, 1e3 * fit.residuals, ".", color=GREY)
+    below.axhline(0.0, color=BLUE, lw=1)
+    below.set(xlabel="depth after contact [mm]", ylabel="left [mN]")
+    return fig

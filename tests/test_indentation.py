@@ -1,0 +1,92 @@
+"""Modulus and contact point of indentation curves: other laws of contact, coverage, files, the command."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fitting.__main__ import main
+from fitting.methods.contact_point import fit_contact
+from fitting.readers.indentation_curves import read_indentation
+from fitting.rigs.thin_layer import Indenter, Layer
+from liverjax.core.errors import InputError
+
+R, H, E, START = 5e-3, 10e-3, 2400.0, 2e-4
+DEPTH = np.linspace(0.0, 7e-4, 80)
+
+
+def hertz(depth: np.ndarray) -> np.ndarray:
+    """Force [N] of an incompressible half-space."""
+    return 16 / 9 * E * np.sqrt(R) * np.maximum(depth, 0.0) ** 1.5
+
+
+def test_a_thick_layer_gives_hertz_back():
+    layer = Layer(Indenter("sphere", 1e3 * H, 0.5, R))
+    found = fit_contact(DEPTH, hertz(DEPTH - START), layer.force)
+    # The layer is 10 m thick: 1.133 chi is 1.8e-4 at the deepest point.
+    assert np.isclose(found.modulus, E, rtol=3e-4) and np.isclose(found.contact_point, START, atol=3e-8)
+
+
+def test_a_thin_layer_by_the_first_terms_of_its_series():
+    """Hertz times 1 + 1.133 chi + 1.497 chi^2 (c and 7/6 c^2), chi up to 0.1: the rest is below 0.2 %."""
+    depth = np.linspace(0.0, 4e-4, 80)
+    chi = np.sqrt(R * np.maximum(depth - START, 0.0)) / H
+    force = hertz(depth - START) * (1 + 1.133 * chi + 1.497 * chi**2)
+    found = fit_contact(depth, force, Layer(Indenter("sphere", H, 0.5, R)).force)
+    assert np.isclose(found.modulus, E, rtol=0.01) and np.isclose(found.contact_point, START, atol=2e-6)
+
+
+def test_intervals_cover_with_five_percent_of_noise():
+    """200 curves of Hertz's law with noise of 5 % of the largest force: mean within 5 %, 90 to 99 % covered."""
+    force, layer = hertz(DEPTH - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        noisy = force + 0.05 * force.max() * rng.normal(size=len(force))
+        found.append(fit_contact(DEPTH, noisy, layer.force))
+    moduli, points = np.array([f.modulus for f in found]), np.array([f.contact_point for f in found])
+    errors = np.array([f.standard_errors for f in found])
+    assert abs(np.median(moduli) / E - 1) < 0.05 and abs(np.median(points) - START) < 1e-5
+    for values, sd, true in ((moduli, errors[:, 0], E), (points, errors[:, 1], START)):
+        covered = np.mean(np.abs(values - true) < found[0].quantile * sd)
+        assert 0.90 <= covered <= 0.99, covered
+
+
+def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
+    back = DEPTH[-2::-1]
+    depth = np.concatenate([DEPTH, back])
+    force = np.concatenate([hertz(DEPTH - START), 0.8 * hertz(back - START)])
+    force = force + 1e-6 * np.random.default_rng(1).normal(size=len(force))
+    rows = "\n".join(f"{1e6 * d:.9g},{1e3 * f:.9g}" for d, f in zip(depth, force, strict=True))
+    (tmp_path / "c.csv").write_text(f"# a sphere\nIndentation (µm),Load [mN]\n{rows}\n")
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "10", "--out", str(tmp_path)]
+    assert main(command) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert np.isclose(content["young_modulus"], E, rtol=0.01) and np.isclose(content["shear_modulus"], E / 3, rtol=0.01)
+    assert np.isclose(content["contact_point"], START, atol=2e-6) and not content["warnings"]
+    assert (tmp_path / "fit.png").stat().st_size > 1000
+    told = capsys.readouterr()
+    assert "79 points after the deepest one are left out" in told.err and "half-space" in told.out
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "words"),
+    [
+        ("a,b\n1,2\n", [], "no header names depth and force"),
+        ("depth_m,force_N\n0,0\n1e-4,x\n", [], "line 3: 'x' is not a finite number"),
+        ("depth_m,force_N\n0,0\n1e-4,1\n", [], "2 points go in"),
+        ("depth_m,force_N\n0,0\n", ["--thickness", "-1"], "must be above 0"),
+        ("depth_m,force_N\n0,0\n", ["--poisson", "0.7"], "must be from 0 to 0.5"),
+        ("depth_m,force_N\n0,0\n", ["--radius", "0"], "must be above 0"),
+    ],
+)
+def test_bad_curves_and_options_are_one_sentence(tmp_path, capsys, text, more, words):
+    (tmp_path / "c.csv").write_text(text)
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", "0.005", "--thickness", "0.01", *more]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert words in told and len(told.strip().splitlines()) == 1
+
+
+def test_no_such_file():
+    with pytest.raises(InputError, match="no such file"):
+        read_indentation("nothing.csv")
