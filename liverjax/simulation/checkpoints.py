@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
 from liverjax.solvers.continuation import ROOT
@@ -51,15 +52,20 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
     if kept >= steps:
         return jax.lax.scan(step, start, numbers)[1]
     count, length, rest = lengths(steps, kept)
+    beyond = length - rest if rest else 0
 
-    # Nothing of a segment but its beginning stays.
+    def unless_over(carry, at):
+        k, real = at
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
+        return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
+
+    # Nothing of a segment but its beginning stays. Compiled once: the last one skips the steps beyond the run's end.
     @jax.checkpoint
-    def segment(carry, numbers):
-        return jax.lax.scan(step, carry, numbers)
+    def segment(carry, at):
+        return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)
 
-    carry, out = jax.lax.scan(segment, start, numbers[: count * length].reshape(count, length))
-    out = jax.tree.map(lambda a: a.reshape(count * length, *a.shape[2:]), out)
-    if rest:
-        _, last = segment(carry, numbers[count * length :])
-        out = jax.tree.map(lambda a, b: jax.numpy.concatenate([a, b]), out, last)
-    return out
+    count += rest > 0
+    at = jnp.pad(numbers, (0, beyond)).reshape(count, length)
+    at = (at, (jnp.arange(count * length) < steps).reshape(count, length)) if beyond else at
+    out = jax.lax.scan(segment, start, at)[1]
+    return jax.tree.map(lambda a: a.reshape(count * length, *a.shape[2:])[:steps], out)
