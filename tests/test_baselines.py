@@ -50,6 +50,7 @@ def test_explicit_dynamics_is_stable_just_below_its_critical_step():
     assert not np.abs(above).max() < 1.0
 
 
+@pytest.mark.slow
 def test_corotational_agrees_with_implicit_euler_where_strains_are_small():
     """Both take the same step; what differs is of second order in the strain."""
     apart = []

@@ -43,7 +43,7 @@ def test_lengths_and_moduli_are_units_only():
 
 
 @pytest.mark.parametrize("ratio", [*(pytest.param(r, marks=pytest.mark.slow) for r in (1e-6, 1.0)), 1e6])
-@pytest.mark.parametrize("scheme", viscosity.SCHEMES)
+@pytest.mark.parametrize("scheme", ["exponential", pytest.param("backward_euler", marks=pytest.mark.slow)])
 def test_steps_far_from_the_relaxation_time(ratio, scheme):
     """A stretch applied in one step: alpha(dt) of the stress is left, by the scheme's own formula."""
     g, dt = 0.9, 0.5
@@ -75,7 +75,7 @@ def test_ratios_that_leave_almost_nothing():
     assert np.abs(result.reactions[-1]).max() < 2e-5 * np.abs(elastic).max()
 
 
-@pytest.mark.parametrize("solver", ["cg", "direct"])
+@pytest.mark.parametrize("solver", ["cg", pytest.param("direct", marks=pytest.mark.slow)])
 def test_a_layer_ten_thousand_times_stiffer(solver):
     """A block of solid elements, its top quarter stiff, pulled: in series only the soft part stretches."""
     mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 4))
@@ -235,4 +235,5 @@ def test_more_than_float32_can_give_is_told_with_the_best_it_has():
     moved = np.abs(exact - np.asarray(mesh.points)).max()
     assert status.NAMES[int(single.status[-1])] == "stalled"
     assert moved < 1e-4  # of 0.06 m: float32 resolves 4e-9 m
-    assert np.abs(np.asarray(single.positions[-1], float) - exact).max() < 1e-3 * moved
+    # Positions rounded to 4e-9 m bend a beam that is six times as long as high by up to 36 times as much.
+    assert np.abs(np.asarray(single.positions[-1], float) - exact).max() < 1e-2 * moved

@@ -145,11 +145,15 @@ TOGETHER = {
 }
 
 
-#: One of them is enough for other versions of Python and jax.
-CORE = "newmark isochoric porous"
+#: The one with the most equations runs always.
+MARKS = {
+    "newmark isochoric porous": pytest.mark.core,
+    "dynamic viscous chapter": pytest.mark.slow,
+    "follower": pytest.mark.slow,
+}
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.core) if k == CORE else k for k in TOGETHER])
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=MARKS[k]) if k in MARKS else k for k in TOGETHER])
 def test_some_leaves_of_a_scene(kind):
     """Six tetrahedra, two steps: central differences of the value, from the program of the gradient itself."""
     scene = _scene(kind, cells=(1, 1, 1), steps=2)

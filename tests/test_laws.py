@@ -66,7 +66,7 @@ def random_gradients(n: int) -> np.ndarray:
 )
 def test_stress_and_tangent_against_autodiff(name):
     # NumPy for maxima: jnp.max of jax 0.12.0.1 passes over NaN in arrays of several dimensions.
-    law, F = LAWS[name], jnp.asarray(random_gradients(20000))
+    law, F = LAWS[name], jnp.asarray(random_gradients(4000))
     exists = np.isfinite(law.energy(F))  # the logarithmic law ends at a finite stretch
     P, A = (np.asarray(v) for v in (law.first_piola(F), law.tangent(F)))
     assert np.array_equal(np.isfinite(P).all(axis=(1, 2)), exists)

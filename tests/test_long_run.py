@@ -110,6 +110,12 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
     for name, value in expected.items():
         assert value.tobytes() == found[name].tobytes(), name
     assert sorted(p.name for p in stopped.iterdir()) == ["result.h5"]
+
+
+@pytest.mark.slow
+def test_a_run_in_parts_is_the_run_in_one(scene, tmp_path):
+    assert main(["simulate", str(scene), "--every", "4", "--out", str(tmp_path)]) == 0
+    found = _numbers(tmp_path / "result.h5")
     # Parts differ from one run by the tangents that a part does not inherit: within the tolerance of Newton.
     once = lj.simulate(lj.load_scene(scene)).check()
     moved = np.abs(np.asarray(once.positions) - np.asarray(once.positions)[0]).max()

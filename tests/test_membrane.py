@@ -49,7 +49,7 @@ LAWS = {
 
 
 @ORDERS
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [n if n != "ogden" else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
 def test_a_patch_in_tension_takes_the_stress_of_an_incompressible_sample(order, name):
     """Force on a straight edge: thickness times nominal stress (`laws.homogeneous`, another way to the same)."""
     mesh = box(order)

@@ -307,13 +307,10 @@ FEATURES = (
     *("lagged", "complete", "traction", "pressure", "support", "sliding", "projected", "one step", "region"),
     *("stretches", "float32", "membrane", "ligament", "vessel", "history"),
 )
-#: By default only what has the most equations: other tests run elastic bodies of both orders.
-QUICK = {"porous"}
 
 
-@pytest.mark.parametrize(
-    "feature", [f if f in QUICK else pytest.param(f, marks=pytest.mark.slow) for f in sorted(FEATURES)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("feature", sorted(FEATURES))
 def test_every_feature_runs_on_both_orders(feature):
     """Both converge, and what they show differs by less than the linear mesh's error."""
     linear = crooked()
@@ -467,12 +464,17 @@ def test_mixed_elements_do_not_lock_and_iterations_do_not_grow():
     # What is left of compressibility goes with mu/K.
     assert abs(rises[1] / rises[0] - 1) < 0.03 and abs(rises[2] / rises[1] - 1) < 1e-3
     assert taken[2] < 1.5 * taken[0]
-    stiff = lj.simulate(locked, mesh_error=True)
-    assert _rise(locked, stiff) < 0.4 * rises[1]
-    # The estimate sees the locking: it is made of elements that do not lock.
+    assert _rise(locked, lj.simulate(locked)) < 0.4 * rises[1]
+
+
+@pytest.mark.slow
+def test_the_estimate_sees_the_locking():
+    """It is made of elements that do not lock."""
+    locked, free = _cook(1, 8, 1e4), _cook(2, 4, 1e4, volumetric="mixed")
+    rise, stiff = _rise(free, lj.simulate(free).check()), lj.simulate(locked, mesh_error=True)
     edge = np.asarray(locked.mesh.node_sets["x_max"])
     value, change = stiff.mesh_error.change(lambda x, R: jnp.mean(x[-1, edge, 1] - locked.mesh.points[edge, 1]), stiff)
-    assert abs((value + change) / rises[1] - 1) < 0.1
+    assert abs((value + change) / rise - 1) < 0.1
 
 
 def _rise(scene: lj.Scene, result: lj.Result) -> float:
@@ -490,7 +492,8 @@ def test_gradients_through_pressures_of_their_own():
         return jnp.mean(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1, edge, 1])
 
     slope, other = jax.grad(rise)(770.0), jax.jacfwd(rise)(770.0)
-    differences = [(rise(770.0 + h) - rise(770.0 - h)) / (2 * h) for h in (0.3, 0.03)]
+    # Truncation falls with h^2, 1.5e-7 at the first; the tolerance of 1e-11 of the rise, over h, is 2e-7 at the last.
+    differences = [(rise(770.0 + h) - rise(770.0 - h)) / (2 * h) for h in (0.3, 0.1, 0.03)]
     assert abs(slope - other) < 1e-8 * abs(other)
     assert min(abs(d - slope) for d in differences) < 1e-7 * abs(slope)
 

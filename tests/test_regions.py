@@ -21,7 +21,7 @@ def _pulled(law: lj.Law, region: tuple = ()) -> lj.Scene:
     )
 
 
-QUICK = ("neo_hookean", "ogden", "costa")
+QUICK = ("neo_hookean", "ogden")
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in lj.laws.LAWS])
@@ -138,6 +138,11 @@ def test_regions_of_a_scene_file(tmp_path):
     assert softer.region[0].law["mu.1"] == 10.0
     law = regions.law_of_elements(softer.law, softer.region, scene.mesh.number_of_elements)
     assert float(law.mu[1].min()) == 10.0 and float(law.mu[1].max()) == 300.0
+
+
+@pytest.mark.slow
+def test_a_scene_file_with_a_region_runs(tmp_path):
+    scene = _load(tmp_path, "[[region]]\nwhere = {x_min = 0.02}\nlaw = {mu = [1500.0, 900.0], bulk = 6000.0}")
     assert np.isfinite(np.asarray(lj.simulate(scene).check().positions)).all()
 
 

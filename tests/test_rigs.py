@@ -106,8 +106,8 @@ def test_the_table_of_converged_numbers_is_that_of_another_program(verified):
 
 
 def test_the_default_mesh_is_within_one_percent(verified):
-    errors = _errors("tension", 1.0, (3.0, 20.0, 1e4))
-    verified("tension of a glued cylinder, K/mu 3 to 1e4", "axisymmetric solver", abs(errors).max(), 0.01)
+    errors = _errors("tension", 1.0, (3.0, 1e4))
+    verified("tension of a glued cylinder, K/mu 3 and 1e4", "axisymmetric solver", abs(errors).max(), 0.01)
     assert abs(errors).max() < 0.01, errors
 
 

@@ -256,6 +256,7 @@ def test_equilibrium_with_inverted_elements_is_no_success():
     assert "inverted" in status.advice(status.INVERTED)
 
 
+@pytest.mark.slow
 def test_gradients_use_the_true_tangent():
     law = laws.typical("stable_neo_hookean")
     start = inverted_start(0.2, 2)

@@ -154,11 +154,12 @@ def gradients() -> jax.Array:
             jax.jacfwd(jax.grad(polynomial, 1)),
             1e-11,
         ),
-        (
+        pytest.param(
             "tangent by parameters",
             jax.jacrev(lambda t, F: ogden(t).tangent(F)),
             jax.jacfwd(jax.hessian(polynomial, 1)),
             1e-11,
+            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda v: v if isinstance(v, str) else "",

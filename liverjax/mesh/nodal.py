@@ -31,10 +31,8 @@ def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
     """The transpose of `interpolated`: sums (V,) at the vertices of what every point has, (Q, E)."""
     if mesh.order == 1:
         return to_nodes(mesh, shares / 4)
-    total, L = jnp.zeros(mesh.number_of_vertices, shares.dtype), jnp.asarray(basis(mesh.order).L, shares.dtype)
-    for a in range(4):
-        total = given(total, mesh.tetrahedra[:, a], jnp.sum(L[a][:, None] * shares, axis=0))
-    return total
+    parts = jnp.asarray(basis(mesh.order).L, shares.dtype) @ shares
+    return given(jnp.zeros(mesh.number_of_vertices, shares.dtype), mesh.tetrahedra.T, parts)
 
 
 def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
@@ -67,13 +65,11 @@ def load_volumes(mesh: TetMesh) -> jax.Array:
     total = _weighted_parts(mesh, _INTEGRALS[mesh.order])
     if mesh.order < 3:
         return total
-    for nodes in mesh.element_nodes[-4:]:
-        total = total.at[nodes].add(9 / 40 * mesh.volumes)
-    return total
+    bubbles = jnp.stack(mesh.element_nodes[-4:])
+    return given(total, bubbles, jnp.broadcast_to(9 / 40 * mesh.volumes, bubbles.shape))
 
 
 def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
-    total = jnp.zeros(mesh.number_of_nodes, mesh.volumes.dtype)
-    for a, nodes in enumerate(mesh.element_nodes[: 4 if mesh.order == 1 else 10]):
-        total = total.at[nodes].add(mesh.volumes * parts[a >= 4])
-    return total
+    nodes = jnp.stack(mesh.element_nodes[: 4 if mesh.order == 1 else 10])
+    own = jnp.array([parts[a >= 4] for a in range(len(nodes))], mesh.volumes.dtype)
+    return given(jnp.zeros(mesh.number_of_nodes, mesh.volumes.dtype), nodes, own[:, None] * mesh.volumes[None])

@@ -50,23 +50,17 @@ def shares(mesh: TetMesh, triangles: jax.Array) -> list[tuple[jax.Array, float]]
 
 def pressure_forces(triangles: jax.Array, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
     """Nodal forces (V, 3) [N] of a unit pressure on the triangles at positions x (V, 3) [m]: integrals of -N n da."""
-    force = jnp.zeros_like(x)
     if mesh is None or mesh.order == 1:
         corner = x[triangles]
         twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        for a in range(3):
-            force = force.at[triangles[:, a]].add(-1 / 6 * twice)
-        return force
-    nodes = triangle_nodes(mesh, triangles)
-    weights, l = triangle_rule()
-    N, along = _quadratic(l)
-    moved = [x[n] for n in nodes]
-    for q, weight in enumerate(weights):
-        first, second = (sum(slope[a, q] * moved[a] for a in range(6)) for slope in along)
-        normal = jnp.cross(first, second)
-        for a, n in enumerate(nodes):
-            force = force.at[n].add(-0.5 * weight * N[a, q] * normal)
-    return force
+        nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
+    else:
+        nodes = jnp.stack(triangle_nodes(mesh, triangles))
+        weights, l = triangle_rule()
+        N, along = _quadratic(l)
+        first, second = (jnp.tensordot(jnp.asarray(slope.T, x.dtype), x[nodes], axes=1) for slope in along)
+        own = jnp.tensordot(jnp.asarray(-0.5 * weights * N, x.dtype), jnp.cross(first, second), axes=1)
+    return jnp.zeros_like(x).at[nodes].add(own)
 
 
 def slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

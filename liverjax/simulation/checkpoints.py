@@ -65,7 +65,7 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)
 
     count += rest > 0
-    at = jnp.pad(numbers, (0, beyond)).reshape(count, length)
-    at = (at, (jnp.arange(count * length) < steps).reshape(count, length)) if beyond else at
-    out = jax.lax.scan(segment, start, at)[1]
+    rows = jnp.pad(numbers, (0, beyond)).reshape(count, length)
+    real = (jnp.arange(count * length) < steps).reshape(count, length)
+    out = jax.lax.scan(segment, start, (rows, real) if beyond else rows)[1]
     return jax.tree.map(lambda a: a.reshape(count * length, *a.shape[2:])[:steps], out)

@@ -38,16 +38,17 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     blocks = stored(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
+    places = jnp.concatenate(list(pattern.element_edges))
     edge: list[list[Any]] = [[None] * m for _ in range(m)]
     for r in range(m):
         for c in range(m):
             if blocks[PAIRS[0]][r][c] is None:
                 continue
-            total = jnp.zeros(number + 1, mesh.points.dtype)
-            for k, pair in enumerate(PAIRS):
-                K = blocks[pair]
-                value = K[r][c] if r == c else jnp.where(swapped[pair], K[c][r], K[r][c])
-                total = given(total, pattern.element_edges[k], value)
+            own = [blocks[pair] for pair in PAIRS]
+            values = [
+                K[r][c] if r == c else jnp.where(swapped[p], K[c][r], K[r][c]) for p, K in zip(PAIRS, own, strict=True)
+            ]
+            total = given(jnp.zeros(number + 1, mesh.points.dtype), places, jnp.concatenate(values))
             edge[r][c] = total
     gathered: list[list[Any]] = [[None if e is None else taken(e, pattern.row_edges) for e in row] for row in edge]
     upward = jnp.arange(mesh.number_of_vertices, dtype=jnp.int32)[None] < pattern.row_nodes
