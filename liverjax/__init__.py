@@ -32,6 +32,11 @@ from liverjax.physics.boundary import Displaced, Fixed, Traction
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.viscosity import Prony
+from liverjax.reduced.estimate import reduced_error
+from liverjax.reduced.files import load_reduced, save_reduced
+from liverjax.reduced.model import ReducedModel, reduced_identity
+from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced
+from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve, with_parameters
 from liverjax.scenes.scene_checks import check_scene
@@ -54,6 +59,8 @@ __all__ = [
     "Obstacle",
     "Porosity",
     "Prony",
+    "ReducedModel",
+    "ReducedResult",
     "Region",
     "Result",
     "Scene",
@@ -64,17 +71,24 @@ __all__ = [
     "check_mesh",
     "check_scene",
     "laws",
+    "load_reduced",
     "load_scene",
     "mjed",
     "obstacle_forces",
     "param",
     "quadratic",
     "read_mesh",
+    "reduce_scene",
+    "reduced_error",
+    "reduced_identity",
+    "reduced_positions",
     "reference",
     "refined",
+    "save_reduced",
     "shapes",
     "simulate",
     "simulate_batch",
+    "simulate_reduced",
     "static",
     "struct",
     "tet_mesh",

@@ -62,6 +62,7 @@ STOREYS = {
         "physics",
         "scenes",
         "simulation",
+        "reduced",
         "jobs",
         "commands",
     ),

@@ -1,0 +1,131 @@
+"""A reduced model: modes of motion, and weighted points of elements at which stresses are taken.
+
+Positions are x = X + u_D(t) + sum_k q_k phi_k with prescribed motion u_D, and modes phi_k that vanish where the body is
+held or moved. The energy is W(q) = sum_p w_p W(F_p(q)) over the sampled points p, with weights w_p >= 0. Its gradient,
+sum_p w_p P(F_p) : grad phi_k, is the reduced force. So a sum over points keeps the structure of the full model
+(energy-conserving sampling and weighting: Farhat, Avery, Chapman, Cortial 2014; here by points of elements).
+"""
+
+import hashlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, static, struct
+from liverjax.laws import Law
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import Physics
+from liverjax.physics.elasticity import Elasticity
+from liverjax.physics.loads import follows
+from liverjax.physics.viscosity import Viscoelasticity
+from liverjax.scenes import regions
+from liverjax.scenes.scene import Scene
+from liverjax.tensors.matrices import Matrix, deformation_gradient
+
+
+@struct
+class ReducedModel:
+    """n modes and S points of one scene; numbers of its law, viscosity and loads stay free."""
+
+    modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
+    slopes: jax.Array = param("1/m", "gradients of the modes at the points (n, 9, S), row by row")
+    weights: jax.Array = param("m^3", "reference volume that a point stands for (S,), not negative")
+    points: jax.Array = param("1", "number q E + e of point q of element e (S,)")
+    ranges: dict[str, Any] = param("1", "parameters of the training: name -> lowest and highest value")
+    identity: str = static(default="", about="digest of what modes and points are made for")
+
+    @property
+    def number_of_modes(self) -> int:
+        """The number n of unknowns of a step."""
+        return self.modes.shape[0]
+
+
+def flat_gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
+    """Gradient of a field x (V, 3) at all points of the mesh: (9, Q E), row by row."""
+    F = deformation_gradient(mesh, x)
+    return jnp.stack([entry for row in F for entry in row]).reshape(9, -1)
+
+
+def as_matrix(flat: jax.Array) -> Matrix:
+    """A tuple matrix from its nine entries (9, S)."""
+    return tuple(tuple(flat[3 * i + j] for j in range(3)) for i in range(3))
+
+
+def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
+    """The model of these modes (n, V, 3) that takes the stress at every point: Galerkin's projection."""
+    mesh = scene.mesh
+    slopes = jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes)
+    w = mesh.weights.ravel()
+    return ReducedModel(
+        modes=modes,
+        slopes=slopes,
+        weights=w,
+        points=jnp.arange(w.size, dtype=jnp.int32),
+        ranges={},
+        identity=reduced_identity(scene),
+    )
+
+
+def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
+    """The physics of the full model's elements, its law with the numbers of the sampled points."""
+    E = scene.mesh.number_of_elements
+    law = regions.law_of_elements(scene.law, scene.region, E)
+    elements = model.points % E
+    law = jax.tree.map(lambda a: jnp.asarray(a)[elements] if jnp.shape(a) in ((E,), (E, 3)) else a, law)
+    assert isinstance(law, Law)
+    return Elasticity(law=law) if scene.viscosity is None else Viscoelasticity(law=law, prony=scene.viscosity)
+
+
+def reduced_identity(scene: Scene) -> str:
+    """Digest of mesh, held and moved nodes, kind of law, viscosity and run: other numbers leave it as it is."""
+    whole = hashlib.sha256()
+    for array in (scene.mesh.points, scene.mesh.tetrahedra):
+        whole.update(np.ascontiguousarray(np.asarray(array)).tobytes())
+    parts: list[Any] = [scene.mesh.order, str(jax.tree.structure(scene.law))]
+    prony = scene.viscosity
+    parts.append(None if prony is None else (prony.part, prony.scheme, len(jnp.atleast_1d(jnp.asarray(prony.ratios)))))
+    parts += [(np.asarray(c.nodes).tolist(), c.axes) for held in (scene.fixed, scene.displaced) for c in held]
+    parts += [scene.solve.kind, scene.solve.dt is None]
+    whole.update(repr(parts).encode())
+    return whole.hexdigest()[:16]
+
+
+def refuse_unknown_physics(scene: Scene) -> None:
+    """Refuse a scene with physics that reduced models have not.
+
+    Raises:
+        InputError: porosity, supports and other named physics, pressures that follow, averaged or mixed volumes.
+    """
+    if scene.porosity is not None:
+        raise InputError("a reduced model has no pore pressures: leave [porosity] out, or run the full model")
+    if scene.physics:
+        section = scene.physics[0].section
+        raise InputError(f"a reduced model has no [[{section}]]: leave it out, or run the full model")
+    if follows(scene.traction):
+        raise InputError("a reduced model has no pressure that follows the body: give traction.value instead")
+    if scene.solve.volumetric != "element":
+        raise InputError(f"[solve] volumetric = {scene.solve.volumetric!r} is not for reduced models: use 'element'")
+    if scene.solve.precision != "float64":
+        raise InputError(f"[solve] precision = {scene.solve.precision!r} is not for reduced models: use 'float64'")
+    if scene.solve.kind == "static" and scene.viscosity is not None and scene.solve.dt is None:
+        raise InputError("[viscosity] needs dt in [solve]: give a time step in s")
+
+
+def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
+    """Refuse a scene that the model was not made for.
+
+    Raises:
+        InputError: as `refuse_unknown_physics`, or another mesh, held nodes, law, viscosity or kind of run.
+    """
+    refuse_unknown_physics(scene)
+    if isinstance(scene.mesh.points, jax.core.Tracer):
+        return
+    own = reduced_identity(scene)
+    if own != model.identity:
+        raise InputError(
+            f"the reduced model was made for scene {model.identity}, and this is {own} (mesh, held nodes, law, "
+            "viscosity or kind differ): run python -m liverjax reduce for this scene"
+        )

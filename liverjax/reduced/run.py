@@ -1,0 +1,271 @@
+"""Runs of a reduced model: a step of Newton's method for n coordinates, with stresses at the sampled points alone."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core import status
+from liverjax.core.struct import param, struct
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.physics.base import End, Free, Solid, Step
+from liverjax.physics.inertia import FACTOR
+from liverjax.physics.loads import Loads, dead_loads
+from liverjax.physics.prescribed import prescribed
+from liverjax.physics.viscosity import initial_history
+from liverjax.reduced.model import (
+    ReducedModel,
+    as_matrix,
+    flat_gradient,
+    refuse_another_scene,
+    solid_at_points,
+)
+from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene_checks import check_bounds, check_choices
+from liverjax.tensors.matrices import IDENTITY, determinant
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@struct
+class ReducedResult:
+    """What a reduced run leaves; arrays over the T steps. `reduced_positions` gives the motion of the nodes."""
+
+    times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
+    coordinates: jax.Array = param("m", "of the modes (T, n)")
+    status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
+    iterations: jax.Array = param("1", "(T,) of Newton's method")
+    residual: jax.Array = param("1", "(T,) of the reduced equations over the forces at work")
+    error: jax.Array | None = param(
+        "m", "(T,) estimated largest distance of a node from the full model, where asked for", default=None
+    )
+
+
+class ReducedMotion(NamedTuple):
+    """Velocity and acceleration of the coordinates (n,)."""
+
+    velocity: jax.Array  # [m/s]
+    acceleration: jax.Array  # [m/s^2]
+
+
+class _Given(NamedTuple):
+    """What a run prescribes, at the end of every step."""
+
+    load: jax.Array  # (T, n) [N]
+    gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) where nothing moves
+
+
+class _Equations(NamedTuple):
+    """What is constant during a step."""
+
+    model: ReducedModel
+    acting: Solid
+    load: jax.Array
+    gradient: jax.Array
+    mass: jax.Array | None  # (n, n) [kg]
+    q: jax.Array  # at the beginning
+    motion: ReducedMotion | None
+    dt: Any
+    newmark: bool
+
+
+def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
+    """As `liverjax.physics.inertia.Moving.kinematics`."""
+    assert e.motion is not None
+    velocity = (q - e.q) / e.dt
+    acceleration = (velocity - e.motion.velocity) / e.dt
+    if e.newmark:
+        acceleration = 4 * acceleration - e.motion.acceleration
+        velocity = e.motion.velocity + 0.5 * e.dt * (e.motion.acceleration + acceleration)
+    return ReducedMotion(velocity, acceleration)
+
+
+def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
+    return e.gradient + jnp.tensordot(q, e.model.slopes, axes=1)
+
+
+def _residual(e: _Equations, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Out-of-balance forces (n,) and the size of all forces."""
+    F = _deformation(e, q)
+    P = jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in e.acting.stress(as_matrix(F)) for entry in row])
+    internal = jnp.tensordot(e.model.slopes, e.model.weights[None] * P, axes=2)
+    r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load)
+    if e.mass is not None:
+        inertia = e.mass @ _kinematics(e, q).acceleration
+        r, size = r + inertia, size + jnp.linalg.norm(inertia)
+    return r, size
+
+
+def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
+    """Derivative of the residual (n, n): the elements' own blocks, with the axes for shape vectors."""
+    B, F = e.model.slopes, _deformation(e, q)
+    blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
+    A: list[list[Any]] = [[None] * 9 for _ in range(9)]
+    for (i, j), K in zip(_PAIRS, blocks, strict=True):
+        for r in range(3):
+            for c in range(3):
+                A[3 * r + i][3 * c + j] = A[3 * c + j][3 * r + i] = jnp.broadcast_to(K[r][c], F.shape[1:])
+    moduli = e.model.weights[None, None] * jnp.stack([jnp.stack(row) for row in A])
+    AB = jnp.sum(moduli[None] * B[:, None], axis=2)
+    n = len(B)
+    elastic = B.reshape(n, -1) @ AB.reshape(n, -1).T
+    if e.mass is None:
+        return elastic
+    return elastic + FACTOR["newmark" if e.newmark else "euler"] / e.dt**2 * e.mass
+
+
+class _Found(NamedTuple):
+    q: jax.Array
+    residual: jax.Array
+    iterations: jax.Array
+
+
+def _newton(e: _Equations, tolerance: Any, most: int) -> _Found:
+    """The coordinates at the end of a step; their derivatives are those of the solution, by one exact last step."""
+    fixed, tolerance = jax.lax.stop_gradient((e, tolerance))
+    fixed = fixed._replace(newmark=e.newmark)
+    start = fixed.q if fixed.motion is None else fixed.q + fixed.dt * fixed.motion.velocity
+
+    def relative(r: jax.Array, size: jax.Array) -> jax.Array:
+        return jnp.linalg.norm(r) / jnp.maximum(size, jnp.finfo(r.dtype).tiny)
+
+    def unfinished(carry: tuple) -> jax.Array:
+        _, _, size, k = carry
+        return (size > tolerance) & (k < most)
+
+    def usable(q: jax.Array) -> jax.Array:
+        return jnp.min(determinant(as_matrix(_deformation(fixed, q)))) > 0
+
+    def iterate(carry: tuple) -> tuple:
+        q, r, _, k = carry
+        dq = jnp.linalg.solve(_reduced_tangent(fixed, q), r)
+        # Halved until no sampled point is inverted, six times at most.
+        part = jax.lax.while_loop(
+            lambda part: (part > 0.02) & ~usable(q - part * dq), lambda part: 0.5 * part, jnp.ones((), q.dtype)
+        )
+        q = q - part * dq
+        r, size = _residual(fixed, q)
+        return q, r, relative(r, size), k + 1
+
+    start = jnp.where(usable(start), start, fixed.q)
+    r, size = _residual(fixed, start)
+    q, _, size, k = jax.lax.while_loop(unfinished, iterate, (start, r, relative(r, size), jnp.zeros((), jnp.int32)))
+    q, size = jax.lax.stop_gradient((q, size))
+    last = jnp.linalg.solve(jax.lax.stop_gradient(_reduced_tangent(fixed, q)), _residual(e, q)[0])
+    return _Found(q - last, size, k)
+
+
+def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
+    """Loads and prescribed motion of every step, and the load (n,) at the beginning of the run."""
+    mesh, solve, body = scene.mesh, scene.solve, scene.body
+    weight = {} if body is None else {k: getattr(body, k) for k in ("density", "gravity", "times", "history")}
+    loads = Loads(traction=scene.traction, **weight)
+    numbers = jnp.arange(solve.steps + 1, dtype=mesh.points.dtype)
+
+    def reduced(at: Loads) -> jax.Array:
+        dead = dead_loads(mesh, at.density, at.gravity, at.traction)
+        return jnp.tensordot(model.modes, dead, axes=2)
+
+    if loads.history is not None or any(load.history is not None for load in loads.traction):
+        all_steps = jax.lax.map(lambda k: reduced(loads.at(k * solve.dt)), numbers)
+        first, load = all_steps[0], all_steps[1:]
+    else:
+        first = reduced(loads)
+        parts = numbers[1:] / solve.steps if solve.dt is None else jnp.ones_like(numbers[1:])
+        load = parts[:, None] * first[None]
+
+    return _Given(load, prescribed_gradients(model, scene)), first
+
+
+def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
+    """Deformation gradients of the prescribed motion at the points: (T, 9, S), or (1, 9, S) where nothing moves."""
+    mesh, solve = scene.mesh, scene.solve
+
+    def moved(k: jax.Array) -> jax.Array:
+        time = 0.0 if solve.dt is None else solve.dt * k
+        u = prescribed(mesh, scene.displaced, time, k / solve.steps)
+        return flat_gradient(mesh, mesh.points + u)[:, model.points]
+
+    if not scene.displaced:
+        return moved(jnp.zeros((), mesh.points.dtype))[None]
+    return jax.lax.map(moved, jnp.arange(1, solve.steps + 1, dtype=mesh.points.dtype))
+
+
+def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
+    """Coordinates, memory, motion at rest, and the mass matrix; the last two None without inertia."""
+    n, S = model.slopes.shape[0], model.weights.shape[0]
+    q = jnp.zeros(n, model.modes.dtype)
+    memory = None if scene.viscosity is None else initial_history(scene.viscosity, S, q.dtype)
+    if scene.solve.kind != "dynamic" or scene.body is None:
+        return q, memory, None, None
+    nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
+    mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
+    newmark = scene.solve.integrator == "newmark"
+    return q, memory, ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q), mass
+
+
+def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
+    """(coordinates, memory, motion), what is given in a step -> those after it, and what the result has."""
+    solve, solid = scene.solve, solid_at_points(model, scene)
+    points = scene.mesh.points
+    step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
+
+    def advance(carry: tuple, given: tuple) -> tuple:
+        q, memory, motion = carry
+        acting = solid.freeze(memory, step)
+        newmark = solve.integrator == "newmark"
+        load, gradient = given
+        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, newmark)
+        found = _newton(e, solve.tolerance, solve.newton_iterations)
+        F = as_matrix(_deformation(e, found.q))
+        memory = solid.advance(memory, acting, End(points, F, None))
+        motion = None if motion is None else _kinematics(e, found.q)
+        code = jnp.where(found.residual <= solve.tolerance, status.CONVERGED, status.STALLED)
+        code = jnp.where(jnp.min(determinant(F)) <= 0, status.INVERTED, code)
+        code = jnp.where(jnp.all(jnp.isfinite(found.q)), code, status.NOT_FINITE)
+        return (found.q, memory, motion), (found.q, code, found.iterations, found.residual)
+
+    return advance
+
+
+@jax.jit
+def _reduced_run(model: ReducedModel, scene: Scene) -> ReducedResult:
+    given, load = _given(model, scene)
+    *begin, mass = _begin(model, scene, load)
+    T = scene.solve.steps
+    advance = _advance(model, scene, mass)
+    if scene.displaced:
+        _, out = jax.lax.scan(advance, tuple(begin), (given.load, given.gradient))
+    else:
+        F = given.gradient[0]
+        _, out = jax.lax.scan(lambda carry, load: advance(carry, (load, F)), tuple(begin), given.load)
+    q, code, iterations, residual = out
+    times = jnp.arange(1, T + 1, dtype=q.dtype) * (1.0 if scene.solve.dt is None else scene.solve.dt)
+    return ReducedResult(times=times, coordinates=q, status=code, iterations=iterations, residual=residual)
+
+
+def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
+    """Run a scene by its reduced model; may be differentiated, vmapped and jitted.
+
+    Args:
+        model: `ReducedModel`, from `reduce_scene` or `load_reduced`.
+        scene: the scene it was made for; numbers of law, regions, viscosity, body, loads and time step may differ.
+
+    Raises:
+        InputError: another scene, or numbers that `simulate` refuses too.
+    """
+    refuse_another_scene(model, scene)
+    check_choices(scene)
+    check_bounds(scene)
+    return _reduced_run(model, scene)
+
+
+def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
+    """Positions (T, V, 3) [m] of the nodes."""
+    mesh, solve = scene.mesh, scene.solve
+    u = jnp.tensordot(result.coordinates, model.modes, axes=1)
+    if scene.displaced:
+        numbers = jnp.arange(1, solve.steps + 1, dtype=u.dtype)
+        u = u + jax.vmap(lambda k, t: prescribed(mesh, scene.displaced, t, k / solve.steps))(numbers, result.times)
+    return mesh.points[None] + u

@@ -1,0 +1,94 @@
+"""Points and weights that give the reduced forces of the training runs, none of them negative.
+
+The contributions of all points to the reduced forces are a matrix G (rows, P); the forces are the sums of its rows.
+Weights xi >= 0 with few entries above 0 are the least-squares solution of G xi = G 1 by Lawson and Hanson's method, on
+the largest singular vectors of G alone: there are at most as many points as vectors (Hernandez, Caicedo, Ferrer 2017).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import replace
+from liverjax.physics.base import End, Free, Step
+from liverjax.physics.viscosity import initial_history
+from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
+from liverjax.reduced.run import prescribed_gradients
+from liverjax.scenes.scene import Scene, with_parameters
+
+#: The most states whose forces are taken: more cost memory and change little.
+MOST_STATES = 60
+
+
+def sampled(
+    whole: ReducedModel, scene: Scene, values: Mapping[str, Any], q: jax.Array, tolerance: float
+) -> ReducedModel:
+    """The model with few points, from one of all points and coordinates q (R, T, n) of runs with R rows of values.
+
+    Args:
+        whole: as `with_all_points` makes it.
+        scene: `Scene`.
+        values: dotted names -> (R, …).
+        q: coordinates [m].
+        tolerance: part of the forces that may be left out [1].
+    """
+    R, T, _ = q.shape
+    each = max(1, MOST_STATES // R)
+    times = np.unique(np.linspace(0, T - 1, each).round().astype(int))
+    rows = []
+    for r in np.unique(np.linspace(0, R - 1, min(R, MOST_STATES)).round().astype(int)):
+        own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
+        rows.append(np.asarray(_contributions(whole, own, q[r], jnp.asarray(times))).reshape(-1, whole.weights.size))
+    xi = nonnegative_weights(np.concatenate(rows), np.asarray(whole.weights), tolerance)
+    points = np.flatnonzero(xi)
+    return replace(
+        whole,
+        slopes=whole.slopes[:, :, points],
+        weights=whole.weights[points] * xi[points],
+        points=whole.points[points],
+    )
+
+
+@jax.jit
+def _contributions(whole: ReducedModel, scene: Scene, q: jax.Array, times: jax.Array) -> jax.Array:
+    """What each point gives to each reduced force along a run, at some times: (K, n, P), each state of size 1."""
+    solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
+    F0 = prescribed_gradients(whole, scene)
+    step = Step(scene.mesh, points, 1, solve.steps, solve.dt, False, None, Free(jnp.ones_like(points)))
+    memory = None if scene.viscosity is None else initial_history(scene.viscosity, whole.weights.size, q.dtype)
+
+    def advance(memory: Any, given: tuple) -> tuple:
+        k, own = given
+        F = as_matrix(F0[k if len(F0) > 1 else 0] + jnp.tensordot(own, whole.slopes, axes=1))
+        acting = solid.freeze(memory, step)
+        P = jnp.stack([entry for row in acting.stress(F) for entry in row])
+        return solid.advance(memory, acting, End(points, F, None)), P
+
+    P: jax.Array
+    _, P = jax.lax.scan(advance, memory, (jnp.arange(len(q)), q))
+    G = jnp.sum(whole.slopes[None] * (whole.weights[None, None] * P[times])[:, None], axis=2)
+    size = jnp.linalg.norm(jnp.sum(G, axis=2), axis=1)
+    return G / jnp.maximum(size, 1e-300)[:, None, None]
+
+
+def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
+    """Factors xi (P,), few of them above 0, with G xi = G 1 nearly, and the sum of volumes kept.
+
+    Args:
+        G: contributions (rows, P).
+        volumes: of the points (P,).
+        tolerance: part of G that may be left out [1].
+    """
+    from scipy.optimize import nnls
+
+    size, vectors = np.linalg.eigh(G @ G.T)
+    size, vectors = np.maximum(size[::-1], 0.0), vectors[:, ::-1]
+    left = np.sqrt(np.maximum(size.sum() - np.cumsum(size), 0.0) / size.sum())
+    rank = min(int(np.sum(left > tolerance)) + 1, int(np.sum(size > 1e-14 * size[0])))
+    # Rows of length 1: small vectors count as much as large ones.
+    V = (vectors[:, :rank] / np.sqrt(size[:rank])).T @ G
+    V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
+    return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

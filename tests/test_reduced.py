@@ -1,0 +1,146 @@
+"""Reduced models: the full model in other coordinates, their structure, their error, and what they refuse."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
+from liverjax.reduced.sampling import nonnegative_weights
+
+pytestmark = pytest.mark.quick_to_compile
+
+PRONY = lj.Prony(ratios=jnp.array([0.3, 0.2]), relaxation_times=jnp.array([0.3, 0.03]))
+MOVING = lj.Solve(kind="dynamic", integrator="newmark", dt=0.05, steps=3)
+
+
+def _bar(cells: tuple, order: int = 1, **changes) -> lj.Scene:
+    """A bar of 3 x 1 x 1 cm held at x = 0 under its weight."""
+    mesh = lj.shapes.box([0.03, 0.01, 0.01], list(cells))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    held = jnp.asarray(lj.boundary.select(mesh, {"x_max": 0.0}, None, "fixed"))
+    law = lj.laws.NeoHookean(mu=800.0, bulk=3000.0)
+    body = lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -1.0]))
+    return lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=held),), body=body, **changes)
+
+
+def _every_motion(scene: lj.Scene) -> jax.Array:
+    """One mode a free degree of freedom."""
+    held = [*scene.fixed, *scene.displaced]
+    free = lj.boundary.free_degrees(scene.mesh, tuple(held), ())
+    return jnp.asarray(np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape))
+
+
+@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
+def test_all_motions_and_all_points_are_the_full_model(order):
+    # Another path to the same numbers: Newton's method on dense matrices, memory and inertia of coordinates.
+    scene = _bar((1, 1, 1), order, viscosity=PRONY, solve=MOVING)
+    full = lj.simulate(scene).check()
+    model = with_all_points(scene, _every_motion(scene))
+    found = lj.simulate_reduced(model, scene)
+    assert not np.any(found.status)
+    moved = np.abs(full.positions - scene.mesh.points[None]).max()
+    # The solver's tolerance of 1e-8 of the forces, through a condition number of some thousands.
+    assert np.abs(lj.reduced_positions(model, scene, found) - full.positions).max() < 1e-5 * moved
+
+
+@pytest.mark.slow
+def test_prescribed_motion_and_histories_are_those_of_the_full_model():
+    scene = _bar((1, 1, 1), viscosity=PRONY, solve=lj.Solve(dt=0.1, steps=2))
+    end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
+    body = replace(scene.body, times=jnp.array([0.0, 0.2]), history=jnp.array([1.0, 0.5]))
+    scene = replace(scene, displaced=(lj.Displaced(nodes=end[:2], by=jnp.array([0.004, 0.0, 0.002])),), body=body)
+    model = with_all_points(scene, _every_motion(scene))
+    x = lj.reduced_positions(model, scene, lj.simulate_reduced(model, scene))
+    assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.004
+
+
+@pytest.fixture(scope="module")
+def trained() -> tuple:
+    """A viscous bar in motion, its reduced model of few rows, and numbers between and beyond them."""
+    scene = _bar((4, 1, 1), viscosity=PRONY, solve=MOVING)
+    rng = np.random.default_rng(1)
+    down = rng.uniform(-5.0, -2.0, 8)
+    gravity = np.stack([rng.uniform(-2, 2, 8), rng.uniform(-2, 2, 8), down], axis=1)
+    rows = {"law.mu": rng.uniform(700.0, 1000.0, 8), "body.gravity": gravity}
+    return scene, lj.reduce_scene(scene, rows, most_modes=5, point_tolerance=1e-3)
+
+
+def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
+    scene, model = trained
+    assert np.all(np.asarray(model.weights) > 0) and len(model.points) < scene.mesh.weights.size
+    # Volume is kept by a row of the least squares.
+    assert float(model.weights.sum()) == pytest.approx(float(scene.mesh.volumes.sum()), rel=1e-6)
+    law = solid_at_points(model, scene).law
+    rest = jnp.eye(3).reshape(9, 1)
+
+    def energy(q):
+        F = as_matrix(rest + jnp.tensordot(q, model.slopes, axes=1))
+        return jnp.sum(model.weights * law.strain_energy(law.measures(F)))
+
+    # A static step with no load but this force ends at q: the force of the run is the derivative of this energy.
+    static = replace(scene, viscosity=None, solve=lj.Solve())
+    own = replace(model, identity=lj.reduced_identity(static))
+    q = lj.simulate_reduced(own, static).coordinates[-1]
+    load = jnp.tensordot(model.modes, jnp.asarray(_weight(static)), axes=2)
+    assert np.allclose(jax.grad(energy)(q), load, rtol=0, atol=1e-8 * np.linalg.norm(load))
+
+
+def _weight(scene: lj.Scene) -> np.ndarray:
+    per_node = np.zeros(len(scene.mesh.points))
+    np.add.at(per_node, np.asarray(scene.mesh.tetrahedra), np.asarray(scene.mesh.volumes)[:, None] / 4)
+    return 1000.0 * per_node[:, None] * np.asarray(scene.body.gravity)
+
+
+def test_weights_give_all_forces_and_are_few():
+    rng = np.random.default_rng(0)
+    G = rng.normal(size=(40, 6)) @ rng.normal(size=(6, 200))
+    xi = nonnegative_weights(G, np.ones(200), 1e-8)
+    assert np.all(xi >= 0) and np.count_nonzero(xi) <= 7
+    assert np.allclose(G @ xi, G.sum(axis=1), rtol=0, atol=1e-8 * np.abs(G).sum(axis=1).max())
+
+
+def test_the_error_is_stated(trained):
+    scene, model = trained
+    for mu, gravity in ((850.0, (0.5, -1.0, -4.0)), (640.0, (0.0, 3.0, 2.0))):
+        own = lj.with_parameters(scene, {"law.mu": mu, "body.gravity": gravity})
+        found = lj.simulate_reduced(model, own)
+        error = lj.reduced_error(model, own, found).error
+        full = lj.simulate(own).check().positions
+        true = np.linalg.norm(lj.reduced_positions(model, own, found) - full, axis=-1).max(axis=1)
+        assert true.max() > 1e-6  # five modes are not the answer: there is an error to state
+        assert np.all(error < 2 * true) and np.all(true < 2 * error)
+
+
+def test_derivatives_and_lanes(trained):
+    scene, model = trained
+
+    def tip(mu):
+        own = lj.with_parameters(scene, {"law.mu": mu, "viscosity.ratios.0": mu / 3000.0})
+        return lj.reduced_positions(model, own, lj.simulate_reduced(model, own))[-1, -1, 2]
+
+    found = jax.grad(tip)(800.0)
+    assert found == pytest.approx(float(jax.jacfwd(tip)(800.0)), rel=1e-10)
+    steps = 800.0 * 10.0 ** -np.arange(1, 8)
+    lanes = jax.jit(jax.vmap(tip))(jnp.concatenate([800.0 + steps, 800.0 - steps]))
+    errors = np.abs((lanes[:7] - lanes[7:]) / (2 * steps) / found - 1)
+    # Second order, then the run's tolerance: the curve falls and rises.
+    assert errors.min() < 1e-7 and errors[0] > 1e3 * errors.min() and errors[-1] > errors.min()
+
+
+def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
+    scene, model = trained
+    lj.save_reduced(model, tmp_path / "model.h5")
+    again = lj.load_reduced(tmp_path / "model.h5")
+    assert again.identity == model.identity and np.array_equal(again.slopes, model.slopes)
+    with pytest.raises(lj.InputError, match=r"was made for scene .* run python -m liverjax reduce"):
+        lj.simulate_reduced(again, _bar((1, 1, 1)))
+    with pytest.raises(lj.InputError, match="no pore pressures"):
+        porous = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
+        lj.simulate_reduced(again, replace(scene, porosity=porous))
+    with pytest.raises(lj.InputError, match="is no reduced model"):
+        lj.load_reduced(tmp_path / "none.h5")
+    with pytest.raises(lj.InputError, match="between 0 and 1"):
+        lj.reduce_scene(scene, {"law.mu": [800.0]}, tolerance=2.0)
