@@ -45,6 +45,7 @@ from liverjax.simulation.batch import Batch, simulate_batch
 from liverjax.simulation.gradients import Gradient, value_and_gradient
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result, simulate
+from liverjax.waves.harmonic import Harmonic, harmonic
 
 __version__ = "0.1.0"
 
@@ -54,6 +55,7 @@ __all__ = [
     "Displaced",
     "Fixed",
     "Gradient",
+    "Harmonic",
     "InputError",
     "Law",
     "Obstacle",
@@ -70,6 +72,7 @@ __all__ = [
     "boundary",
     "check_mesh",
     "check_scene",
+    "harmonic",
     "laws",
     "load_reduced",
     "load_scene",

@@ -63,6 +63,7 @@ STOREYS = {
         "scenes",
         "simulation",
         "reduced",
+        "waves",
         "jobs",
         "commands",
     ),

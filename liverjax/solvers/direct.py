@@ -58,7 +58,7 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack([jnp.zeros_like(like) if e is None else e for e in row]) for row in blocks])
 
 
-def _across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
+def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     """n n^T of every node, in the order of the unknowns, (size, size)."""
     import scipy.sparse  # a fifth of the time that importing the package takes: here and below only where it is used
 
@@ -139,7 +139,7 @@ def _factorised(A: Any, free: np.ndarray, b: np.ndarray, normals: Any, mean: flo
     import scipy.sparse.linalg
 
     if normals is not None:
-        N = _across(np.asarray(normals), len(b))
+        N = across(np.asarray(normals), len(b))
         inside = scipy.sparse.eye_array(len(b)) - N
         A = inside @ A @ inside + mean * N
     keep = np.flatnonzero(free)

@@ -1,0 +1,151 @@
+"""Harmonic motion of a scene: complex amplitudes at given frequencies."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, struct
+from liverjax.physics import viscosity
+from liverjax.physics.loads import follows, nodal_tractions
+from liverjax.physics.prescribed import prescribed
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.equations import Sizes, equations, initial_state
+from liverjax.simulation.run import prepared
+from liverjax.waves import sparse
+from liverjax.waves.operator import Operator, applied, operator
+
+MASSES = ("consistent", "lumped")
+
+
+@struct
+class Harmonic:
+    """Amplitudes of small motion at F frequencies: the displacement is the real part of u exp(i omega t)."""
+
+    frequencies_Hz: jax.Array = param("Hz", "(F,)")
+    displacement: jax.Array = param("m", "u, complex (F, V, 3)")
+    reactions: jax.Array = param("N", "complex (F, V, 3), force of the support on the body where motion is given")
+    residual: jax.Array = param("1", "(F,) what is out of balance where the body is free, over the forces at work")
+
+    def check(self) -> "Harmonic":
+        """The result itself, or `RuntimeError` with advice where a frequency has no answer; host side."""
+        wrong = np.flatnonzero(~(np.asarray(self.residual) < 1e-6))
+        if wrong.size:
+            raise RuntimeError(
+                f"{float(self.frequencies_Hz[wrong[0]]):g} Hz: {status.advice(status.NOT_FINITE)}; a body without "
+                "viscosity has no answer at its resonances"
+            )
+        return self
+
+
+def harmonic(
+    scene: Scene,
+    frequencies_Hz: Any,
+    factors: Any = None,
+    about: jax.Array | None = None,
+    motion: Any = None,
+    mass: str = "consistent",
+) -> Harmonic:
+    """Small motion of the scene at these frequencies, driven by its tractions and prescribed motions as amplitudes.
+
+    Law, viscosity, density, supports, held nodes and regions act; gravity and time steps have no part. May be
+    differentiated in both modes and jitted; every derivative costs one more solve a frequency.
+
+    Args:
+        scene: `Scene`. What `displaced` prescribes is the amplitude of a motion in phase.
+        frequencies_Hz: (F,), above 0.
+        factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
+            default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or 1 without one.
+        about: positions (V, 3) [m] of an equilibrium that has rested for long, as of `simulate`; default: the
+            reference shape. The law's stress there stiffens the body.
+        motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
+        mass: "consistent" (each element's integrals), or "lumped" as in runs in time.
+
+    Returns:
+        `Harmonic`. A matrix without an inverse leaves NaN at its frequency.
+
+    Raises:
+        InputError: what has no harmonic motion here (porosity, pressures that follow, rigid plates, mixed or averaged
+            volumes), shapes and values that cannot be used.
+    """
+    scene, omegas = _small(scene, mass), 2 * jnp.pi * _frequencies(frequencies_Hz)
+    mesh = scene.mesh
+    number, elements = len(omegas), mesh.number_of_elements
+    factors = _factors(scene, omegas) if factors is None else jnp.asarray(factors, complex)
+    if factors.shape not in ((number,), (number, elements)):
+        raise InputError(f"factors have shape {factors.shape}: give ({number},) or ({number}, {elements})")
+    if motion is None:
+        motion = prescribed(mesh, tuple(replace(d, times=None, history=None) for d in scene.displaced), 0.0, 1.0)
+    motion = jnp.asarray(motion, complex)
+    if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
+        raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape} or one more axis of frequencies")
+    if about is not None and jnp.shape(about) != mesh.points.shape:
+        raise InputError(f"about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}")
+    motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
+    return _answer(scene, (factors, omegas), motion, about, mass)
+
+
+def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
+    still = replace(scene, viscosity=None, displaced=tuple(replace(d, by=jnp.zeros(3)) for d in scene.displaced))
+    none = jnp.zeros(())
+    e = equations(still, initial_state(still), 1.0, Sizes(none, none))
+    if e.free.tied:
+        raise InputError("nodes that turn together (a rigid plate) have no harmonic motion here: prescribe theirs")
+    return operator(e._replace(scene=scene), scene.mesh.points if about is None else about, about is not None, mass)
+
+
+@partial(jax.jit, static_argnames="mass")
+def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, about: Any, mass: str) -> Harmonic:
+    """Motion, reactions and what is out of balance; `at` are factors and angular frequencies."""
+    A = _operator(scene, about, mass)
+    held = (1 - A.free.mask)[None] * motion
+    load = jnp.asarray(nodal_tractions(scene.mesh, scene.traction), complex)[None]
+    forced = jax.lax.map(lambda one: applied(A, one[0], one[1], one[2]), (*at, held))
+    u = held + sparse.solve(A, *at, load - forced)
+    f = jax.lax.map(lambda one: applied(A, one[0], one[1], one[2]), (*at, u)) - load
+    out = jax.vmap(A.free.vectors)(f)
+    size = jnp.linalg.norm(f - out, axis=(1, 2)) + jnp.linalg.norm(load, axis=(1, 2))
+    residual = jnp.linalg.norm(out, axis=(1, 2)) / jnp.where(size > 0, size, 1.0)
+    return Harmonic(
+        frequencies_Hz=at[1] / (2 * jnp.pi),
+        displacement=u,
+        reactions=f - out,
+        residual=jax.lax.stop_gradient(residual),
+    )
+
+
+def _frequencies(frequencies_Hz: Any) -> jax.Array:
+    found = jnp.atleast_1d(jnp.asarray(frequencies_Hz, float))
+    if not isinstance(found, jax.core.Tracer) and not (
+        found.ndim == 1 and found.size and np.all(np.asarray(found) > 0)
+    ):
+        raise InputError(f"frequencies_Hz = {np.asarray(frequencies_Hz).tolist()} must be a list of numbers above 0")
+    return found
+
+
+def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
+    """m (F,) of the scene's viscosity."""
+    if scene.viscosity is None:
+        return jnp.ones(omegas.shape, complex)
+    return 1 - jnp.sum(viscosity.complex_ratios(scene.viscosity, omegas), axis=0)
+
+
+def _small(scene: Scene, mass: str) -> Scene:
+    """The scene as its small motion sees it: no time, no weight; refuses what has no part in it."""
+    if mass not in MASSES:
+        raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
+    if scene.porosity is not None:
+        raise InputError("porosity has no harmonic motion here: leave it out, or run the scene in time")
+    if follows(scene.traction):
+        raise InputError("a pressure that follows the body has no harmonic motion here: give a traction as value")
+    if scene.solve.volumetric in ("nodal", "mixed"):
+        raise InputError(f"volumetric = {scene.solve.volumetric!r} has no harmonic motion here: use 'element'")
+    solve = replace(scene.solve, kind="static", dt=None, steps=1, linear_solver="cg", volumetric="element")
+    traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
+    body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)
+    viscous, scene = scene.viscosity, replace(scene, viscosity=None, traction=traction, body=body, solve=solve)
+    return replace(prepared(scene), viscosity=viscous)

@@ -1,0 +1,157 @@
+"""Dynamic stiffness of small harmonic motion: K(omega) - omega^2 M, kept by element.
+
+About a state x that has rested for long, the stress that relaxes has come down to m_inf S_h, and a small motion adds
+m(omega) times its instantaneous change, where m = G*/G0 (m_inf = 1 - sum g_k). So, with the material and the geometric
+part of the tangent apart (superposed small motion: Lockett 1972, Nonlinear Viscoelastic Solids, chapter 7),
+
+    K(omega) = m(omega) (K_h - K_geometric) + m_inf K_geometric + K_rest,
+
+where K_rest is of what does not relax: the volumetric part of the law where only the isochoric part does, supports,
+membranes and springs.
+"""
+
+from functools import cache
+from itertools import product
+from math import factorial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.elements import mjed
+from liverjax.laws.base import volumetric_part
+from liverjax.laws.terms import invariant_terms
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.basis import basis
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics import viscosity
+from liverjax.physics.base import Free
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.equations import Equations
+from liverjax.simulation.tangent import node_blocks
+from liverjax.solvers import attached
+from liverjax.solvers.attached import Attached
+from liverjax.solvers.block_matrix import Block
+from liverjax.tensors.material_axes import symmetric
+from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, dot, matvec, scale_matrix
+
+_OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
+
+
+class Operator(NamedTuple):
+    """Matrices of every element with n nodes, and what acts at nodes."""
+
+    nodes: jax.Array  # (n, E)
+    relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] is multiplied by m(omega)
+    rest: jax.Array | None  # (n, 3, n, 3, E) [N/m]
+    mass: jax.Array | None  # (n, n, E) [kg] of one component, or lumped (V,)
+    springs: Block | None  # diagonal blocks 3 x 3 of (V,) [N/m]
+    attached: tuple[Attached, ...]
+    free: Free
+
+
+def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
+    """The operator about positions x (V, 3) [m].
+
+    Args:
+        e: equations of the scene, of which viscosity takes no part.
+        loaded: x is not the reference shape; there is stress.
+        mass: "consistent" or "lumped", as in runs in time.
+    """
+    scene, mesh = e.scene, e.mesh
+    relaxing, rest = _blocks(scene, deformation_gradient(mesh, x), loaded)
+    springs = node_blocks(e)
+    more = tuple(own for own in (a.attached(mesh, x, 1.0) for a in e.nodal) if own is not None)
+    nodes = jnp.stack(mesh.element_nodes)
+    heavy = None if scene.body is None else _mass(mesh, jnp.asarray(scene.body.density), nodes, mass)
+    whole = None if rest is None else _element_matrices(mesh, rest)
+    return Operator(nodes, _element_matrices(mesh, relaxing), whole, heavy, springs, more, e.free)
+
+
+def _blocks(scene: Scene, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
+    """Blocks per volume of the corners 1, 2, 3 (`_OWN`) that m(omega) multiplies, and of those that it does not."""
+    mesh, law, prony = scene.mesh, scene.law, scene.viscosity
+    D = [tuple(mesh.gradients[a]) for a in range(3)]
+    if prony is None:
+        return invariant_terms.blocks(invariant_terms.state(law, F), D, _OWN), None
+    own = viscosity.relaxing(prony, law)
+    K, rest = invariant_terms.blocks(invariant_terms.state(own, F), D, _OWN), None
+    if loaded:
+        S = symmetric(tuple(viscosity.relaxing_stress(prony, law, F)))
+        metric = [_times_identity(dot(D[i], matvec(S, D[j]))) for i, j in _OWN]
+        K = [add_matrices(k, scale_matrix(-1.0, g)) for k, g in zip(K, metric, strict=True)]
+        rest = [scale_matrix(1 - jnp.sum(jnp.asarray(prony.ratios)), g) for g in metric]
+    volume = volumetric_part(law) if prony.part == "isochoric" else None
+    if volume is not None:
+        U = invariant_terms.blocks(invariant_terms.state(volume, F), D, _OWN)
+        rest = U if rest is None else [add_matrices(a, b) for a, b in zip(rest, U, strict=True)]
+    return K, rest
+
+
+def _times_identity(value: jax.Array) -> Matrix:
+    zero = jnp.zeros_like(value)
+    return tuple(tuple(value if r == c else zero for c in range(3)) for r in range(3))
+
+
+def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
+    """(n, 3, n, 3, E) [N/m] from blocks per volume at the points."""
+    weighted = {(a + 1, b + 1): scale_matrix(mesh.weights, K) for (a, b), K in zip(_OWN, blocks, strict=True)}
+    corners = jnp.stack([jnp.stack([_stacked(K) for K in row]) for row in mjed.all_blocks(weighted)])
+    if mesh.order == 1:
+        return jnp.transpose(corners, (0, 2, 1, 3, 4))
+    c = jnp.asarray(basis(mesh.order).c, corners.dtype)
+    return jnp.einsum("akq,klrsqe,blq->arbse", c, corners, c, optimize=True)
+
+
+def _stacked(K: Matrix) -> jax.Array:
+    return jnp.stack([jnp.stack(row) for row in K])
+
+
+def _mass(mesh: TetMesh, density: jax.Array, nodes: jax.Array, kind: str) -> jax.Array:
+    if kind == "lumped":
+        return density * nodal_volumes(mesh)
+    own = density if density.ndim == 0 else jnp.mean(density[nodes], axis=0)
+    return jnp.asarray(_products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
+
+
+@cache
+def _products(order: int) -> np.ndarray:
+    """Integrals (n, n) of the products of two functions over an element, over its volume; exact."""
+    vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
+    if order == 1:
+        functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]
+    else:
+        functions = [{tuple(2 * n for n in v): 2.0, v: -1.0} for v in vertex]
+        functions += [{tuple(np.add(vertex[i], vertex[j]).tolist()): 4.0} for i, j in PAIRS]
+
+    def integral(f: dict[tuple, float], g: dict[tuple, float]) -> float:
+        total = 0.0
+        for (p, a), (q, b) in product(f.items(), g.items()):
+            powers = np.add(p, q)
+            total += a * b * 6 * np.prod([factorial(n) for n in powers]) / factorial(int(powers.sum()) + 3)
+        return total
+
+    return np.array([[integral(f, g) for g in functions] for f in functions])
+
+
+def applied(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.Array:
+    """(K - omega^2 M) u, (V, 3) complex [N], for a motion u (V, 3); `factor` is m at omega [rad/s], () or (E,)."""
+    own = u[A.nodes]  # (n, E, 3)
+    factor = jnp.asarray(factor)
+    factor = factor[None, None] if factor.ndim else factor
+    force = factor * jnp.einsum("arbse,bes->are", A.relaxing, own)
+    if A.rest is not None:
+        force = force + jnp.einsum("arbse,bes->are", A.rest, own)
+    if A.mass is not None and A.mass.ndim == 3:
+        force = force - omega**2 * jnp.einsum("abe,ber->are", A.mass, own)
+    total = jnp.zeros_like(u).at[A.nodes].add(jnp.swapaxes(force, 1, 2))
+    if A.mass is not None and A.mass.ndim == 1:
+        total = total - (omega**2 * A.mass)[:, None] * u
+    if A.springs is not None:
+        rows = [[jnp.zeros_like(u[:, c]) if K is None else K * u[:, c] for c, K in enumerate(row)] for row in A.springs]
+        total = total + jnp.stack([row[0] + row[1] + row[2] for row in rows], axis=1)
+    for K in A.attached:
+        total = total + jnp.stack(attached.product(K, tuple(u.T)), axis=1)
+    return total

@@ -1,0 +1,250 @@
+"""Harmonic motion: against waves in closed form, against runs in time, and its derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.laws.base import Law
+
+pytestmark = pytest.mark.quick_to_compile
+
+LENGTH, MU, DENSITY = 0.03, 3000.0, 1000.0
+PRONY = lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.003]))
+FREQUENCIES = np.array([60.0, 100.0])
+
+
+def slab(n: int, order: int, **changes) -> lj.Scene:
+    """A slab of n cells along z that moves along x alone; its lower face is driven, its upper one is free."""
+    mesh = lj.shapes.box((LENGTH / n, LENGTH / n, LENGTH), (1, 1, n))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=MU, bulk=10 * MU),
+        viscosity=PRONY,
+        body=lj.Body(density=DENSITY),
+        fixed=(lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="yz"),),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_min"], by=jnp.array([1e-4, 0.0, 0.0]), axes="x"),),
+        **changes,
+    )
+
+
+def standing(z: np.ndarray, G: np.ndarray, length: float = LENGTH) -> np.ndarray:
+    """Amplitudes (F, V) [m] between a driven and a free face, of complex moduli G (F,) [Pa]."""
+    k = (2 * np.pi * FREQUENCIES * np.sqrt(DENSITY / G))[:, None]
+    return 1e-4 * np.cos(k * (length - z[None])) / np.cos(k * length)
+
+
+def modulus(prony: lj.Prony = PRONY) -> np.ndarray:
+    """G* (F,) [Pa] by the textbook's formula."""
+    g, tau = np.asarray(prony.ratios), np.asarray(prony.relaxation_times)
+    w = 2 * np.pi * FREQUENCIES[:, None]
+    return MU * (1 - np.sum(g / (1 + 1j * w * tau), axis=1))
+
+
+def off(n: int, order: int, mass: str = "consistent") -> float:
+    """Largest error of the slab's motion, over the largest motion."""
+    scene = slab(n, order)
+    found = np.asarray(lj.harmonic(scene, FREQUENCIES, mass=mass).check().displacement[:, :, 0])
+    exact = standing(np.asarray(scene.mesh.points)[:, 2], modulus())
+    return np.abs(found - exact).max() / np.abs(exact).max()
+
+
+@pytest.mark.core
+def test_a_plane_shear_wave_and_its_order(verified):
+    """Wavelengths of 17 and 27 mm: the motion is wrong by h^2 and h^3, the phase of quadratic elements by h^4."""
+    linear = [off(n, 1) for n in (40, 80)]
+    quadratic = [off(n, 2) for n in (20, 40)]
+    orders = [float(np.log2(e[0] / e[1])) for e in (linear, quadratic)]
+    assert 1.9 < orders[0] < 2.1 and 2.8 < orders[1] < 4.2
+    # Eleven elements a wave, and twice as many.
+    assert quadratic[0] < 2e-3 and quadratic[1] < 2e-4
+    verified(
+        "plane shear wave, viscoelastic, 23 quadratic elements a wave", "closed form", quadratic[1], 2e-4, orders[1]
+    )
+
+
+def test_lumped_masses_cost_quadratic_elements_their_order():
+    assert 1.8 < np.log2(off(20, 2, "lumped") / off(40, 2, "lumped")) < 2.2
+
+
+def test_a_torsional_wave(verified):
+    """A cylinder whose lower face turns: every section turns as a whole, by the slab's formula."""
+    mesh = lj.quadratic(lj.shapes.cylinder(0.004, 0.01, 0.002))
+    low, points = np.asarray(mesh.node_sets["bottom"]), np.asarray(mesh.points)
+    turn = 1e-4 / 0.004 * np.stack([-points[:, 1], points[:, 0], 0 * points[:, 0]], axis=1)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=MU, bulk=10 * MU),
+        viscosity=PRONY,
+        body=lj.Body(density=DENSITY),
+        displaced=(lj.Displaced(nodes=jnp.asarray(low), by=jnp.asarray(turn[low])),),
+    )
+    found = np.asarray(lj.harmonic(scene, FREQUENCIES).check().displacement)
+    exact = turn[None] * (standing(points[:, 2], modulus(), 0.01) / 1e-4)[:, :, None]
+    error = np.abs(found - exact).max() / np.abs(exact).max()
+    assert error < 0.02  # eight elements a wave
+    verified("torsional wave, viscoelastic, 2 mm quadratic elements", "closed form", error, 0.02)
+
+
+def test_springpots_by_element_are_factors():
+    """(i omega)^0.2 in two halves of the slab, one written by element."""
+    scene = replace(slab(8, 2), viscosity=None)
+    m = (1j * FREQUENCIES / 80) ** 0.2
+    whole = lj.harmonic(scene, FREQUENCIES, factors=m)
+    parts = lj.harmonic(scene, FREQUENCIES, factors=m[:, None] * np.ones(scene.mesh.number_of_elements))
+    assert np.allclose(whole.displacement, parts.displacement, rtol=1e-12, atol=1e-16)
+    z = np.asarray(scene.mesh.points)[:, 2]
+    # As coarse as this the mesh leaves 2 %.
+    assert np.abs(np.asarray(whole.displacement[:, :, 0]) - standing(z, MU * m)).max() < 0.02 * 2e-4
+
+
+def stretched(scene: lj.Scene, stretch: float) -> jax.Array:
+    """Positions of the slab stretched along z."""
+    return scene.mesh.points * jnp.array([[1.0, 1.0, stretch]])
+
+
+@pytest.mark.parametrize("part", ["all", "isochoric"])
+def test_about_a_stretched_state(part):
+    """The stress that has not relaxed stiffens the slab: its modulus there from derivatives of the energy alone."""
+    prony = replace(PRONY, part=part)
+    scene = replace(slab(30, 2), viscosity=prony)
+    F0, law = jnp.diag(jnp.array([1.0, 1.0, 1.2])), scene.law
+
+    def of(law: Law) -> tuple[float, float]:
+        """d2W/dF_xz^2 and the second Piola-Kirchhoff stress S_zz."""
+        P = jax.grad(law.energy)
+        return float(jax.jacfwd(P)(F0)[0, 2, 0, 2]), float(P(F0)[2, 2] / 1.2)
+
+    kept = lj.laws.NeoHookean(mu=MU, bulk=1e-9) if part == "isochoric" else law
+    (A, S), (whole, _) = of(kept), of(law)
+    m = modulus() / MU
+    C = m * (A - S) + 0.7 * S + (whole - A if part == "isochoric" else 0.0)
+    found = np.asarray(lj.harmonic(scene, FREQUENCIES, about=stretched(scene, 1.2)).check().displacement[:, :, 0])
+    exact = standing(np.asarray(scene.mesh.points)[:, 2], C)
+    assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
+    # Without the state the answer is another one.
+    assert np.abs(standing(np.asarray(scene.mesh.points)[:, 2], modulus()) - exact).max() > 0.1 * np.abs(exact).max()
+
+
+@pytest.mark.slow
+def test_a_run_in_time_comes_to_it():
+    """A compressed slab, at rest for long, is driven until it is steady: the error falls with dt^2."""
+    n, f, errors = 6, 100.0, []
+    for per_cycle in (32, 64):
+        dt, cycles = 1 / f / per_cycle, 40
+        at_rest = 10 * per_cycle  # as many steps, each 33 times the relaxation time in all
+        times = np.arange(at_rest + cycles * per_cycle + 1) * dt
+        after = np.maximum(times - at_rest * dt, 0.0)
+        wave = 1e-5 * np.sin(2 * np.pi * f * after) * np.minimum(after * f / 2, 1.0) ** 2
+        pull = np.minimum(times / (at_rest * dt / 4), 1.0)
+        scene = slab(n, 1)
+        z = np.asarray(scene.mesh.points)[:, 2]
+        ends = (
+            lj.Displaced(
+                nodes=scene.mesh.node_sets["z_min"], times=times, history=wave[:, None] * [1.0, 0, 0], axes="x"
+            ),
+            lj.Displaced(
+                nodes=jnp.arange(len(z)),
+                by=np.asarray(-0.1 * z[:, None] * [0, 0, 1.0]),
+                times=times,
+                history=pull,
+                axes="z",
+            ),
+        )
+        held = (lj.Fixed(nodes=jnp.arange(len(z)), axes="y"),)
+        solve = lj.Solve(kind="dynamic", integrator="newmark", dt=dt, steps=len(times) - 1, tolerance=1e-9)
+        run = lj.simulate(replace(scene, displaced=ends, fixed=held, solve=solve)).check()
+        last = np.asarray(run.positions[-per_cycle:, :, 0] - scene.mesh.points[None, :, 0])
+        phase = np.exp(-2j * np.pi * f * (times[-per_cycle:] - at_rest * dt))
+        amplitude = 2 / per_cycle * np.einsum("t,tv->v", phase, last) * 1j * 10
+        steady = replace(scene, displaced=(replace(scene.displaced[0], by=jnp.array([1e-4, 0, 0])),))
+        exact = np.asarray(
+            lj.harmonic(steady, [f], about=run.positions[at_rest - 1], mass="lumped").displacement[0, :, 0]
+        )
+        errors.append(np.abs(amplitude - exact).max() / np.abs(exact).max())
+    assert errors[1] < 0.02 and 1.7 < np.log2(errors[0] / errors[1]) < 2.3, errors
+
+
+def test_derivatives_in_both_modes_and_by_differences():
+    """By moduli of elements, the relaxation time and the density; differences have their floor at eps^(2/3)."""
+    scene = slab(4, 2)
+    E = scene.mesh.number_of_elements
+    rng = np.random.default_rng(3)
+    way = {"law.mu": MU * jnp.asarray(rng.uniform(0.5, 1, E)), "viscosity.relaxation_times": jnp.array([0.002])}
+    way["body.density"] = jnp.asarray(300.0)
+    at = {"law.mu": jnp.full(E, MU), "viscosity.relaxation_times": jnp.array([0.003]), "body.density": jnp.asarray(1e3)}
+    weights = jnp.asarray(rng.normal(size=(2, scene.mesh.number_of_nodes, 3)))
+
+    @jax.jit
+    def loss(values):
+        u = lj.harmonic(lj.with_parameters(scene, values), FREQUENCIES).displacement
+        return jnp.sum(weights * u.real + weights[::-1] * u.imag) * 1e4
+
+    gradient = jax.jit(jax.grad(loss))(at)
+    slope = sum(float(jnp.vdot(gradient[name], way[name])) for name in at)
+    _, forward = jax.jit(lambda v: jax.jvp(loss, (v,), (way,)))(at)
+    assert np.isclose(slope, forward, rtol=1e-10)
+
+    def moved(h):
+        return float(loss({name: at[name] + h * way[name] for name in at}))
+
+    errors = [abs((moved(h) - moved(-h)) / (2 * h) / slope - 1) for h in (1e-3, 1e-4, 1e-5)]
+    assert errors[0] / errors[1] > 50 and min(errors) < 1e-7
+
+
+def test_supports_and_regions_take_part():
+    """A stiff slab on springs is a mass on a spring: u = p A / (k A - omega^2 m) of a traction p."""
+    from liverjax.physics.elastic_support import ElasticSupport
+
+    mesh = lj.shapes.box((0.02, 0.02, 0.01), (2, 2, 1))
+    low, top = (jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets[s])) for s in ("z_min", "z_max"))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1e9, bulk=1e10),
+        body=lj.Body(density=1000.0),
+        fixed=(lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="xy"),),
+        traction=(lj.Traction(triangles=top, value=jnp.array([0.0, 0.0, 2.0])),),
+        physics=(ElasticSupport(triangles=low, normal=1e6),),
+    )
+    u = np.asarray(lj.harmonic(scene, FREQUENCIES).check().displacement[:, :, 2])
+    exact = 2.0 / (1e6 - (2 * np.pi * FREQUENCIES) ** 2 * 1000.0 * 0.01)
+    # The slab itself gives way by p h/(K + 4/3 mu), 2e-6 of it.
+    assert np.allclose(u, exact[:, None], rtol=1e-5)
+
+
+def test_an_undamped_resonance_is_told():
+    scene = replace(slab(2, 1), viscosity=None)
+    broken = replace(scene, law=lj.laws.NeoHookean(mu=jnp.nan, bulk=jnp.nan))
+    result = jax.jit(lambda s: lj.harmonic(s, [50.0]))(broken)
+    with pytest.raises(RuntimeError, match="50 Hz"):
+        result.check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"frequencies_Hz": [-1.0]}, "frequencies_Hz = .* above 0"),
+        ({"frequencies_Hz": []}, "frequencies_Hz"),
+        ({"factors": np.ones(5)}, "factors have shape"),
+        ({"motion": np.ones(3)}, "motion has shape"),
+        ({"about": np.ones(3)}, "about has shape"),
+        ({"mass": "none"}, "mass = 'none'"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, words):
+    with pytest.raises(lj.InputError, match=words):
+        lj.harmonic(**{"scene": slab(2, 1), "frequencies_Hz": FREQUENCIES} | changes)
+
+
+def test_physics_without_harmonic_motion_is_refused():
+    scene = slab(2, 1)
+    top = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
+    for change, words in (
+        ({"traction": (lj.Traction(triangles=top, pressure=1.0),)}, "follows the body"),
+        ({"solve": lj.Solve(volumetric="nodal")}, "volumetric = 'nodal'"),
+    ):
+        with pytest.raises(lj.InputError, match=words):
+            lj.harmonic(replace(scene, **change), FREQUENCIES)
