@@ -9,8 +9,8 @@ from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
 from fitting.fits import edges, models, viscoelastic
-from fitting.methods import consistency, generalised_maxwell
-from fitting.methods.consistency import runs_probability
+from fitting.methods import generalised_maxwell, kramers_kronig
+from fitting.methods.kramers_kronig import runs_probability
 from fitting.readers.rheometer import Sweep, read_sweep, some, within
 from liverjax import InputError
 
@@ -30,8 +30,8 @@ def material(seed: int, noise: float = 0.0, omega: np.ndarray = OMEGA) -> Sweep:
     return Sweep(omega, G.real * factor[0], G.imag * factor[1])
 
 
-def of_data(s: Sweep) -> consistency.Consistency:
-    return consistency.of_data(s, generalised_maxwell.spectrum(s))
+def of_data(s: Sweep) -> kramers_kronig.Consistency:
+    return kramers_kronig.of_data(s, generalised_maxwell.spectrum(s))
 
 
 @pytest.mark.parametrize("ups", [2, 4, 5])
@@ -47,7 +47,9 @@ def test_chances_of_runs_are_those_of_counting_every_order(ups):
 
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])
 def test_no_material_is_accused(noise):
-    accused = [bool(consistency.sentences(of_data(material(seed, noise)), material(seed, noise))) for seed in range(60)]
+    accused = [
+        bool(kramers_kronig.sentences(of_data(material(seed, noise)), material(seed, noise))) for seed in range(60)
+    ]
     # Four standard deviations, three bounds at 30 places: 0.3 % of sweeps by chance.
     assert sum(accused) <= 1
 
@@ -67,7 +69,7 @@ def test_the_inertia_of_the_instrument_is_named(sign):
         last = s.storage[-1]
         spoiled = s._replace(storage=s.storage + sign * 0.5 * last * (s.angular_frequency / 100) ** 2)
         found = of_data(spoiled)
-        told = consistency.sentences(found, spoiled)
+        told = kramers_kronig.sentences(found, spoiled)
         assert found.onset is not None and "mark of the instrument" in told[0], seed
         # what the sentence asks for keeps the last good point and mends the sweep
         limit = float(told[0].split("--max-frequency ")[1].split()[0])
@@ -78,7 +80,7 @@ def test_the_inertia_of_the_instrument_is_named(sign):
 def test_a_drift_is_called_one():
     s = material(3, 0.001)
     drifting = s._replace(storage=s.storage * np.linspace(1.6, 1.0, len(s.storage)))
-    told = consistency.sentences(of_data(drifting), drifting)
+    told = kramers_kronig.sentences(of_data(drifting), drifting)
     assert any("Kramers-Kronig" in t or "no material that relaxes" in t for t in told)
 
 
@@ -96,7 +98,7 @@ def test_measured_sweeps_are_judged_as_their_raw_torque_is():
 
 def test_structured_residuals_are_called_so():
     x = np.linspace(0, 1, 30)
-    numbers, told = consistency.structure(x, np.sin(6 * x), np.random.default_rng(0).standard_normal(30))
+    numbers, told = kramers_kronig.structure(x, np.sin(6 * x), np.random.default_rng(0).standard_normal(30))
     assert "structured misfit" in told[0] and "storage_modulus" in told[0] and "loss_modulus" not in told[0]
     assert numbers["storage_modulus"]["runs"] == 2 and numbers["loss_modulus"]["probability"] > 0.01
 

@@ -124,7 +124,7 @@ PROTOCOL = {
 }
 EVERYWHERE = {"__getattr__", "main", "_"}
 #: Names that several modules define nevertheless; a new one is to be named otherwise.
-MOST_HOMONYMS = 45
+MOST_HOMONYMS = 30
 
 
 def test_few_names_are_defined_in_several_modules():

@@ -6,7 +6,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, Fit
-from fitting.methods import consistency, generalised_maxwell, relaxation_spectrum, springpots
+from fitting.methods import generalised_maxwell, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts, levenberg_marquardt
 from fitting.readers.rheometer import Sweep, some
@@ -19,8 +19,8 @@ PARTS = ("without_first_half_decade", "without_last_half_decade")
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
     """The fit with what its ends decide, the structure of its residuals, and what the data say of themselves."""
     details, warnings = dict(fit.details), list(fit.warnings)
-    found = consistency.of_data(sweep, dense)
-    told = consistency.sentences(found, sweep)
+    found = kramers_kronig.of_data(sweep, dense)
+    told = kramers_kronig.sentences(found, sweep)
     details["consistency"] = {
         "kramers_kronig_misfit": found.misfit,
         "scatter": found.scatter if np.isfinite(found.scatter) else None,
@@ -28,7 +28,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         "instrument_above_Hz": None if found.onset is None else found.onset / (2 * np.pi),
     }
     if np.max(fit.relative_errors(sweep)) > viscoelastic.EXACT:
-        runs, structured = consistency.structure(
+        runs, structured = kramers_kronig.structure(
             sweep.angular_frequency, fit.storage - sweep.storage, fit.loss - sweep.loss
         )
         details["residuals"] = runs
@@ -86,7 +86,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         reference = springpots.reference_frequency(sweep)
-        starts = springpots.starts(part)
+        starts = springpots.starting_points(part)
         starts[-1, list(model.free)] = np.asarray(fit.solution.u)
         best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
         # The program is that of all points, some without weight: it is there already.

@@ -45,36 +45,36 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     """
     if sweep.inertia is None or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
-    value, error, refitted = _found(fit, sweep)
+    value, error, refitted = _error_of_inertia(fit, sweep)
     kept = sweep.angular_frequency < sweep.angular_frequency[-1] / HALF_DECADE * (1 - 1e-9)
     part: tuple[Any, Any] = (None, None)
     if len(np.unique(sweep.angular_frequency[kept])) > len(fit.solution.u) // 2 + 1:
         shorter = some(sweep, kept)
-        part = _found(viscoelastic.closed_form(shorter, fit.modes), shorter)[:2]
+        part = _error_of_inertia(viscoelastic.closed_form(shorter, fit.modes), shorter)[:2]
     found = InertiaError(value, error, *part)
-    details = fit.details | {"instrument": numbers(found)}
+    details = fit.details | {"instrument": as_numbers(found)}
     if not found.steady:
-        moved = "too few points are left to check it" if found.part is None else f"it is {_percent(found.part)} there"
+        moved = "too few points are left to check it" if found.part is None else f"it is {_share(found.part)} there"
         told = (
-            f"the instrument's inertia seems off by {_percent(value)} (standard error {_percent(error)}), but not "
+            f"the instrument's inertia seems off by {_share(value)} (standard error {_share(error)}), but not "
             f"without the last half decade ({moved}): the misfit of the model poses as inertia, so it is not corrected"
         )
         return fit._replace(details=details, warnings=(*fit.warnings, told)), sweep
     corrected = _shifted(sweep, value)
     note = (
-        f"the inertia that the instrument subtracted is taken to be off by {_percent(value)} (standard error "
-        f"{_percent(error)}, prior {_percent(raw_torque.UNCERTAINTY)}), and the storage moduli are corrected for it"
+        f"the inertia that the instrument subtracted is taken to be off by {_share(value)} (standard error "
+        f"{_share(error)}, prior {_share(raw_torque.UNCERTAINTY)}), and the storage moduli are corrected for it"
     )
     corrected = corrected._replace(notes=(*sweep.notes, note))
     spread = _with_direction(refitted, corrected, error)
     return refitted._replace(details=refitted.details | details, uncertainty=spread), corrected
 
 
-def _percent(value: float) -> str:
+def _share(value: float) -> str:
     return f"{100 * value:.2g} %"
 
 
-def numbers(found: InertiaError) -> dict[str, Any]:
+def as_numbers(found: InertiaError) -> dict[str, Any]:
     """The part `instrument` of fit.json."""
     return {
         "inertia_off_by": found.value,
@@ -85,7 +85,7 @@ def numbers(found: InertiaError) -> dict[str, Any]:
     }
 
 
-def _direction(sweep: Sweep) -> np.ndarray:
+def _residuals_per_error(sweep: Sweep) -> np.ndarray:
     """What an error of 1 does to the residuals (2n,)."""
     assert sweep.inertia is not None
     return np.concatenate([sweep.inertia, np.zeros(len(sweep.inertia))]) / np.concatenate(sweep.deviations)
@@ -96,14 +96,14 @@ def _shifted(sweep: Sweep, value: float) -> Sweep:
     return sweep._replace(storage=sweep.storage + value * sweep.inertia)
 
 
-def _found(fit: Fit, sweep: Sweep) -> tuple[float, float, Fit]:
+def _error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[float, float, Fit]:
     """The error of the inertia, its standard error, and the fit to the moduli that it corrects."""
     value = 0.0
     for _ in range(ROUNDS):
         here = _shifted(sweep, value)
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
         noise = max(fit.uncertainty.noise, 1e-12)
-        d = _direction(here)
+        d = _residuals_per_error(here)
         own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # what the modes cannot follow
         precision = own @ own / noise**2 + raw_torque.UNCERTAINTY**-2
         # The prior is of the whole error, the residuals are of what is left of it.
@@ -124,7 +124,7 @@ def _with_direction(fit: Fit, sweep: Sweep, error: float) -> Estimate:
     _, slope = host.with_jacobian(
         lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
     )
-    moved = slope @ np.linalg.lstsq(J, _direction(sweep), rcond=1e-12)[0]
+    moved = slope @ np.linalg.lstsq(J, _residuals_per_error(sweep), rcond=1e-12)[0]
     return _wider(fit.uncertainty, moved * error)
 
 

@@ -23,7 +23,7 @@ STRONG = 10.0
 
 def fractional(sweep: Sweep) -> list[Fit]:
     """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts; one program fits them all."""
-    reference, starts = springpots.reference_frequency(sweep), springpots.starts(sweep)
+    reference, starts = springpots.reference_frequency(sweep), springpots.starting_points(sweep)
     scaled = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
     out = []
@@ -234,7 +234,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
     ]
 
 
-def table(fit: Fit) -> list[str]:
+def comparison(fit: Fit) -> list[str]:
     """Lines on what the choice of a model rests on, best first; none where there was no choice."""
     rows = fit.details.get("models_compared", [])
     if len(rows) < 2:

@@ -12,7 +12,7 @@ import numpy as np
 import liverjax as lj
 from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
-from fitting.readers.displacements import Displacements, residuals
+from fitting.readers.displacements import Displacements, weighted_differences
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.scenes.scene import Scene, numbers_at
@@ -35,7 +35,7 @@ def misfit(problem: Problem, values: dict[str, Any], store: str | int = "all") -
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
-        parts.append(residuals(data, scene, result.positions))
+        parts.append(weighted_differences(data, scene, result.positions))
         codes.append(jnp.max(result.status))
     return jnp.concatenate(parts), jnp.stack(codes)
 
@@ -96,7 +96,10 @@ def missing(problem: Problem, values: dict[str, Any]) -> np.ndarray:
         scene = lj.with_parameters(scene, values)
         result = lj.simulate(scene, mesh_error=True)
         assert result.mesh_error is not None
-        both = (residuals(data, scene, x) for x in (result.positions + result.mesh_error.positions, result.positions))
+        both = (
+            weighted_differences(data, scene, x)
+            for x in (result.positions + result.mesh_error.positions, result.positions)
+        )
         more, less = (np.asarray(r) for r in both)
         rows.append(more - less)
     return np.concatenate(rows)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, Kind
-from fitting.methods import consistency, generalised_maxwell, time_response, uncertainty
+from fitting.methods import generalised_maxwell, kramers_kronig, time_response, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, levenberg_marquardt
@@ -225,8 +225,8 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
         if not low <= tau <= high:
             out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of the test")
     residuals = chosen.fitted - chosen.measured
-    runs, chance = consistency.runs_probability(np.sign(residuals))
-    if chance < consistency.CHANCE and chosen.relative_errors.max() > viscoelastic.EXACT:
+    runs, chance = kramers_kronig.runs_probability(np.sign(residuals))
+    if chance < kramers_kronig.CHANCE and chosen.relative_errors.max() > viscoelastic.EXACT:
         out.append(
             f"structured misfit: the residuals change sign {runs - 1} times over {len(residuals)} answers (by chance: "
             f"{chance:.1g}); the model misses something, or neighbouring answers share their noise"

@@ -143,7 +143,7 @@ def reference_frequency(sweep: Sweep) -> float:
     return float(np.sqrt(sweep.angular_frequency[0] * sweep.angular_frequency[-1]))
 
 
-def starts(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
+def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
     """Starting points (count, SIZE): two pots that cross inside or near the band, then spread around the data."""
     rng = np.random.default_rng(seed)
     size = np.log(np.hypot(sweep.storage, sweep.loss))

@@ -70,7 +70,7 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
 def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     try:
         data = file.read_bytes()
-        workbook.refuse(file, data, "the sheet of the curves")
+        workbook.refuse_workbook(file, data, "the sheet of the curves")
         text = data.decode("utf-8-sig")
     except IsADirectoryError:
         raise InputError(f"{file} is a folder: give a CSV file of curves") from None

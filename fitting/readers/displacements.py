@@ -74,7 +74,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     if "node" in table:
         nodes, weights = _at_nodes(path, mesh, table["node"])
     else:
-        nodes, weights = _at_points(path, mesh, scale * np.stack([table[c] for c in "xyz"], axis=1))
+        nodes, weights = _measured_at_points(path, mesh, scale * np.stack([table[c] for c in "xyz"], axis=1))
     return Displacements(
         step=_steps(path, scene, table.get("time"), n),
         nodes=nodes,
@@ -116,7 +116,7 @@ def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, 
     return np.repeat(node.astype(np.int32)[:, None], 4, axis=1), weights
 
 
-def _at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if not np.all(np.isfinite(points)):
         raise InputError(f"{path}: a place x,y,z is not finite: give the position at rest of every point")
     nodes, weights, outside = locate(mesh, points)
@@ -175,6 +175,6 @@ def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Ar
     return jnp.sum(data.weights[..., None] * corner, axis=1)
 
 
-def residuals(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
+def weighted_differences(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
     """Differences over the noise, flat (3 n,); 0 where nothing was measured."""
     return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()

@@ -38,7 +38,7 @@ class Share(NamedTuple):
     modulus: np.ndarray  # (n,) I omega^2 / K [Pa]
 
 
-def columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float]]:
+def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float]]:
     """Quantity -> place and factor to SI, of the headings that are known and have a known unit.
 
     Args:

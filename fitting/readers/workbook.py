@@ -45,7 +45,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
     return "\n".join(line for part in parts for line in part)
 
 
-def refuse(path: Path, data: bytes, wanted: str) -> None:
+def refuse_workbook(path: Path, data: bytes, wanted: str) -> None:
     """`InputError` where the bytes are a workbook and only text will do, saying to export `wanted` as CSV."""
     if is_one(data):
         raise InputError(f"{path} is a spreadsheet workbook, not text: open it, export {wanted} as CSV, and give that")

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fitting.methods.consistency import runs_probability
 from fitting.methods.contact_point import ContactFit
+from fitting.methods.kramers_kronig import runs_probability
 from fitting.readers.indentation_curves import IndentationCurve
 from fitting.reports.sweep_report import numbers
 from fitting.rigs.thin_layer import Indenter, half_space

@@ -55,8 +55,8 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },
-        "mesh_bias": _bias(u, n, u.mesh_bias),
-        "time_step_bias": _bias(u, n, u.time_step_bias),
+        "mesh_bias": _bias_by_name(u, n, u.mesh_bias),
+        "time_step_bias": _bias_by_name(u, n, u.time_step_bias),
         **_own(fit),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
@@ -71,7 +71,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def _bias(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, Any] | None:
+def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, Any] | None:
     """By the names of `standard_errors`; null where it is not known."""
     if moved is None:
         return None
@@ -323,7 +323,7 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
     width = max(len(r) for r in columns[0]) + 3
     rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
     decided = [MARK] if any(edges.moved(fit) for fit in fits) else []
-    return "\n".join([*rows, *decided, *_agreement(fits), *models.table(fits[0])])
+    return "\n".join([*rows, *decided, *_agreement(fits), *models.comparison(fits[0])])
 
 
 def _agreement(fits: list[Fit]) -> list[str]:

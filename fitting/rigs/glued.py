@@ -98,7 +98,7 @@ def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
             "cell_size, then it is whole"
         )
     scene = replace(rig.scene, law=law, viscosity=prony)
-    most = STIFFEST.get(automatic.volumetric(scene))
+    most = STIFFEST.get(automatic.form_of_volumes(scene))
     ratio = _ratio(law)
     if not rig.whole and most is not None and ratio is not None and ratio > most * (1 + 1e-9):
         warnings.warn(

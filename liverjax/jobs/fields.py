@@ -44,7 +44,7 @@ def check(names: list[str], scene: Scene) -> None:
             raise InputError(f"[output] fields: {name!r} is not known: {hint(name, FIELDS)}")
     if "fluid_velocity" in names and scene.porosity is None:
         raise InputError("[output] fields: fluid_velocity needs [porosity]: leave it out")
-    if automatic.volumetric(scene) == "mixed" and "cauchy_stress" in names:
+    if automatic.form_of_volumes(scene) == "mixed" and "cauchy_stress" in names:
         raise InputError(
             "[output] fields: cauchy_stress lacks the pressures of volumetric = 'mixed', which no result keeps: take "
             "'element' or 'nodal', or leave it out"

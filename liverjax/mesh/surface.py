@@ -63,7 +63,7 @@ def pressure_forces(triangles: jax.Array, x: jax.Array, mesh: TetMesh | None = N
     return jnp.zeros_like(x).at[nodes].add(own)
 
 
-def slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """Weights (Q,) of points on a triangle; slopes (2, Q, n) of its functions towards its second and third vertex."""
     if mesh.order == 1:
         return np.ones(1), np.array([[[-1.0, 1.0, 0.0]], [[-1.0, 0.0, 1.0]]])
@@ -71,7 +71,7 @@ def slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     return weights, np.swapaxes(np.stack(_quadratic(l)[1]), 1, 2)
 
 
-def functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
+def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
     """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q)."""
     return l if mesh.order == 1 else _quadratic(l)[0]
 

@@ -64,7 +64,7 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, toleran
     return Flow(A, store, mask, slow, low, high, tolerance)
 
 
-def load(flow: Flow, b: jax.Array) -> jax.Array:
+def right_side(flow: Flow, b: jax.Array) -> jax.Array:
     """The part of b (V,) that the free pressures answer for: with what enters, without what given pressures take."""
     if flow.enters is not None:
         b = b + flow.enters
@@ -73,7 +73,7 @@ def load(flow: Flow, b: jax.Array) -> jax.Array:
 
 def with_given(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     """All pressures (V,) [Pa], those that are given among them."""
-    P = solved(mesh, flow, load(flow, b))
+    P = solved(mesh, flow, right_side(flow, b))
     return P if flow.given is None else P + flow.given
 
 

@@ -203,7 +203,7 @@ def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_
     P = pressure(porosity, mesh, fluid, flow, J_end)
     if flow.given is None:
         return 0.5 * jnp.vdot(flow.mask * b, P)
-    return 0.5 * jnp.vdot(darcy.load(flow, b), P) + jnp.vdot(flow.given, b)
+    return 0.5 * jnp.vdot(darcy.right_side(flow, b), P) + jnp.vdot(flow.given, b)
 
 
 def first_piola(porosity: Porosity, mesh: TetMesh, P: jax.Array, F: Matrix) -> Matrix:

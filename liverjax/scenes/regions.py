@@ -22,7 +22,7 @@ class Region:
     law: dict[str, Any] = param("1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values")
 
 
-def select(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
+def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
     """Numbers of the elements of a set, or of those whose four nodes satisfy `where` (see `boundary.select`).
 
     Raises:
@@ -65,10 +65,10 @@ def check(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Non
             raise InputError(f"region.{k} names elements outside 0 to {number_of_elements - 1}: renumber them")
         if not region.law:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
-    check_numbers(law, regions)
+    check_regions(law, regions)
 
 
-def check_numbers(law: Law, regions: tuple[Region, ...]) -> None:
+def check_regions(law: Law, regions: tuple[Region, ...]) -> None:
     """Refuse numbers of regions that their law does not allow; traced ones pass.
 
     Raises:

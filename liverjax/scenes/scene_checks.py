@@ -109,7 +109,7 @@ def check_bounds(scene: Scene) -> None:
     bounds.check(scene, leave=("mesh", "physics"))
     for name, physics in _named_physics(scene):
         bounds.check(physics, name)
-    regions.check_numbers(scene.law, scene.region)
+    regions.check_regions(scene.law, scene.region)
 
 
 def check_numbers(scene: Scene) -> None:

@@ -99,12 +99,12 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
         region=tuple(_region(mesh, k, t) for k, t in enumerate(_tables(content, "region"))),
         viscosity=prony,
         porosity=_section(content, "porosity", lambda table: _porosity(mesh, table)),
-        body=_section(content, "body", _body),
+        body=_section(content, "body", _read_body),
         fixed=tuple(_fixed(mesh, k, t) for k, t in enumerate(_tables(content, "fixed"))),
         displaced=tuple(_displaced(mesh, k, t) for k, t in enumerate(_tables(content, "displaced"))),
         traction=tuple(_traction(mesh, k, t) for k, t in enumerate(_tables(content, "traction"))),
         physics=tuple(_physics(mesh, content)),
-        solve=_solve(_table("solve", content.get("solve", {}))),
+        solve=_read_solve(_table("solve", content.get("solve", {}))),
     )
     check_scene(scene)
     return scene
@@ -246,7 +246,7 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
         raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
     if not isinstance(given, dict) or not given:
         raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
-    elements = regions.select(mesh, where, table.get("set"), name)
+    elements = regions.select_elements(mesh, where, table.get("set"), name)
     return Region(elements=jnp.asarray(elements, jnp.int32), law=dict(_dotted(f"{name} law", given)))
 
 
@@ -318,7 +318,7 @@ def _drained(mesh: Any, given: Any) -> jax.Array:
     return jnp.asarray(np.unique(np.concatenate(nodes)))
 
 
-def _body(table: dict) -> Body:
+def _read_body(table: dict) -> Body:
     if "density" not in table:
         raise InputError("[body] needs density in kg/m^3: give e.g. density = 1060.0")
     gravity = _numbers("[body] gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3)
@@ -379,7 +379,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     return Traction(triangles=triangles, value=value, **given)
 
 
-def _solve(table: dict) -> Solve:
+def _read_solve(table: dict) -> Solve:
     values = dict(table)
     for key, allowed in CHOICES.items():
         if key in values and values[key] not in allowed:

@@ -37,7 +37,7 @@ def linear_solver(scene: Scene) -> str:
     return "direct" if stiff or thinnest(points, np.asarray(mesh.tetrahedra), volumes) < THINNEST else "cg"
 
 
-def volumetric(scene: Scene) -> str:
+def form_of_volumes(scene: Scene) -> str:
     """The form for volume changes: mixed for quadratic elements where it can be, else element.
 
     Looks at no numbers: a run and its derivatives must be of one form.

@@ -86,7 +86,7 @@ def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshEr
     volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
     solve = replace(rich.solve, linear_solver="cg", robust="off", volumetric=volumetric)
     rich = replace(rich, law=rich.mesh.at_points(rich.law), solve=solve)
-    rich = replace(rich, solve=replace(solve, volumetric=automatic.volumetric(rich)))
+    rich = replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
     return _estimate(scene, rich, positions, reactions)
 
 

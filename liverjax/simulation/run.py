@@ -187,7 +187,7 @@ def prepared(scene: Scene) -> Scene:
         per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
         scene = replace(scene, law=per_element, region=())
     scene = replace(scene, law=scene.mesh.at_points(scene.law))
-    scene = replace(scene, solve=replace(scene.solve, volumetric=automatic.volumetric(scene)))
+    scene = replace(scene, solve=replace(scene.solve, volumetric=automatic.form_of_volumes(scene)))
     if scene.solve.linear_solver == "auto":
         scene = replace(scene, solve=replace(scene.solve, linear_solver=automatic.linear_solver(scene)))
     if scene.solve.precision == "float32":

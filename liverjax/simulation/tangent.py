@@ -22,7 +22,12 @@ from liverjax.simulation.equations import Equations
 from liverjax.solvers import attached, block_matrix, direct, point_matrix
 from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block, BlockMatrix
-from liverjax.solvers.krylov import conjugate_gradients, refined, stabilised_biconjugate_gradients, true_residual
+from liverjax.solvers.krylov import (
+    conjugate_gradients,
+    stabilised_biconjugate_gradients,
+    true_residual,
+    with_true_residual,
+)
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.solvers.preconditioner import Coarse, coarse, corrected, worthwhile
 from liverjax.tensors.matrices import (
@@ -332,4 +337,4 @@ def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iteratio
     def nearly(r: jax.Array, tolerance: Any) -> jax.Array:
         return solve(e, K, r, tolerance, max_iterations)[0]
 
-    return refined(nearly, tolerance, product(e, K, exactly=True), b)
+    return with_true_residual(nearly, tolerance, product(e, K, exactly=True), b)

@@ -95,7 +95,7 @@ def _solve(*given: Any) -> np.ndarray:
         more = [a.ravel() for a in np.broadcast_arrays(*entry)]
         values, lines, columns = [*values, more[0]], [*lines, more[1]], [*columns, more[2]]
     A = scipy.sparse.coo_array((np.concatenate(values), (np.concatenate(lines), np.concatenate(columns))))
-    return _factorised(A.tocsr(), free.ravel(), b.ravel(), normals, abs(diagonal[0, 0]).mean()).reshape(m, n)
+    return _one_solution(A.tocsr(), free.ravel(), b.ravel(), normals, abs(diagonal[0, 0]).mean()).reshape(m, n)
 
 
 def _solve_points(order: int, *given: Any) -> np.ndarray:
@@ -130,11 +130,11 @@ def _solve_points(order: int, *given: Any) -> np.ndarray:
     parts = [[a.ravel() for a in np.broadcast_arrays(*entry)] for entry in entries]
     values, lines, columns = (np.concatenate(a) for a in zip(*parts, strict=True))
     A = scipy.sparse.coo_array((values, (lines, columns)), shape=(len(known), len(known))).tocsr()
-    x = _factorised(A, known, load, normals, abs(element[0, 0]).mean())
+    x = _one_solution(A, known, load, normals, abs(element[0, 0]).mean())
     return x[: 3 * n].reshape(3, n).astype(b.dtype)
 
 
-def _factorised(A: Any, free: np.ndarray, b: np.ndarray, normals: Any, mean: float) -> np.ndarray:
+def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, normals: Any, mean: float) -> np.ndarray:
     """Solution (n,) of A x = b where `free` (n,) is not 0; `mean` stands for A along the normals."""
     import scipy.sparse.linalg
 

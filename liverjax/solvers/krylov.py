@@ -167,7 +167,7 @@ def differentiable_solve(
 _INNER, _REFINEMENTS = 5e-2, 60
 
 
-def refined(
+def with_true_residual(
     nearly: Callable[[jax.Array, Any], jax.Array],
     tolerance: Any,
     matvec: Callable[[jax.Array], jax.Array],

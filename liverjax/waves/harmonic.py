@@ -17,7 +17,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
 from liverjax.waves import sparse
-from liverjax.waves.operator import Operator, applied, operator
+from liverjax.waves.operator import Operator, forces_of_motion, operator
 
 MASSES = ("consistent", "lumped")
 
@@ -104,9 +104,9 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
     A = _operator(scene, about, mass)
     held = (1 - A.free.mask)[None] * motion
     load = jnp.asarray(nodal_tractions(scene.mesh, scene.traction), complex)[None]
-    forced = jax.lax.map(lambda one: applied(A, one[0], one[1], one[2]), (*at, held))
-    u = held + sparse.solve(A, *at, load - forced)
-    f = jax.lax.map(lambda one: applied(A, one[0], one[1], one[2]), (*at, u)) - load
+    forced = jax.lax.map(lambda one: forces_of_motion(A, one[0], one[1], one[2]), (*at, held))
+    u = held + sparse.motions(A, *at, load - forced)
+    f = jax.lax.map(lambda one: forces_of_motion(A, one[0], one[1], one[2]), (*at, u)) - load
     out = jax.vmap(A.free.vectors)(f)
     size = jnp.linalg.norm(f - out, axis=(1, 2)) + jnp.linalg.norm(load, axis=(1, 2))
     residual = jnp.linalg.norm(out, axis=(1, 2)) / jnp.where(size > 0, size, 1.0)

@@ -136,7 +136,7 @@ def _products(order: int) -> np.ndarray:
     return np.array([[integral(f, g) for g in functions] for f in functions])
 
 
-def applied(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.Array:
+def forces_of_motion(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.Array:
     """(K - omega^2 M) u, (V, 3) complex [N], for a motion u (V, 3); `factor` is m at omega [rad/s], () or (E,)."""
     own = u[A.nodes]  # (n, E, 3)
     factor = jnp.asarray(factor)

@@ -10,10 +10,10 @@ import jax
 import numpy as np
 
 from liverjax.solvers.direct import across
-from liverjax.waves.operator import Operator, applied
+from liverjax.waves.operator import Operator, forces_of_motion
 
 
-def solve(A: Operator, factors: jax.Array, omegas: jax.Array, b: jax.Array) -> jax.Array:
+def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: jax.Array) -> jax.Array:
     """Free motions u (F, V, 3) complex [m] with P A P u = P b, where P leaves what is free; 0 where it is not.
 
     Args:
@@ -39,14 +39,14 @@ def solve(A: Operator, factors: jax.Array, omegas: jax.Array, b: jax.Array) -> j
 
 
 def _all(A: Operator, factors: jax.Array, omegas: jax.Array, u: jax.Array) -> jax.Array:
-    """`applied` at every frequency, one after the other: element matrices are read once each."""
-    return jax.lax.map(lambda at: applied(A, *at), (factors, omegas, u))
+    """`forces_of_motion` at every frequency, one after the other: element matrices are read once each."""
+    return jax.lax.map(lambda at: forces_of_motion(A, *at), (factors, omegas, u))
 
 
 def _host(*given: Any) -> np.ndarray:
     A, factors, omegas, b = jax.tree.map(np.asarray, given)
     V = b.shape[1]
-    parts, lines, columns = _entries(A, V)
+    parts, lines, columns = _places(A, V)
     keep = np.flatnonzero(A.free.mask.T)
     N = None if A.free.normals is None else across(A.free.normals, 3 * V)
     u = np.zeros((len(b), 3 * V), b.dtype)
@@ -56,14 +56,14 @@ def _host(*given: Any) -> np.ndarray:
     return np.swapaxes(u.reshape(len(b), 3, V), 1, 2)
 
 
-def _entries(A: Operator, V: int) -> tuple[list, np.ndarray, np.ndarray]:
+def _places(A: Operator, V: int) -> tuple[list, np.ndarray, np.ndarray]:
     """Parts of the values as functions of m and omega, lines and columns; all x of the nodes come first."""
     n = len(A.nodes)
     at = np.asarray(A.nodes)[:, None] + V * np.arange(3)[None, :, None]  # (n, 3, E)
     square = np.broadcast_arrays(at[:, :, None, None], at[None, None])
     places = [[a.ravel() for a in square]]
     rest = 0.0 if A.rest is None else A.rest
-    mass = 0.0
+    mass: Any = 0.0
     if A.mass is not None and A.mass.ndim == 3:
         mass = A.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
     parts: list = [lambda m, w: (m * A.relaxing + rest - w**2 * mass).reshape(-1)]

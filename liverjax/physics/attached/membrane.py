@@ -82,14 +82,14 @@ class Stretched(Elements):
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
         """Of two unit vectors in the plane of the reference triangle."""
-        _, along = surface.slopes(mesh)
+        _, along = surface.triangle_slopes(mesh)
         r11, r12, r22 = (r[None, None] for r in self._edges(mesh))
         first, second = (jnp.asarray(a.T, r11.dtype)[:, :, None] for a in along)
         return jnp.stack([first / r11, (second - r12 / r11 * first) / r22])
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
         """Thickness times area times energy density."""
-        weights, _ = surface.slopes(mesh)
+        weights, _ = surface.triangle_slopes(mesh)
         r11, _, r22 = self._edges(mesh)
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
         W = layers.in_plane_energy(law, C, self.solved is not None)

@@ -194,7 +194,7 @@ def _touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
 
 def _at_points(mesh: TetMesh, dtype: Any) -> jax.Array:
     """Of a triangle's nodes at its points (n, Q)."""
-    return jnp.asarray(surface.functions(mesh, _POINTS), dtype)
+    return jnp.asarray(surface.triangle_functions(mesh, _POINTS), dtype)
 
 
 def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:

@@ -43,11 +43,11 @@ def distance(shape: str, y: list[jax.Array], axis: Any, radius: Any, half_angle:
     if shape == "sphere":
         return _round(y, radius)
     if shape == "cylinder":
-        return _round(_across(y, axis), radius, axis)
+        return _round(_normal_to(y, axis), radius, axis)
     return _cone(y, axis, radius, half_angle)
 
 
-def _across(y: list[jax.Array], axis: Any) -> list[jax.Array]:
+def _normal_to(y: list[jax.Array], axis: Any) -> list[jax.Array]:
     """The part of y normal to the axis."""
     along = sum(a * c for a, c in zip(axis, y, strict=True))
     return [c - along * a for a, c in zip(axis, y, strict=True)]
@@ -70,7 +70,7 @@ def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Any) -> Distan
     along, tip, side = (
         sum(a * v for a, v in zip(axis, y, strict=True)),
         _round(y, radius),
-        _round(_across(y, axis), 0.0, axis),
+        _round(_normal_to(y, axis), 0.0, axis),
     )
     lateral = Distance(
         c * side.value - s * along - radius,
