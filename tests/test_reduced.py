@@ -1,11 +1,13 @@
 """Reduced models: the full model in other coordinates, their structure, their error, and what they refuse."""
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
 from liverjax.reduced.sampling import nonnegative_weights
@@ -144,3 +146,53 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
         lj.load_reduced(tmp_path / "none.h5")
     with pytest.raises(lj.InputError, match="between 0 and 1"):
         lj.reduce_scene(scene, {"law.mu": [800.0]}, tolerance=2.0)
+
+
+SCENE = """
+[mesh]
+shape = "box"
+size = [0.03, 0.01, 0.01]
+cells = [3, 1, 1]
+
+[law]
+name = "neo_hookean"
+mu = 800.0
+bulk = 3000.0
+
+[body]
+density = 1000.0
+gravity = [0.0, 0.0, -1.0]
+
+[[fixed]]
+where = {x_max = 0.0}
+
+[solve]
+"""
+
+
+def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "rows.csv").write_text("law.mu,body.gravity.2\n700,-1.2\n900,-0.8\n800,-0.4\n800,-1.0\n")
+    model = ["--out", str(tmp_path / "model.h5")]
+    assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "rows.csv"), *model, "--modes", "3"]) == 0
+    found = {}
+    for name, lines in (("full", ""), ("used", 'reduced = "model.h5"'), ("refused", REFUSED)):
+        (tmp_path / f"{name}.toml").write_text(SCENE + lines)
+        assert main(["simulate", str(tmp_path / f"{name}.toml"), "--out", str(tmp_path / name)]) == 0
+        said = capsys.readouterr().out
+        assert ("estimated error" in said) == (name != "full") and ("the full model runs" in said) == (
+            name == "refused"
+        )
+        with h5py.File(tmp_path / name / "result.h5") as file:
+            found[name] = file["positions"][()], file["reactions"][()].sum(axis=(0, 1))
+    assert np.array_equal(found["full"][0], found["refused"][0])
+    moved = np.abs(found["full"][0] - found["full"][0][0, :1]).max()
+    assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
+    # The weight hangs on the held nodes, whichever model: 3 g of tissue.
+    assert np.allclose(found["full"][1], [0, 0, 3e-3], rtol=0, atol=1e-9)
+
+
+REFUSED = """
+reduced = "model.h5"
+reduced_tolerance = 1e-9
+"""

@@ -45,7 +45,9 @@ def run(options: argparse.Namespace) -> int:
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
     report = None if bar.disable else lambda _: bar.update()
     try:
-        ran = long_run.run(scene, text, target, options.every, options.resume, report)
+        ran, scene = _reduced(scene)
+        if ran is None:
+            ran = long_run.run(scene, text, target, options.every, options.resume, report)
     except OSError as error:
         print(f"stopped: {target}: {error.strerror}; go on with --resume when there is space", file=sys.stderr)
         return 1
@@ -83,6 +85,18 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
         names = list(dict.fromkeys([*names, *options.fields.split(",")]))
     fields.check(names, scene)
     return names, reactions or options.reactions
+
+
+def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
+    """The run of a scene that names a reduced model, or None where the full model has to run; and the scene without."""
+    if not scene.solve.reduced:
+        return None, scene
+    from liverjax.core.struct import replace
+    from liverjax.jobs import reduction
+
+    ran, said = reduction.tried(scene)
+    print(said)
+    return ran, replace(scene, solve=replace(scene.solve, reduced=""))
 
 
 def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":

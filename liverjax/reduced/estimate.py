@@ -50,27 +50,28 @@ class _Body(NamedTuple):
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
-    """The result with its estimated error (T,) [m]; host side, beside the run of one scene.
+    """The result with its estimated error (T,) [m] and reactions (T, V, 3) [N]; host side, beside the run of one scene.
 
     Args:
         model, scene, result: as of `simulate_reduced`.
     """
     own = prepared(scene)
-    residuals = np.asarray(_out_of_balance(own, reduced_positions(model, scene, result)))
-    e = _errors(own, residuals)
-    return replace(result, error=jnp.asarray(np.linalg.norm(e, axis=-1).max(axis=1)))
+    residuals, reactions = _out_of_balance(own, reduced_positions(model, scene, result))
+    e = _errors(own, np.asarray(residuals))
+    return replace(result, error=jnp.asarray(np.linalg.norm(e, axis=-1).max(axis=1)), reactions=reactions)
 
 
 @jax.jit
-def _out_of_balance(scene: Scene, x: jax.Array) -> jax.Array:
-    """Out-of-balance forces (T, V, 3) [N] of the full model along given positions (T, V, 3)."""
+def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Out-of-balance forces and reactions (T, V, 3) [N] of the full model along given positions (T, V, 3)."""
     sizes = force_sizes(scene)
 
-    def advance(state: State, given: tuple) -> tuple[State, jax.Array]:
+    def advance(state: State, given: tuple) -> tuple[State, tuple[jax.Array, jax.Array]]:
         k, own = given
         e = equations(scene, state, k, sizes)
         f = forces(e, unknowns(e, own), jnp.ones((), own.dtype))
-        return advanced(e, End(f.x, f.F, f.pressure)), e.free.vectors(f.total, f.x)
+        r = e.free.vectors(f.total, f.x)
+        return advanced(e, End(f.x, f.F, f.pressure)), (r, f.total - r)
 
     numbers = jnp.arange(1, len(x) + 1, dtype=x.dtype)
     return jax.lax.scan(advance, initial_state(scene), (numbers, x))[1]

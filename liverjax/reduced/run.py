@@ -40,6 +40,7 @@ class ReducedResult:
     error: jax.Array | None = param(
         "m", "(T,) estimated largest distance of a node from the full model, where asked for", default=None
     )
+    reactions: jax.Array | None = param("N", "(T, V, 3) as of the full model, where error is", default=None)
 
 
 class ReducedMotion(NamedTuple):

@@ -58,6 +58,10 @@ class Solve:
     robust: str = static(
         default="off", about="projected or regularised: make the energy least where a step cannot be followed"
     )
+    reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
+    reduced_tolerance: Any = param(
+        "1", "estimated error over the largest displacement, above which the full model runs", above=0.0, default=0.01
+    )
 
 
 @struct

@@ -138,13 +138,15 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 
 
 def _with_paths(content: Any, folder: Path) -> Any:
-    """With files of histories relative to the folder of the scene file."""
+    """With files of histories and of a reduced model relative to the folder of the scene file."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):
         return content
     return {
-        key: str(folder / value) if key == "history" and isinstance(value, str) else _with_paths(value, folder)
+        key: str(folder / value)
+        if key in ("history", "reduced") and isinstance(value, str)
+        else _with_paths(value, folder)
         for key, value in content.items()
     }
 
@@ -384,5 +386,9 @@ def _read_solve(table: dict) -> Solve:
     for key, allowed in CHOICES.items():
         if key in values and values[key] not in allowed:
             raise InputError(f"[solve] {key} = {values[key]!r} is not known: use {' or '.join(allowed)}")
-    values |= {key: _number(f"[solve] {key}", values[key]) for key in ("dt", "tolerance") if key in values}
+    values |= {
+        key: _number(f"[solve] {key}", values[key]) for key in ("dt", "tolerance", "reduced_tolerance") if key in values
+    }
+    if not isinstance(values.get("reduced", ""), str):
+        raise InputError(f'[solve] reduced = {values["reduced"]!r} is no file: write reduced = "model.h5"')
     return Solve(**values)

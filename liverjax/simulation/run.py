@@ -181,6 +181,12 @@ def prepared(scene: Scene) -> Scene:
     """
     check_choices(scene)
     check_bounds(scene)
+    if scene.solve.reduced:
+        file = scene.solve.reduced
+        raise InputError(
+            f"[solve] reduced = {file!r} is for python -m liverjax simulate: in Python leave it out and call "
+            "lj.simulate_reduced(lj.load_reduced(file), scene)"
+        )
     if scene.solve.newton_iterations == 1:
         scene = replace(scene, solve=replace(scene.solve, newton="one_step"))
     if scene.region:

@@ -1,0 +1,31 @@
+"""``liverjax reduce SCENE.toml ROWS.csv``: a reduced model of a scene from full runs of a table's rows."""
+
+import argparse
+from pathlib import Path
+
+
+def add(parsers: argparse._SubParsersAction) -> None:
+    """Declare the command."""
+    command = parsers.add_parser(
+        "reduce",
+        help="make a reduced model of a scene from runs of a table's rows",
+        description="Run a scene for every row of a table, and make a reduced model from these runs.",
+    )
+    command.add_argument("scene", type=Path, metavar="SCENE.toml")
+    command.add_argument("rows", type=Path, metavar="ROWS.csv", help="a header of dotted names, one row a run")
+    command.add_argument("--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="the model (model.h5)")
+    command.add_argument(
+        "--tolerance", type=float, default=1e-3, metavar="X", help="part of the motions that may be left out (1e-3)"
+    )
+    command.add_argument("--modes", type=int, default=40, metavar="N", help="the most modes (40)")
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Make the model and write it."""
+    from liverjax.jobs import reduction
+
+    model = reduction.make(options.scene, options.rows, options.out, options.tolerance, options.modes)
+    print(f"{model.number_of_modes} modes, {len(model.points)} points\nwritten: {options.out}")
+    print(f'to use it: [solve] reduced = "{options.out}"')
+    return 0

@@ -1,0 +1,83 @@
+"""Reduced models of scene files: made from a table of rows, and run in place of the full model while they are right."""
+
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.jobs.long_run import Ran
+from liverjax.jobs.sweep import read_sweep
+from liverjax.reduced.estimate import reduced_error
+from liverjax.reduced.files import load_reduced, save_reduced
+from liverjax.reduced.model import ReducedModel
+from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced
+from liverjax.reduced.training import reduce_scene
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.run import Result
+from liverjax.solvers.problem import StepStatistics
+
+
+class Tried(NamedTuple):
+    """A run of a scene by its reduced model."""
+
+    ran: Ran | None  # None: the estimated error is above the tolerance, or a step failed
+    sentence: str  # what came out
+
+
+def make(scene_file: Path, rows_file: Path, out: Path, tolerance: float, modes: int) -> ReducedModel:
+    """Run the rows of a table with the full model and write the reduced model made from them.
+
+    Raises:
+        InputError: an unusable scene, table, tolerance or output.
+    """
+    if modes < 1:
+        raise InputError(f"--modes {modes} must be above 0: give e.g. 40")
+    if not out.parent.is_dir():
+        raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
+    table = read_sweep(scene_file, rows_file)
+    scene = replace(table.scene, solve=replace(table.scene.solve, reduced=""))
+    rows = {name: table.rows[:, k] for k, name in enumerate(table.names)}
+    model = reduce_scene(scene, rows, tolerance, modes)
+    save_reduced(model, out, scene_file.read_text(encoding="utf-8"))
+    return model
+
+
+def tried(scene: Scene) -> Tried:
+    """The run of a scene that names a reduced model in [solve], with its estimated error.
+
+    Raises:
+        InputError: no such model, or one of another scene.
+    """
+    solve = scene.solve
+    model, plain = load_reduced(solve.reduced), replace(scene, solve=replace(solve, reduced=""))
+    begin = time.perf_counter()
+    first = jax.block_until_ready(simulate_reduced(model, plain))
+    again = time.perf_counter()
+    found = jax.block_until_ready(simulate_reduced(model, plain))
+    run_time = time.perf_counter() - again
+    x, found = reduced_positions(model, plain, found), reduced_error(model, plain, found)
+    error = np.asarray(found.error)
+    moved = float(np.linalg.norm(np.asarray(x) - np.asarray(scene.mesh.points), axis=-1).max())
+    said = (
+        f"reduced model: {model.number_of_modes} modes, {len(model.points)} of {scene.mesh.weights.size} points; "
+        f"estimated error {error.max():.2g} m, {error.max() / moved:.2%} of the largest displacement"
+    )
+    if np.any(np.asarray(first.status)) or not error.max() <= solve.reduced_tolerance * moved:
+        limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
+        return Tried(None, f"{said}: above {limit}, or a step failed, so the full model runs")
+    ran = Ran(_as_result(found, x), len(found.times), run_time, again - begin - run_time)
+    return Tried(ran, said)
+
+
+def _as_result(found: ReducedResult, x: jax.Array) -> Result:
+    zeros = jnp.zeros(len(found.times), jnp.int32)
+    values = {"iterations": found.iterations, "residual": found.residual, "status": found.status}
+    took = StepStatistics(**{name: values.get(name, zeros) for name in StepStatistics._fields})
+    assert found.reactions is not None
+    result = Result(times=found.times, positions=x, reactions=found.reactions, status=found.status, statistics=took)
+    return jax.tree.map(np.asarray, result)
