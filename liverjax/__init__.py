@@ -46,6 +46,7 @@ from liverjax.simulation.gradients import Gradient, value_and_gradient
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result, simulate
 from liverjax.waves.harmonic import Harmonic, harmonic
+from liverjax.waves.mesh_error import harmonic_mesh_error
 
 __version__ = "0.1.0"
 
@@ -73,6 +74,7 @@ __all__ = [
     "check_mesh",
     "check_scene",
     "harmonic",
+    "harmonic_mesh_error",
     "laws",
     "load_reduced",
     "load_scene",

@@ -1,11 +1,14 @@
 """Harmonic motion: against waves in closed form, against runs in time, and its derivatives."""
 
+import h5py
 import jax
 import jax.numpy as jnp
+import meshio
 import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 
@@ -168,6 +171,19 @@ def test_a_run_in_time_comes_to_it():
     assert errors[1] < 0.02 and 1.7 < np.log2(errors[0] / errors[1]) < 2.3, errors
 
 
+@pytest.mark.parametrize(("order", "n"), [(1, 20), (2, 10)])
+def test_the_error_of_the_mesh(order, n):
+    """It is what the closed form says, within a tenth: 18 % and 1.2 % of the motion."""
+    scene = slab(n, order)
+    found = lj.harmonic(scene, FREQUENCIES)
+    estimate = np.asarray(lj.harmonic_mesh_error(scene, found))[:, :, 0]
+    exact = standing(np.asarray(scene.mesh.points)[:, 2], modulus())
+    missing = exact - np.asarray(found.displacement)[:, :, 0]
+    assert np.all(np.linalg.norm(estimate - missing, axis=1) < 0.1 * np.linalg.norm(missing, axis=1))
+    with pytest.raises(lj.InputError, match="nodes"):
+        lj.harmonic_mesh_error(slab(2, 1), found)
+
+
 def test_derivatives_in_both_modes_and_by_differences():
     """By moduli of elements, the relaxation time and the density; differences have their floor at eps^(2/3)."""
     scene = slab(4, 2)
@@ -237,6 +253,74 @@ def test_an_undamped_resonance_is_told():
 def test_what_cannot_be_is_refused(changes, words):
     with pytest.raises(lj.InputError, match=words):
         lj.harmonic(**{"scene": slab(2, 1), "frequencies_Hz": FREQUENCIES} | changes)
+
+
+FILE = """
+[mesh]
+shape = "box"
+size = [0.03, 0.01, 0.01]
+cells = [3, 1, 1]
+[law]
+name = "neo_hookean"
+mu = 3000.0
+bulk = 30000.0
+[body]
+density = 1000.0
+[[displaced]]
+where = {x_max = 0.0}
+by = [0.0, 1e-5, 0.0]
+[solve]
+kind = "harmonic"
+"""
+
+
+def test_scene_files(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE + "frequencies_Hz = [40.0, 60.0]\n")
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["simulate", str(scene), *out, "--vtu", "--mesh-error"]) == 0
+    assert "60 Hz: at most" in capsys.readouterr().out
+    expected = lj.harmonic(lj.load_scene(scene))
+    with h5py.File(tmp_path / "out" / "result.h5") as file:
+        assert np.array_equal(file["displacement"][()], expected.displacement)
+        assert file["mesh_error/displacement"].shape == expected.displacement.shape
+    shown = meshio.read(tmp_path / "out" / "vtu" / "frequency_002.vtu").point_data["displacement_imaginary"]
+    assert np.array_equal(shown, np.asarray(expected.displacement[1]).imag)
+    # About the last state of a run in time: there it is pulled by 10 %.
+    still = FILE.split("[[displaced]]")[0]
+    pulled = "[[fixed]]\nwhere = {x_max = 0.0}\n[[displaced]]\nwhere = {x_min = 0.03}\nby = [0.003, 0.0, 0.0]\n"
+    (tmp_path / "still.toml").write_text(still + pulled)
+    assert main(["simulate", str(tmp_path / "still.toml"), "--out", str(tmp_path / "still")]) == 0
+    assert main(["simulate", str(scene), *out, "--about", str(tmp_path / "still" / "result.h5")]) == 0
+    with h5py.File(tmp_path / "out" / "result.h5") as file, h5py.File(tmp_path / "still" / "result.h5") as state:
+        about = lj.harmonic(lj.load_scene(scene), about=state["positions"][-1])
+        assert np.array_equal(file["displacement"][()], about.displacement)
+    assert np.abs(about.displacement - expected.displacement).max() > 1e-7
+
+
+@pytest.mark.parametrize(
+    ("line", "more", "words"),
+    [
+        ("", [], "frequencies_Hz = [60.0] go together"),
+        ("frequencies_Hz = 60.0\n", [], "must be a list"),
+        ("frequencies_Hz = [-60.0]\n", [], "frequencies_Hz"),
+        ("frequencies_Hz = [60.0]\n", ["--png"], "--png is for runs in time"),
+        ("frequencies_Hz = [60.0]\n", ["--about", "none.h5"], "holds no positions"),
+    ],
+)
+def test_bad_scene_files_are_refused(tmp_path, capsys, line, more, words):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE + line)
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "out"), *more]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_runs_in_time_refuse_a_harmonic_scene():
+    scene = slab(2, 1)
+    with pytest.raises(lj.InputError, match=r"call lj\.harmonic"):
+        lj.simulate(replace(scene, solve=lj.Solve(kind="harmonic", frequencies_Hz=jnp.array([60.0]))))
+    with pytest.raises(lj.InputError, match="needs frequencies_Hz"):
+        lj.harmonic(scene)
 
 
 def test_physics_without_harmonic_motion_is_refused():

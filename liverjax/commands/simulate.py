@@ -5,7 +5,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from liverjax.commands import harmonic
 from liverjax.commands.arguments import add_out
+from liverjax.core.errors import InputError
 from liverjax.core.files import writable
 
 if TYPE_CHECKING:
@@ -25,6 +27,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("--fields", metavar="NAMES", help="fields to write, with commas: cauchy_stress,volume_ratio,…")
     command.add_argument("--reactions", action="store_true", help="write the forces of held parts over time as CSV")
     command.add_argument("--mesh-error", action="store_true", help="estimate what the mesh leaves out of the result")
+    command.add_argument(
+        "--about", type=Path, metavar="RESULT.h5", help="of a harmonic scene: the run whose last state moves"
+    )
     add_out(command)
     command.set_defaults(run=run)
 
@@ -40,6 +45,10 @@ def run(options: argparse.Namespace) -> int:
 
     scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8")
     names, reactions = _asked_for(options, scene, text)
+    if scene.solve.kind == "harmonic":
+        return harmonic.run(options, scene, text)
+    if options.about:
+        raise InputError("--about is for [solve] kind = 'harmonic': leave it out")
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only

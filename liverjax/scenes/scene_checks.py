@@ -17,7 +17,7 @@ from liverjax.scenes.scene import Body, Scene
 
 #: What the choices of [solve] may be.
 CHOICES = {
-    "kind": ("static", "dynamic"),
+    "kind": ("static", "dynamic", "harmonic"),
     "newton": ("converged", "one_step"),
     "integrator": ("euler", "newmark"),
     "precision": ("float64", "float32"),
@@ -37,6 +37,8 @@ def check_choices(scene: Scene) -> None:
         value = getattr(scene.solve, key)
         if value not in allowed:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
+    if (scene.solve.kind == "harmonic") != (scene.solve.frequencies_Hz is not None):
+        raise InputError("[solve] kind = 'harmonic' and frequencies_Hz = [60.0] go together: give both, or neither")
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
@@ -142,7 +144,7 @@ def check_scene(scene: Scene) -> None:
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
     histories = any(getattr(load, "history", None) is not None for load in loads)
-    if solve.dt is None:
+    if solve.dt is None and solve.kind != "harmonic":
         for present, what in (
             (scene.viscosity is not None, "viscosity"),
             (scene.porosity is not None, "porosity"),

@@ -181,6 +181,8 @@ def prepared(scene: Scene) -> Scene:
     """
     check_choices(scene)
     check_bounds(scene)
+    if scene.solve.kind == "harmonic":
+        raise InputError("[solve] kind = 'harmonic' has no run in time: call lj.harmonic(scene)")
     if scene.solve.reduced:
         file = scene.solve.reduced
         raise InputError(

@@ -20,6 +20,15 @@ from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, forces_of_motion, operator
 
 MASSES = ("consistent", "lumped")
+#: What the equations of one instant need of [solve].
+_STILL = {
+    "kind": "static",
+    "frequencies_Hz": None,
+    "dt": None,
+    "steps": 1,
+    "linear_solver": "cg",
+    "volumetric": "element",
+}
 
 
 @struct
@@ -44,7 +53,7 @@ class Harmonic:
 
 def harmonic(
     scene: Scene,
-    frequencies_Hz: Any,
+    frequencies_Hz: Any = None,
     factors: Any = None,
     about: jax.Array | None = None,
     motion: Any = None,
@@ -57,7 +66,7 @@ def harmonic(
 
     Args:
         scene: `Scene`. What `displaced` prescribes is the amplitude of a motion in phase.
-        frequencies_Hz: (F,), above 0.
+        frequencies_Hz: (F,), above 0; default: those of scene.solve.
         factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
             default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or 1 without one.
         about: positions (V, 3) [m] of an equilibrium that has rested for long, as of `simulate`; default: the
@@ -72,7 +81,8 @@ def harmonic(
         InputError: what has no harmonic motion here (porosity, pressures that follow, rigid plates, mixed or averaged
             volumes), shapes and values that cannot be used.
     """
-    scene, omegas = _small(scene, mass), 2 * jnp.pi * _frequencies(frequencies_Hz)
+    omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies_Hz if frequencies_Hz is None else frequencies_Hz)
+    scene = _small(scene, mass)
     mesh = scene.mesh
     number, elements = len(omegas), mesh.number_of_elements
     factors = _factors(scene, omegas) if factors is None else jnp.asarray(factors, complex)
@@ -119,6 +129,8 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
 
 
 def _frequencies(frequencies_Hz: Any) -> jax.Array:
+    if frequencies_Hz is None:
+        raise InputError("harmonic motion needs frequencies_Hz: give e.g. [60.0]")
     found = jnp.atleast_1d(jnp.asarray(frequencies_Hz, float))
     if not isinstance(found, jax.core.Tracer) and not (
         found.ndim == 1 and found.size and np.all(np.asarray(found) > 0)
@@ -144,7 +156,7 @@ def _small(scene: Scene, mass: str) -> Scene:
         raise InputError("a pressure that follows the body has no harmonic motion here: give a traction as value")
     if scene.solve.volumetric in ("nodal", "mixed"):
         raise InputError(f"volumetric = {scene.solve.volumetric!r} has no harmonic motion here: use 'element'")
-    solve = replace(scene.solve, kind="static", dt=None, steps=1, linear_solver="cg", volumetric="element")
+    solve = replace(scene.solve, **_STILL)
     traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
     body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)
     viscous, scene = scene.viscosity, replace(scene, viscosity=None, traction=traction, body=body, solve=solve)

@@ -23,7 +23,7 @@ from liverjax.elements import mjed
 from liverjax.laws.base import volumetric_part
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.basis import basis
+from liverjax.mesh.basis import FACES, basis
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import viscosity
@@ -124,7 +124,10 @@ def _products(order: int) -> np.ndarray:
         functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]
     else:
         functions = [{tuple(2 * n for n in v): 2.0, v: -1.0} for v in vertex]
-        functions += [{tuple(np.add(vertex[i], vertex[j]).tolist()): 4.0} for i, j in PAIRS]
+        functions += [{_power(vertex, i, j): 4.0} for i, j in PAIRS]
+    if order == 3:
+        functions += [{_power(vertex, i, i, j): 1.0, _power(vertex, i, j, j): -1.0} for i, j in PAIRS]
+        functions += [{_power(vertex, i, j, k): 27.0} for i, j, k in FACES]
 
     def integral(f: dict[tuple, float], g: dict[tuple, float]) -> float:
         total = 0.0
@@ -134,6 +137,11 @@ def _products(order: int) -> np.ndarray:
         return total
 
     return np.array([[integral(f, g) for g in functions] for f in functions])
+
+
+def _power(vertex: list[tuple], *which: int) -> tuple:
+    """Exponents of a product of linear functions."""
+    return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))
 
 
 def forces_of_motion(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.Array:

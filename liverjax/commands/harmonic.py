@@ -1,0 +1,58 @@
+"""``liverjax simulate SCENE.toml`` of a scene of kind harmonic."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
+
+if TYPE_CHECKING:
+    from liverjax.jobs.waves import Waves
+    from liverjax.scenes.scene import Scene
+
+
+def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
+    """Solve the scene's harmonic motion and write it; 1 if a frequency has no answer."""
+    from liverjax.core.versions import versions
+    from liverjax.jobs import waves
+
+    _refuse(options)
+    target = options.out / "result.h5"
+    writable(options.out, (target.name,))
+    ran = waves.solved(scene, options.about, options.mesh_error)
+    waves.write_waves(target, scene, ran, {"scene": text, "run_time_s": ran.seconds, "versions": versions()})
+    written = [str(target)]
+    if options.vtu:
+        written.append(str(waves.write_waves_vtu(options.out / "vtu", scene, ran.found)))
+    _tell(scene, ran)
+    print(f"written: {', '.join(written)}")
+    try:
+        ran.found.check()
+    except RuntimeError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _refuse(options: argparse.Namespace) -> None:
+    given = {"fields": options.fields, "reactions": options.reactions, "png": options.png, "resume": options.resume}
+    for name, value in given.items():
+        if value:
+            raise InputError(f"--{name} is for runs in time, [solve] kind is 'harmonic': leave it out")
+
+
+def _tell(scene: "Scene", ran: "Waves") -> None:
+    u = np.linalg.norm(np.asarray(ran.found.displacement), axis=-1)
+    print(
+        f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {len(u)} frequencies in "
+        f"{ran.seconds:.3g} s with compiling"
+    )
+    for k, frequency in enumerate(np.asarray(ran.found.frequencies_Hz)):
+        line = f"{frequency:g} Hz: at most {1e3 * u[k].max():.4g} mm, residual {float(ran.found.residual[k]):.1e}"
+        if ran.mesh_error is not None:
+            off = np.linalg.norm(np.asarray(ran.mesh_error[k])) / np.linalg.norm(u[k])
+            line += f", the mesh leaves out about {off:.2g} of the motion"
+        print(line)

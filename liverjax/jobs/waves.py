@@ -1,0 +1,94 @@
+"""Harmonic motion of scene files: solved, written as HDF5 and for ParaView."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.files import whole
+from liverjax.mesh.files import meshio_cells
+from liverjax.scenes.scene import Scene
+from liverjax.waves.harmonic import Harmonic, harmonic
+from liverjax.waves.mesh_error import harmonic_mesh_error
+
+
+class Waves(NamedTuple):
+    """Amplitudes of a scene and what they took."""
+
+    found: Harmonic
+    mesh_error: jax.Array | None  # (F, V, 3) complex [m]
+    seconds: float
+
+
+def solved(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
+    """The motion of a scene of kind harmonic.
+
+    Args:
+        scene: `Scene`.
+        about: result.h5 of a run of the same mesh, whose last positions are the state that moves.
+        mesh_error: estimate what the mesh leaves out.
+
+    Raises:
+        InputError: as `harmonic`; a file that is no result of this mesh.
+    """
+    x = None if about is None else _positions(about, scene)
+    begin = time.perf_counter()
+    found = jax.block_until_ready(harmonic(scene, about=x))
+    seconds = time.perf_counter() - begin
+    return Waves(found, harmonic_mesh_error(scene, found, about=x) if mesh_error else None, seconds)
+
+
+def _positions(file: Path, scene: Scene) -> jax.Array:
+    import h5py
+
+    try:
+        with h5py.File(file) as given:
+            x = np.asarray(given["positions"][-1])
+    except (OSError, KeyError, IndexError) as error:
+        raise InputError(f"--about {file} holds no positions: give result.h5 of a run of this scene") from error
+    if x.shape != scene.mesh.points.shape:
+        raise InputError(
+            f"--about {file} has {len(x)} nodes, the scene {scene.mesh.number_of_nodes}: give a run of this mesh"
+        )
+    return jnp.asarray(x)
+
+
+def write_waves(file: Path, scene: Scene, waves: Waves, attributes: dict[str, Any]) -> None:
+    """Frequencies, complex displacements and reactions (F, V, 3), and the mesh as datasets; `attributes` as such."""
+    import h5py
+
+    arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}
+    arrays["reference"] = (scene.mesh.points, "m")
+    if waves.mesh_error is not None:
+        arrays["mesh_error/displacement"] = (waves.mesh_error, "m")
+    with whole(file) as new, h5py.File(new, "w") as out:
+        for name, (values, unit) in arrays.items():
+            out[name] = np.asarray(values)
+            out[name].attrs["unit"] = unit
+        out["tetrahedra"] = meshio_cells(scene.mesh)[1]
+        for name, value in attributes.items():
+            out.attrs[name] = value if isinstance(value, (str, int, float)) else json.dumps(value)
+
+
+_UNITS = {"frequencies_Hz": "Hz", "displacement": "m", "reactions": "N", "residual": "1"}
+
+
+def write_waves_vtu(folder: Path, scene: Scene, found: Harmonic) -> Path:
+    """One VTU file a frequency with the real and imaginary part of the displacement; the series that ParaView opens."""
+    import meshio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    for k, u in enumerate(np.asarray(found.displacement)):
+        name = f"frequency_{k + 1:03d}.vtu"
+        data = {"displacement_real": u.real, "displacement_imaginary": u.imag}
+        meshio.Mesh(np.asarray(scene.mesh.points), [meshio_cells(scene.mesh)], point_data=data).write(folder / name)
+        entries.append({"name": name, "time": float(found.frequencies_Hz[k])})
+    series = folder / "result.vtu.series"
+    series.write_text(json.dumps({"file-series-version": "1.0", "files": entries}, indent=1) + "\n")
+    return series

@@ -1,0 +1,51 @@
+"""What the mesh leaves out of harmonic motion: the same problem in the next richer space of functions."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.promotion import on_middles
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.scenes.enriched import enriched
+from liverjax.scenes.scene import Scene
+from liverjax.waves.harmonic import Harmonic, harmonic
+
+
+def harmonic_mesh_error(
+    scene: Scene, found: Harmonic, factors: Any = None, about: jax.Array | None = None, motion: Any = None
+) -> jax.Array:
+    """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
+
+    Quadratic elements are solved where the result is of linear ones, cubic where it is of quadratic ones. Too few
+    elements a wave show as an error of the size of the motion: the phase of the waves is wrong then. The cost is that
+    of a mesh with eight (quadratic: three) times the unknowns.
+
+    Args:
+        scene, factors, about, motion: as of `harmonic`.
+        found: its result.
+
+    Raises:
+        InputError: a scene of another mesh, and what `harmonic` refuses.
+    """
+    nodes = scene.mesh.number_of_nodes
+    if found.displacement.shape[1] != nodes:
+        raise InputError(
+            f"the result has {found.displacement.shape[1]} nodes, the scene {nodes}: give the scene of the result"
+        )
+    rich = enriched(scene)
+    if motion is not None:
+        motion = _padded(rich.mesh, jnp.asarray(motion, complex))
+    if about is not None:
+        about = _padded(rich.mesh, jnp.asarray(about))
+    more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
+    return more.displacement[:, :nodes] - found.displacement
+
+
+def _padded(rich: TetMesh, x: jax.Array) -> jax.Array:
+    """The field x (…, V, 3) in the richer space."""
+    if rich.order == 2:
+        return jnp.swapaxes(on_middles(rich, jnp.swapaxes(x, -1, -2)), -1, -2)
+    new = jnp.zeros((*x.shape[:-2], rich.number_of_nodes - x.shape[-2], 3), x.dtype)
+    return jnp.concatenate([x, new], axis=-2)
