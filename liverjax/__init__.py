@@ -44,7 +44,7 @@ from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import Batch, simulate_batch
 from liverjax.simulation.gradients import Gradient, value_and_gradient
 from liverjax.simulation.obstacle_forces import obstacle_forces
-from liverjax.simulation.run import Result, simulate
+from liverjax.simulation.run import Result, simulate, unloaded
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import harmonic_mesh_error
 
@@ -97,6 +97,7 @@ __all__ = [
     "static",
     "struct",
     "tet_mesh",
+    "unloaded",
     "value_and_gradient",
     "viscosity",
     "with_parameters",

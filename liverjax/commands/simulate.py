@@ -42,6 +42,7 @@ def run(options: argparse.Namespace) -> int:
     from liverjax.core import status
     from liverjax.jobs import fields, long_run, output
     from liverjax.scenes import scene_file
+    from liverjax.simulation.run import unloaded
 
     scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8")
     names, reactions = _asked_for(options, scene, text)
@@ -49,6 +50,8 @@ def run(options: argparse.Namespace) -> int:
         return harmonic.run(options, scene, text)
     if options.about:
         raise InputError("--about is for [solve] kind = 'harmonic': leave it out")
+    if scene.points_are == "loaded":
+        scene = unloaded(scene).scene
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only

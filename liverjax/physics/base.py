@@ -218,6 +218,10 @@ class Physics:
         """The same beside this law, for numbers that follow from it."""
         return self
 
+    def at_beginning(self) -> "Physics":
+        """The same as it stands before a run moves it."""
+        return self
+
     def begin(self, start: Start) -> Any:
         """Memory at the beginning of a run; None: it remembers nothing."""
         return None

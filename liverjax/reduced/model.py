@@ -97,10 +97,13 @@ def refuse_unknown_physics(scene: Scene) -> None:
     """Refuse a scene with physics that reduced models have not.
 
     Raises:
-        InputError: porosity, supports and other named physics, pressures that follow, averaged or mixed volumes.
+        InputError: porosity, supports and other named physics, a loaded mesh, pressures that follow, averaged or mixed
+            volumes.
     """
     if scene.porosity is not None:
         raise InputError("a reduced model has no pore pressures: leave [porosity] out, or run the full model")
+    if scene.points_are == "loaded":
+        raise InputError('[mesh] is = "loaded" is not for reduced models: take the scene of lj.unloaded(scene)')
     if scene.physics:
         section = scene.physics[0].section
         raise InputError(f"a reduced model has no [[{section}]]: leave it out, or run the full model")

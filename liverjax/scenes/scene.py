@@ -80,6 +80,7 @@ class Scene:
     traction: tuple[Traction, ...] = param("1", "loads", default=())
     physics: tuple[Physics, ...] = param("1", "what else acts: supports, …", unnamed="named", default=())
     solve: Solve = param("1", "how", default=Solve())
+    points_are: str = static(default="reference", about="the mesh's points: reference; or loaded, under the loads")
 
     def named(self, section: str) -> list[int]:
         """Places in `physics` of those that scene files write as [[section]]."""

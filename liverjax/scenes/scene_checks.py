@@ -39,6 +39,7 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies_Hz is not None):
         raise InputError("[solve] kind = 'harmonic' and frequencies_Hz = [60.0] go together: give both, or neither")
+    _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
@@ -68,6 +69,15 @@ def check_choices(scene: Scene) -> None:
         history.check(motion.times, motion.history, f"displaced.{k}", (3,) if motion.by is None else (1,))
         if motion.by is None and motion.history is None:
             raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
+
+
+def _loaded(scene: Scene) -> None:
+    if scene.points_are not in ("reference", "loaded"):
+        raise InputError(f"[mesh] is = {scene.points_are!r} is not known: use reference or loaded")
+    if scene.points_are == "loaded" and scene.porosity is not None:
+        raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
+    if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
+        raise InputError('[mesh] is = "loaded" knows no nodes that move together: leave the rigid plate out')
 
 
 def _body(body: Body, nodes: int) -> None:
@@ -163,7 +173,7 @@ def check_scene(scene: Scene) -> None:
             "nodes at and above it, {z_max = 0} those at and below",
             stacklevel=2,
         )
-    if solve.kind == "static":
+    if solve.kind == "static" or scene.points_are == "loaded":
         _held(scene)
 
 

@@ -33,7 +33,7 @@ from liverjax.scenes.scene_checks import CHOICES, check_scene
 #: Of a cylinder: what it needs, then what it may have.
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
-    "mesh": ("file", "unit", "order", "shape", "size", "cells", *_CYLINDER),
+    "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
     "region": ("where", "set", "law"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
     "porosity": (
@@ -105,6 +105,7 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
         traction=tuple(_traction(mesh, k, t) for k, t in enumerate(_tables(content, "traction"))),
         physics=tuple(_physics(mesh, content)),
         solve=_read_solve(_table("solve", content.get("solve", {}))),
+        points_are=content["mesh"].get("is", "reference"),
     )
     check_scene(scene)
     return scene

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from liverjax.physics.contact.obstacle import Obstacle, contact_force, largest_depth
 from liverjax.scenes.scene import Scene
-from liverjax.simulation.run import Result
+from liverjax.simulation.run import Result, unloaded
 
 
 class ObstacleForces(NamedTuple):
@@ -24,6 +24,7 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
         scene: as it was run.
         result: `Result` of `liverjax.simulate`, all steps stored.
     """
+    scene = unloaded(scene).scene if scene.points_are == "loaded" else scene
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
     numbers = jnp.arange(1, len(result.positions) + 1)
     found = [p.in_body(scene.mesh, scene.law) for p in scene.physics if isinstance(p, Obstacle)]

@@ -11,6 +11,7 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, struct
+from liverjax.mesh.tetrahedra import with_points
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
@@ -18,6 +19,7 @@ from liverjax.simulation import automatic, checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs, unknowns
 from liverjax.simulation.mesh_error import MeshError, estimate, refuse
 from liverjax.simulation.step import problem_of, step
+from liverjax.simulation.unloaded import Unloaded, unload
 from liverjax.solvers import continuation
 from liverjax.solvers.problem import StepStatistics
 
@@ -127,8 +129,9 @@ def simulate(
             begins in the reference positions.
 
     Raises:
-        InputError: choices that mean nothing; numbers out of bounds, unless traced; precision "float64" where JAX's
-            64-bit mode is off. `check_scene` checks more, the mesh above all; reading a scene file calls it.
+        InputError: choices that mean nothing; numbers out of bounds, unless traced; a loaded mesh without a reference
+            shape (traced: its points are NaN, its steps NOT_FINITE); precision "float64" where JAX's 64-bit mode is
+            off. `check_scene` checks more, the mesh above all; reading a scene file calls it.
     """
     scene = prepared(scene)
     if start is not None:
@@ -179,6 +182,27 @@ def prepared(scene: Scene) -> Scene:
     Raises:
         InputError: as `simulate`.
     """
+    scene = _ready(scene)
+    return unload(scene).scene if scene.points_are == "loaded" else scene
+
+
+def unloaded(scene: Scene) -> Unloaded:
+    """The scene whose loads lead to the given mesh; its points have derivatives by all numbers of the scene.
+
+    Loads are those at the beginning of the run: histories count at time 0, and prescribed motion has not begun. Forces
+    are those of a body that has lain there long: viscosity has relaxed. Of quadratic elements the vertices are those
+    given; the middles of edges are straight in the reference shape.
+
+    Raises:
+        InputError: as `simulate`; a porous scene; no reference shape was found (traced: its points are NaN).
+    """
+    found = unload(_ready(replace(scene, points_are="loaded")))
+    whole = replace(scene, mesh=with_points(scene.mesh, found.scene.mesh.points), points_are="reference")
+    return found._replace(scene=whole)
+
+
+def _ready(scene: Scene) -> Scene:
+    """`prepared`, with the points as they are given."""
     check_choices(scene)
     check_bounds(scene)
     if scene.solve.kind == "harmonic":

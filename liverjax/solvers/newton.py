@@ -7,7 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core import status
-from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
+from liverjax.solvers.krylov import (
+    Known,
+    conjugate_gradients,
+    differentiable_solve,
+    stabilised_biconjugate_gradients,
+)
 
 
 class NewtonStatistics(NamedTuple):
@@ -20,7 +25,7 @@ class NewtonStatistics(NamedTuple):
 
 
 class NewtonOptions(NamedTuple):
-    """Tolerances and limits; all fixed when compiled."""
+    """Tolerances and limits; all but the tolerance fixed when compiled."""
 
     tolerance: float = 1e-8  # of |r| relative to the scale given
     max_iterations: int = 25
@@ -28,6 +33,7 @@ class NewtonOptions(NamedTuple):
     adjoint_tolerance: float = 1e-10  # of the solves that carry derivatives
     max_linear_iterations: int = 2000
     max_halvings: int = 10
+    symmetric: bool = True  # whether the derivative is: if not, BiCGSTAB solves the linear systems
 
 
 def newton_root(
@@ -37,7 +43,7 @@ def newton_root(
     scale: Any,
     options: NewtonOptions = NewtonOptions(),
 ) -> tuple[jax.Array, NewtonStatistics]:
-    """Root of `residual`, a function of a flat vector (n,) with a symmetric derivative.
+    """Root of `residual`, a function of a flat vector (n,).
 
     Args:
         residual: may close over traced parameters; derivatives with respect to them are exact at the root (implicit
@@ -52,7 +58,8 @@ def newton_root(
         return _halving_newton(residual, start, precondition, jax.lax.stop_gradient(scale), options)
 
     def tangent_solve(linear, y):
-        return differentiable_solve(linear, y, precondition, options.adjoint_tolerance, options.max_linear_iterations)
+        limits = (options.adjoint_tolerance, options.max_linear_iterations)
+        return differentiable_solve(linear, y, precondition, *limits, Known(options.symmetric))
 
     root, statistics = jax.lax.custom_root(residual, jax.lax.stop_gradient(start), iterate, tangent_solve, has_aux=True)
     code, iterations, linear = (n.astype(jnp.int32) for n in statistics[:3])
@@ -75,6 +82,7 @@ class _Iterate(NamedTuple):
 def _halving_newton(residual, start, precondition, scale, options):
     """Newton with step halving on |r|. The program has residual and tangent only once, so it compiles twice as fast."""
     goal = options.tolerance * scale
+    method = conjugate_gradients if options.symmetric else stabilised_biconjugate_gradients
 
     def norm(r):
         return jnp.linalg.norm(r)
@@ -92,7 +100,7 @@ def _halving_newton(residual, start, precondition, scale, options):
         # No more accurate than the last Newton step can use, no less than the forcing term.
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
         load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a zero load costs no iteration
-        dq, s = conjugate_gradients(matvec, load, precondition, forcing, options.max_linear_iterations)
+        dq, s = method(matvec, load, precondition, forcing, options.max_linear_iterations)
         return _Iterate(
             q=q,
             r=r,

@@ -150,6 +150,10 @@ def _small(scene: Scene, mass: str) -> Scene:
     """The scene as its small motion sees it: no time, no weight; refuses what has no part in it."""
     if mass not in MASSES:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
+    if scene.points_are == "loaded":
+        raise InputError(
+            '[mesh] is = "loaded" has no harmonic motion: take the scene of lj.unloaded(scene), and its run as about'
+        )
     if scene.porosity is not None:
         raise InputError("porosity has no harmonic motion here: leave it out, or run the scene in time")
     if follows(scene.traction):

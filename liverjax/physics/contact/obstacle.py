@@ -123,6 +123,10 @@ class Obstacle(Physics):
         modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
 
+    def at_beginning(self) -> "Obstacle":
+        """Where a history has it at time 0; else not yet displaced."""
+        return replace(self, by=None) if self.history is None else self
+
     def displacement(self, k: Any, steps: int, dt: Any) -> jax.Array:
         """(3,) [m] at the end of step k; step 0 is the beginning of the run."""
         zero = jnp.zeros(3)

@@ -1,0 +1,119 @@
+"""The shape before the load: reference positions from which the loads lead to the given ones.
+
+The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions; of
+quadratic elements the middles of its edges follow from these, since elements are straight there, and move by
+displacements of their own. What must vanish are the out-of-balance forces of the body with reference shape X at X + u.
+For small u their derivative is the stiffness K, so K's preconditioner serves Newton's method with BiCGSTAB.
+
+Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite elastostatics"; here the same problem on
+the equations of the forward run.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.elements.gradients import volume_ratios
+from liverjax.mesh.tetrahedra import TetMesh, with_points
+from liverjax.physics.prescribed import Fixed
+from liverjax.scenes.scene import Scene
+from liverjax.simulation import tangent
+from liverjax.simulation.equations import Equations, equations, force_sizes, initial_state, residual, unknowns
+from liverjax.solvers.block_matrix import columns, flat
+from liverjax.solvers.newton import NewtonOptions, newton_root
+
+#: Halvings save a step that goes too far; linear solves need few digits until the last one.
+_OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=12, symmetric=False)
+
+
+class Unloaded(NamedTuple):
+    """A reference shape, and how well it was found."""
+
+    scene: Scene  # with the reference shape
+    status: jax.Array  # of `liverjax.core.status`; the points are NaN where it is not CONVERGED
+    residual: jax.Array  # |r| over the forces at work
+
+
+def unload(scene: Scene) -> Unloaded:
+    """See `liverjax.simulation.run.unloaded`; for a scene as it is run.
+
+    Raises:
+        InputError: no reference shape was found; traced numbers pass.
+    """
+    points, code, relative = _solved(_resting(scene))
+    if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
+        raise InputError(
+            '[mesh] is = "loaded": no reference shape was found that these loads bring to the given one (the rest is '
+            f"{float(relative):.1g} of the forces): take a stiffer law, smaller loads or a better mesh"
+        )
+    # Under jit a shape that was not found passes for none.
+    mesh = with_points(scene.mesh, jnp.where(code == status.CONVERGED, points, jnp.nan))
+    return Unloaded(replace(scene, mesh=mesh, points_are="reference"), code, relative)
+
+
+def _resting(scene: Scene) -> Scene:
+    """The same body at rest for long under the loads of time 0."""
+    law = scene.law
+    if scene.viscosity is not None:
+        left = 1 - jnp.sum(jnp.asarray(scene.viscosity.ratios))
+        split, volume = law.isochoric_part(), law.volumetric_part()
+        if scene.viscosity.part == "all" or split is None:
+            law = laws.scaled(law, left)
+        else:
+            law = laws.scaled(split, left) if volume is None else laws.scaled(split, left) + volume
+    held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
+    # A step without length: histories are at their beginning.
+    solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
+    changed = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
+    return replace(scene, law=law, viscosity=None, displaced=(), solve=solve, points_are="reference", **changed)
+
+
+@jax.jit
+def _solved(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Reference positions (V, 3) [m], code, and the residual over the forces at work."""
+    one, given = jnp.ones((), scene.mesh.points.dtype), scene.mesh.points
+    sizes = force_sizes(scene)
+    first = jax.lax.stop_gradient(equations(scene, initial_state(scene), one, sizes))
+    q = unknowns(first, given)
+    # All that acts on the given shape where it is not strained: the size that the residual is small against.
+    _, loads, pressure = jax.lax.stop_gradient(residual(first, q, one))
+    K = tangent.tangent(first, pressure, given, one)
+
+    def held(z: jax.Array) -> jax.Array:
+        e, q = _moved(scene, given, z, sizes)
+        # Where nothing is free the unknown itself must vanish: a matrix without empty rows.
+        return residual(e, q, one)[0] + (z - _free(first, z))
+
+    options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
+    z, found = newton_root(held, jnp.zeros_like(q), tangent.preconditioner(first, K), loads, options)
+    mesh = _reference(scene.mesh, given, first, z)
+    good = jnp.all(volume_ratios(mesh, given) > 0) & jnp.all(mesh.volumes > 0)
+    code = jnp.where((found.status == status.CONVERGED) & ~good, status.INVERTED, found.status)
+    return mesh.points, code, found.residual
+
+
+def _free(e: Equations, z: jax.Array) -> jax.Array:
+    """The part of the unknowns that is free: displacements, then pressures that are unknown."""
+    n = 3 * e.mesh.number_of_nodes
+    return jnp.concatenate([jnp.concatenate(e.free.columns(columns(z[:n]))), z[n:]])
+
+
+def _reference(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array) -> TetMesh:
+    u = jnp.stack(e.free.columns(columns(z[: 3 * mesh.number_of_nodes])), axis=-1)
+    return with_points(mesh, given - u)
+
+
+def _moved(scene: Scene, given: jax.Array, z: jax.Array, sizes: Any) -> tuple[Equations, jax.Array]:
+    """The equations of the body with the reference shape of z, and its unknowns."""
+    n = 3 * scene.mesh.number_of_nodes
+    still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
+    mesh = _reference(scene.mesh, given, still, z)
+    one = replace(scene, mesh=mesh)
+    e = equations(one, initial_state(one), jnp.ones((), given.dtype), sizes)
+    u = jnp.stack(e.free.columns(columns(z[:n])), axis=-1)
+    return e, jnp.concatenate([flat(e.free.vectors(mesh.points + u)), z[n:]])

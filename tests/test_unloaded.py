@@ -1,0 +1,153 @@
+"""The shape before the load: there and back, and against a column under its own weight."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation.unloaded import unload
+
+pytestmark = pytest.mark.quick_to_compile
+
+TOLERANCE = 1e-12
+SKIN = {"thickness": 1e-4, "law": {"name": "neo_hookean", "mu": 1e4}, "where": {"z_min": 0.01}}
+SUPPORT = {"where": {"x_min": 0.04}, "normal": 200.0}
+#: Pressed on its end by so much, no reference body is that long.
+HEAVY = {"body.gravity": jnp.array([-600.0, 0, 0])}
+
+
+def content(order: int = 1, **more) -> dict:
+    return {
+        "mesh": {"shape": "box", "size": [0.04, 0.01, 0.01], "cells": [2, 1, 1], "order": order, "is": "loaded"},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "body": {"density": 1000.0, "gravity": [3.0, 0, -1.5]},
+        "fixed": [{"where": {"x_max": 0.0}}],
+        "solve": {"tolerance": TOLERANCE},
+    } | more
+
+
+def there_and_back(scene: lj.Scene) -> None:
+    """The run from the reference shape ends in the given one."""
+    found = lj.unloaded(scene)
+    assert found.status == 0 and found.residual <= TOLERANCE
+    given, V = scene.mesh.points, scene.mesh.number_of_vertices
+    moved = np.asarray(found.scene.mesh.points - given)[:V]
+    assert np.linalg.norm(moved, axis=1).max() > 0.04 * 0.04  # far: 4 % of the length and more
+    back = np.asarray(lj.simulate(found.scene).check().positions[-1] - given)[:V]
+    # Two residuals, each of the tolerance times the forces, which sag the body by `moved`; in its softest motion a
+    # force may do ten times more.
+    assert np.linalg.norm(back) < 10 * 2 * TOLERANCE * np.linalg.norm(moved)
+
+
+def test_there_and_back():
+    """Of linear elements; a load that is far too large has no reference shape, and that is said."""
+    scene = scene_from(content())
+    there_and_back(scene)
+    heavy = lj.with_parameters(scene, HEAVY)
+    with pytest.raises(InputError, match=r"no reference shape was found that these loads bring to the given one"):
+        lj.simulate(heavy)
+
+
+@pytest.mark.slow
+def test_inside_a_program_a_shape_that_is_not_found_is_not_a_number():
+    """No run passes for one that began somewhere: its status says so."""
+    heavy = lj.with_parameters(scene_from(content()), HEAVY)
+    points, code, run = jax.jit(lambda s: (*unload(s)[:2], lj.simulate(s).status))(heavy)
+    assert code != status.CONVERGED and np.isnan(points.mesh.points).any()
+    assert run.tolist() == [status.NOT_FINITE]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+def test_there_and_back_with_a_capsule_and_a_support(order):
+    scene = scene_from(content(order, membrane=[SKIN], support=[SUPPORT]))
+    there_and_back(scene)
+    # A run of the loaded scene itself begins in the reference shape.
+    back = lj.simulate(scene).check().positions[-1] - scene.mesh.points
+    assert np.abs(back[: scene.mesh.number_of_vertices]).max() < 1e-12
+
+
+@pytest.mark.slow
+def test_a_column_under_its_own_weight(verified):
+    """P(stretch) = rho g (L - X) at every height, with the sides held: one equation for the reference length L."""
+    rho_g, length = 3000.0, 0.04
+    table = content(2, body={"density": 1000.0, "gravity": [rho_g / 1000.0, 0, 0]})
+    table["mesh"]["cells"] = [4, 1, 1]
+    places = ({"y_max": 0.0}, {"y_min": 0.01}, {"z_max": 0.0}, {"z_min": 0.01})
+    table["fixed"] += [{"where": w, "axes": next(iter(w))[0]} for w in places]
+    scene = scene_from(table)
+    reference = float(np.asarray(lj.unloaded(scene).scene.mesh.points)[:, 0].max())
+    grid = np.linspace(1.0, 1.2, 2001)
+    F = np.tile(np.eye(3), (len(grid), 1, 1))
+    F[:, 0, 0] = grid
+    stress = np.asarray(scene.law.first_piola(F))[:, 0, 0]
+
+    def loaded(L):
+        depth = (np.arange(400) + 0.5) / 400 * L
+        return float(np.mean(np.interp(rho_g * depth, stress, grid)) * L)
+
+    low, high = 0.9 * length, length
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if loaded(middle) < length else (low, middle)
+    change = abs((reference - low) / (length - low))
+    verified("reference length of a column under its weight", "analytic", change, 0.001)
+    # Quadratic elements are exact at their ends for a linear column; its stretch of 2 % leaves the rest.
+    assert change < 0.001
+
+
+@pytest.mark.slow
+def test_derivatives_go_through_the_reference_shape():
+    """Reference length by mu, and a run from it: its end does not depend on mu at all."""
+    scene = scene_from(content())
+    tip = lj.boundary.select(scene.mesh, {"x_min": 0.04})
+
+    @jax.jit
+    def length(mu):
+        return jnp.mean(lj.unloaded(lj.with_parameters(scene, {"law.mu": mu})).scene.mesh.points[tip, 0])
+
+    @jax.jit
+    def end(mu):
+        return jnp.mean(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1, tip, 0])
+
+    by, reverse = jax.jacfwd(length)(800.0), jax.grad(length)(800.0)
+    errors = [abs((length(800.0 + h) - length(800.0 - h)) / (2 * h) / by - 1) for h in (80.0, 0.8, 8e-7)]
+    assert errors[1] < 1e-5 and errors[0] > 1e-4 and errors[2] > errors[1]
+    assert np.isclose(by, reverse, rtol=1e-7)
+    assert abs(jax.grad(end)(800.0)) < 1e-6 * abs(by)
+
+
+@pytest.mark.slow
+def test_the_relaxed_body_lies_as_given():
+    """A viscous body ends, after long, in the given shape."""
+    table = content(viscosity={"ratios": [0.4], "relaxation_times": [0.1]})
+    table["solve"] |= {"dt": 0.5, "steps": 16}
+    scene = scene_from(table)
+    positions = np.asarray(lj.simulate(scene).check().positions)
+    off = np.abs(positions - np.asarray(scene.mesh.points)).max(axis=(1, 2))
+    # The recursion forgets at the rate exp(-dt/tau) = 0.7 % a step, slower in creep by 1/0.6.
+    assert off[0] > 1e-5 and off[-1] < 1e-8
+
+
+@pytest.mark.slow
+def test_an_obstacle_that_comes_later_changes_nothing():
+    """A sphere that presses on the body during the run is not part of the load of the scan."""
+    sphere = {"shape": "sphere", "radius": 0.01, "position": [0.03, 0.005, 0.021], "by": [0, 0, -0.004]}
+    touched, free = (lj.unloaded(scene_from(content(**more))) for more in ({"obstacle": [sphere]}, {}))
+    assert np.allclose(touched.scene.mesh.points, free.scene.mesh.points, atol=1e-14)
+
+
+def test_what_cannot_be_is_said():
+    with pytest.raises(InputError, match="is = 'slack' is not known"):
+        scene_from(content(mesh=content()["mesh"] | {"is": "slack"}))
+    sponge = {"bulk": 400.0, "limit_bulk": 2200.0, "fluid_fraction": 0.5, "permeability": 1e-6}
+    with pytest.raises(InputError, match="does not know the pressure of a fluid"):
+        scene_from(content(porosity=sponge, solve={"dt": 0.1}))
+    with pytest.raises(InputError, match="has no harmonic motion"):
+        lj.harmonic(scene_from(content()), [60.0])
+    with pytest.raises(InputError, match="is not for reduced models"):
+        lj.reduce_scene(scene_from(content()), {"law.mu": [800.0]})
