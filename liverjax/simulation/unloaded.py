@@ -45,7 +45,7 @@ def unload(scene: Scene) -> Unloaded:
     Raises:
         InputError: no reference shape was found; traced numbers pass.
     """
-    points, code, relative = _solved(_resting(scene))
+    points, code, relative = _found_shape(_resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
         raise InputError(
             '[mesh] is = "loaded": no reference shape was found that these loads bring to the given one (the rest is '
@@ -74,7 +74,7 @@ def _resting(scene: Scene) -> Scene:
 
 
 @jax.jit
-def _solved(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Reference positions (V, 3) [m], code, and the residual over the forces at work."""
     one, given = jnp.ones((), scene.mesh.points.dtype), scene.mesh.points
     sizes = force_sizes(scene)
@@ -85,34 +85,34 @@ def _solved(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
     K = tangent.tangent(first, pressure, given, one)
 
     def held(z: jax.Array) -> jax.Array:
-        e, q = _moved(scene, given, z, sizes)
+        e, q = _with_displacements(scene, given, z, sizes)
         # Where nothing is free the unknown itself must vanish: a matrix without empty rows.
-        return residual(e, q, one)[0] + (z - _free(first, z))
+        return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))
     z, found = newton_root(held, jnp.zeros_like(q), tangent.preconditioner(first, K), loads, options)
-    mesh = _reference(scene.mesh, given, first, z)
+    mesh = _reference_shape(scene.mesh, given, first, z)
     good = jnp.all(volume_ratios(mesh, given) > 0) & jnp.all(mesh.volumes > 0)
     code = jnp.where((found.status == status.CONVERGED) & ~good, status.INVERTED, found.status)
     return mesh.points, code, found.residual
 
 
-def _free(e: Equations, z: jax.Array) -> jax.Array:
+def _free_part(e: Equations, z: jax.Array) -> jax.Array:
     """The part of the unknowns that is free: displacements, then pressures that are unknown."""
     n = 3 * e.mesh.number_of_nodes
     return jnp.concatenate([jnp.concatenate(e.free.columns(columns(z[:n]))), z[n:]])
 
 
-def _reference(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array) -> TetMesh:
+def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array) -> TetMesh:
     u = jnp.stack(e.free.columns(columns(z[: 3 * mesh.number_of_nodes])), axis=-1)
     return with_points(mesh, given - u)
 
 
-def _moved(scene: Scene, given: jax.Array, z: jax.Array, sizes: Any) -> tuple[Equations, jax.Array]:
+def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Any) -> tuple[Equations, jax.Array]:
     """The equations of the body with the reference shape of z, and its unknowns."""
     n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)
-    mesh = _reference(scene.mesh, given, still, z)
+    mesh = _reference_shape(scene.mesh, given, still, z)
     one = replace(scene, mesh=mesh)
     e = equations(one, initial_state(one), jnp.ones((), given.dtype), sizes)
     u = jnp.stack(e.free.columns(columns(z[:n])), axis=-1)
