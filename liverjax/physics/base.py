@@ -196,6 +196,8 @@ class Physics:
     section: ClassVar[str] = ""
     #: Whether it makes nodes move together: the factorisation knows no such rows.
     ties: ClassVar[bool] = False
+    #: Whether its forces have an energy; those of friction have none.
+    conservative: ClassVar[bool] = True
     keys: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

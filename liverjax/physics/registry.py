@@ -8,6 +8,7 @@ from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.attached.membrane import Membrane
 from liverjax.physics.attached.vessel import Vessel
 from liverjax.physics.base import Physics
+from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.elasticity import Elasticity
@@ -26,6 +27,7 @@ NAMED: tuple[type[Physics], ...] = (
     Ligament,
     Vessel,
     Obstacle,
+    RoughObstacle,
 )
 
 

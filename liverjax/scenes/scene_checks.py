@@ -40,6 +40,11 @@ def check_choices(scene: Scene) -> None:
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies_Hz is not None):
         raise InputError("[solve] kind = 'harmonic' and frequencies_Hz = [60.0] go together: give both, or neither")
     _loaded(scene)
+    rubs = [name for name, physics in _named_physics(scene) if not physics.conservative]
+    if rubs and (scene.solve.linear_solver == "direct" or scene.solve.robust != "off"):
+        raise InputError(
+            f"{rubs[0]} has friction, whose forces have no energy: leave linear_solver = 'direct' and robust out"
+        )
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):

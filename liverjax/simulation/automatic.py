@@ -1,7 +1,8 @@
 """Which linear solver `linear_solver = "auto"` means: a rule on size and stiffness, measured in `experiments/`.
 
 Conjugate gradients; a factorisation for static bodies of at most 10,000 tetrahedra whose bulk modulus exceeds the shear
-modulus by more than a thousand, or whose worst element is a sliver, and where no pressure follows the body.
+modulus by more than a thousand, or whose worst element is a sliver, and where no pressure follows the body and nothing
+rubs.
 """
 
 import jax
@@ -22,7 +23,8 @@ def linear_solver(scene: Scene) -> str:
     small = mesh.number_of_elements * (1 if mesh.order == 1 else 8) <= LARGEST
     if solve.volumetric == "mixed" or any(physics.ties for physics in scene.physics):
         return "cg"
-    if solve.kind != "static" or not small or any(load.pressure is not None for load in scene.traction):
+    follows = any(load.pressure is not None for load in scene.traction)
+    if solve.kind != "static" or not small or follows or not all(physics.conservative for physics in scene.physics):
         return "cg"
     try:
         shear = scene.law.shear_modulus()

@@ -1,13 +1,15 @@
 """What rigid obstacles feel of a run: the force on each, and how deep the surface is in it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from liverjax.physics.contact.obstacle import Obstacle, contact_force, largest_depth
+from liverjax.physics.base import End, Free, Start, Step
+from liverjax.physics.contact.obstacle import Obstacle, largest_depth
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result, unloaded
+from liverjax.tensors.matrices import deformation_gradient
 
 
 class ObstacleForces(NamedTuple):
@@ -22,20 +24,25 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
 
     Args:
         scene: as it was run.
-        result: `Result` of `liverjax.simulate`, all steps stored.
+        result: `Result` of `liverjax.simulate` from the reference positions, all steps stored.
     """
     scene = unloaded(scene).scene if scene.points_are == "loaded" else scene
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
+    mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
     numbers = jnp.arange(1, len(result.positions) + 1)
     found = [p.in_body(scene.mesh, scene.law) for p in scene.physics if isinstance(p, Obstacle)]
 
     def one(obstacle: Obstacle) -> tuple[jax.Array, jax.Array]:
-        def at(k: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-            moved = obstacle.displacement(k, steps, dt)
-            push = contact_force(obstacle, scene.mesh, x, moved)
-            return jnp.sum(push, axis=0), largest_depth(obstacle, scene.mesh, x, moved)
+        # What sticks remembers where it was: the steps are gone through in order.
+        def at(carry: Any, given: Any) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+            (memory, before), (k, x) = carry, given
+            acting = obstacle.freeze(memory, Step(mesh, before, k, steps, dt, False, None, free))
+            push = jnp.sum(acting.force(mesh, x, 1.0), axis=0)
+            depth = largest_depth(obstacle, mesh, x, obstacle.displacement(k, steps, dt))
+            return (obstacle.advance(memory, acting, End(x, deformation_gradient(mesh, x), None)), x), (push, depth)
 
-        return jax.lax.map(lambda given: at(*given), (numbers, result.positions))
+        start = obstacle.begin(Start(mesh, mesh.points, free, lambda: jnp.zeros_like(mesh.points)))
+        return jax.lax.scan(at, (start, mesh.points), (numbers, jnp.asarray(result.positions)))[1]
 
     if not found:
         return ObstacleForces(jnp.zeros((0, len(numbers), 3)), jnp.zeros((0, len(numbers))))

@@ -96,6 +96,11 @@ def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached, 
     return tuple(own if kind == "true" else attached.definite(own) for own in found if own is not None)
 
 
+def _symmetric(e: Equations, more: tuple[Attached, ...]) -> tuple[Attached, ...]:
+    """What a preconditioner takes of elements between nodes: friction has a stiffness without symmetry."""
+    return more if e.conservative else tuple(attached.symmetric(own) for own in more)
+
+
 def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -> Block:
     for own in more:
         diagonal = block_matrix.added(diagonal, attached.own_diagonal(own, e.mesh.number_of_nodes))
@@ -172,8 +177,9 @@ def _assembled(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> 
         A = mixed_system.coupled(mesh, K, node_blocks(e), F, pressures)
         diagonal = mixed_system.undrained_diagonal(A, 1.0 if volume.flow is None else volume.flow.mask)
     more = _attached(e, x, s, kind)
-    inverse = block_matrix.inverse_blocks(_with_diagonals(e, diagonal, more), e.free.mask, e.free.normals)
-    return A, inverse, None, attached.with_attached(mesh, A, more), more
+    near = _symmetric(e, more)
+    inverse = block_matrix.inverse_blocks(_with_diagonals(e, diagonal, near), e.free.mask, e.free.normals)
+    return A, inverse, None, attached.with_attached(mesh, A, near), more
 
 
 @jax.jit
@@ -199,8 +205,9 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> 
         A = A._replace(border=stored([scale(g, v) for v in volume_gradients(mesh, F)[1:]]))
     own = point_matrix.levels(mesh, A, bulk)
     more = _attached(e, x, s, kind)
-    inverse = block_matrix.inverse_blocks(_with_diagonals(e, own.diagonal, more), e.free.mask, e.free.normals)
-    free, below = _of_vertices(e), attached.with_attached(mesh, own.vertices, more)
+    near = _symmetric(e, more)
+    inverse = block_matrix.inverse_blocks(_with_diagonals(e, own.diagonal, near), e.free.mask, e.free.normals)
+    free, below = _of_vertices(e), attached.with_attached(mesh, own.vertices, near)
     vertices = block_matrix.inverse_blocks(below.diagonal, free.mask, free.normals)
     return A, inverse, vertices, below, more
 

@@ -14,7 +14,7 @@ class Attached(NamedTuple):
     """Stiffness of m elements between n nodes each."""
 
     nodes: jax.Array  # (n, m)
-    blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric
+    blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric but for friction
 
 
 def product(A: Attached, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
@@ -61,6 +61,11 @@ def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
     quarter = 0.25 * A.blocks
     both = jnp.concatenate([quarter, quarter])
     return Attached(jnp.concatenate(ends), jnp.concatenate([both, both], axis=2))
+
+
+def symmetric(A: Attached) -> Attached:
+    """The symmetric part."""
+    return Attached(A.nodes, 0.5 * (A.blocks + jnp.transpose(A.blocks, (2, 3, 0, 1, 4))))
 
 
 def definite(A: Attached) -> Attached:

@@ -1,7 +1,8 @@
 """A rigid obstacle that the surface of the body does not enter: a plane, a sphere, a cylinder or a cone.
 
 At three points of every triangle a pressure `stiffness` times the depth acts along the obstacle's normal, per reference
-area; where the surface is outside, nothing acts, so nothing sticks. There is no friction. The energy is half of
+area; where the surface is outside, nothing acts, so nothing sticks. It has no friction
+(`liverjax.physics.contact.friction` has). The energy is half of
 pressure times depth, its gradient and second derivative are exact. The depth that is left is the pressure over the
 stiffness: `HARDNESS` times the body's own stiffness over the size of a triangle keeps it below a hundredth of the
 triangle's size at a pressure of that stiffness. `lj.obstacle_forces` tells force and largest depth.
@@ -9,7 +10,7 @@ triangle's size at a pressure of that stiffness. `lj.obstacle_forces` tells forc
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +60,7 @@ class Obstacle(Physics):
     )
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Obstacle":
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> Self:
         """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
         shape = table.get("shape")
         if shape not in SHAPES:
@@ -148,42 +149,52 @@ class Touching(NodalForce):
     obstacle: Obstacle = param("1", "shape and stiffness")
     moved: Any = param("m", "its displacement at the beginning and at the end (2, 3)")
 
-    def _now(self, s: Any) -> jax.Array:
+    def now(self, s: Any) -> jax.Array:
+        """Its displacement (3,) [m] at part s of the step."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
         """Minus the pressures, shared out to the nodes of their triangles."""
-        return contact_force(self.obstacle, mesh, x, self._now(s))
+        return contact_force(self.obstacle, mesh, x, self.now(s))
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """Half of stiffness times depth squared."""
-        depth = jnp.minimum(_distances(self.obstacle, mesh, x, self._now(1.0)).value, 0.0)
-        return 0.5 * jnp.sum(_weighted_stiffness(self.obstacle, mesh) * depth**2)
+        depth = jnp.minimum(_distances(self.obstacle, mesh, x, self.now(1.0)).value, 0.0)
+        return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
         """Second derivative of the energy: along the normal, and of the normal."""
-        d, k = _distances(self.obstacle, mesh, x, self._now(s)), _weighted_stiffness(self.obstacle, mesh)
+        d, k = _distances(self.obstacle, mesh, x, self.now(s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
         # A surface that just touches counts as pressed: else a body that lies on a plane begins with nothing below it.
-        inside = (d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(self.obstacle, mesh))[None]).astype(x.dtype)
+        inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack(
             [
                 jnp.stack([k * (inside * d.normal[i] * d.normal[j] + depth * d.bent[i][j]) for j in range(3)])
                 for i in range(3)
             ]
         )
-        N = _at_points(mesh, x.dtype)
-        both = jnp.einsum("aq,bq->abq", N, N)
-        return Attached(_touching_nodes(self.obstacle, mesh), jnp.einsum("abq,ijqm->aibjm", both, H))
+        return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
 
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Gradient of the energy (V, 3) [N] at positions x (V, 3): the force of the nodes on the obstacle, `moved` (3,)."""
     d = _distances(obstacle, mesh, x, moved)
-    push = _weighted_stiffness(obstacle, mesh) * jnp.minimum(d.value, 0.0)  # (Q, m), negative
-    N = _at_points(mesh, x.dtype)
-    own = jnp.stack([jnp.einsum("aq,qm->am", N, push * n) for n in d.normal], axis=-1)
-    return jnp.zeros_like(x).at[_touching_nodes(obstacle, mesh)].add(own)
+    push = weighted_stiffness(obstacle, mesh) * jnp.minimum(d.value, 0.0)  # (Q, m), negative
+    return shared_out(obstacle, mesh, x, jnp.stack([push * n for n in d.normal]))
+
+
+def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
+    """Forces of points (3, Q, m) [N] as the nodes have them (V, 3)."""
+    own = jnp.einsum("aq,iqm->ami", point_functions(mesh, x.dtype), pushes)
+    return jnp.zeros_like(x).at[touching_nodes(obstacle, mesh)].add(own)
+
+
+def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
+    """Stiffness (n, 3, n, 3, m) between the nodes of triangles whose points have H (3, 3, Q, m) [N/m]."""
+    N = point_functions(mesh, H.dtype)
+    both = jnp.einsum("aq,bq->abq", N, N)
+    return jnp.einsum("abq,ijqm->aibjm", both, H)
 
 
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
@@ -191,23 +202,37 @@ def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
     return jnp.maximum(-jnp.min(_distances(obstacle, mesh, x, moved).value), 0.0)
 
 
-def _touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Of the triangles (n, m), with 3 nodes each or 6."""
     return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
 
 
-def _at_points(mesh: TetMesh, dtype: Any) -> jax.Array:
+def point_functions(mesh: TetMesh, dtype: Any) -> jax.Array:
     """Of a triangle's nodes at its points (n, Q)."""
     return jnp.asarray(surface.triangle_functions(mesh, _POINTS), dtype)
 
 
-def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
-    """Of the points of the triangles (Q, m)."""
-    at = jnp.einsum("aq,ami->iqm", _at_points(mesh, x.dtype), x[_touching_nodes(obstacle, mesh)])
-    place = jnp.asarray(obstacle.position, x.dtype) + moved
-    axis, angle = jnp.asarray(obstacle.axis, x.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, x.dtype))
+def contact_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
+    """Points of the triangles (3, Q, m) [m] at positions x (V, 3)."""
+    return jnp.einsum("aq,ami->iqm", point_functions(mesh, x.dtype), x[touching_nodes(obstacle, mesh)])
+
+
+def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
+    """Of points (3, Q, m) [m] from the obstacle, `moved` (3,)."""
+    place = jnp.asarray(obstacle.position, at.dtype) + moved
+    axis, angle = jnp.asarray(obstacle.axis, at.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, at.dtype))
     y = [at[i] - place[i] for i in range(3)]
     return distance(obstacle.shape, y, [axis[0], axis[1], axis[2]], obstacle.radius, angle)
+
+
+def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
+    """Of the points of the triangles (Q, m)."""
+    return distances(obstacle, contact_points(obstacle, mesh, x), moved)
+
+
+def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
+    """Whether points (Q, m) are inside, or so near that a body that lies there begins with something below it."""
+    return d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
 
 
 def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
@@ -216,7 +241,7 @@ def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     return jnp.sqrt(jnp.sum(normal * normal, axis=1))
 
 
-def _weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+def weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Stiffness times reference area of every point (Q, m) [N/m]."""
     whole = _triangle_areas(obstacle, mesh) * obstacle.stiffness
     return jnp.broadcast_to(whole / _POINTS.shape[1], (_POINTS.shape[1], *whole.shape))

@@ -1,0 +1,127 @@
+"""A rigid obstacle with Coulomb friction: the surface sticks to it until the shear reaches mu times the pressure.
+
+Every point of contact has an elastic slip e along the obstacle's surface [m], which the next steps remember. Within a
+step it grows with the motion of the point past the obstacle; beyond mu times the point's depth it is cut to that, and
+the point slides. The shear is `stiffness` times e, as the pressure is `stiffness` times the depth: so the slip that
+sticking needs is at most mu times the depth that the contact leaves, and nothing creeps. An open contact forgets.
+
+The force has no energy: sliding takes it away. Its tangent is exact, and not symmetric where points slide.
+
+Source: Wriggers 2006, Computational Contact Mechanics, sections 5.2 and 6.4 (penalty, return mapping).
+"""
+
+from typing import Any, ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import param, replace, struct
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import End, Start, Step
+from liverjax.physics.contact.obstacle import (
+    Obstacle,
+    Touching,
+    between_nodes,
+    contact_points,
+    distances,
+    just_touching,
+    point_functions,
+    shared_out,
+    touching_nodes,
+    weighted_stiffness,
+)
+from liverjax.solvers.attached import Attached
+
+
+@struct
+class RoughObstacle(Obstacle):
+    """An obstacle that holds the surface back along its own."""
+
+    friction: Any = param("1", "Coulomb's coefficient, mu", lower=0.0, upper=10.0, default=0.0)
+
+    keys: ClassVar[tuple[str, ...]] = (*Obstacle.keys, "friction")
+    conservative: ClassVar[bool] = False
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> Self:
+        """From [[obstacle]] with a friction."""
+        plain = super().read(mesh, table, name)
+        return replace(plain, friction=table["friction"])
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Along all directions, where the surface touches the obstacle at the beginning."""
+        nodes, normals = super().holds(mesh)
+        if not np.all(np.asarray(self.friction) > 0):
+            return nodes, normals
+        return np.tile(nodes, 3), np.repeat(np.eye(3), len(nodes), axis=0)
+
+    def begin(self, start: Start) -> jax.Array:
+        """No slip (3, Q, m) yet."""
+        return jnp.zeros_like(contact_points(self, start.mesh, start.x))
+
+    def freeze(self, memory: Any, step: Step) -> "Rubbing":
+        """With the slip at the beginning of the step, and where the points are then, as seen from the obstacle."""
+        moved = super().freeze(memory, step).moved
+        past = contact_points(self, step.mesh, step.x) - moved[0][:, None, None]
+        slip = jnp.zeros_like(past) if memory is None else memory
+        parts = {
+            "friction": self.friction,
+            "nodes": touching_nodes(self, step.mesh),
+            "functions": point_functions(step.mesh, step.x.dtype),
+        }
+        return Rubbing(obstacle=self, moved=moved, slip=slip, past=past, **parts)
+
+    def advance(self, memory: jax.Array, acting: "Rubbing", end: End) -> jax.Array:
+        """The slip (3, Q, m) [m] at the end of the step."""
+        return acting.slip_at(acting.points(end.x), 1.0)
+
+
+@struct
+class Rubbing(Touching):
+    """The obstacle during a step."""
+
+    friction: Any = param("1", "mu", default=0.0)
+    slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
+    past: Any = param("m", "points of contact then, as seen from the obstacle (3, Q, m)", default=None)
+    nodes: Any = param("1", "of the triangles (n, m)", default=None)
+    functions: Any = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
+
+    conservative: ClassVar[bool] = False  # type: ignore[misc]
+
+    def points(self, x: jax.Array) -> jax.Array:
+        """Points of contact (3, Q, m) at positions x (V, 3)."""
+        return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
+
+    def slip_at(self, at: jax.Array, s: Any) -> jax.Array:
+        """Elastic slip (3, Q, m) [m] of points (3, Q, m) at part s of the step."""
+        moved = self.now(s)
+        d = distances(self.obstacle, at, moved)
+        trial = self.slip + at - moved[:, None, None] - self.past
+        n = jnp.stack(d.normal)
+        trial = trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
+        most = self.friction * jnp.maximum(-d.value, 0.0)
+        size = jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
+        return trial * jnp.where(size > most, most / size, 1.0)[None]
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Pressures, and the shear that holds back."""
+        shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
+        return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
+
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
+        """Derivative of the force, all of it."""
+        at, plain = self.points(x), super().attached(mesh, x, s)
+        units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
+        H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
+        d = distances(self.obstacle, at, self.now(s))
+        n = jnp.stack(d.normal)
+        sticks = jnp.eye(3)[:, :, None, None].astype(x.dtype) - n[:, None] * n[None]
+        # As with the pressure: where a surface just touches, the first guess is that it will be pressed, and stick.
+        guessed = just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0)
+        H = weighted_stiffness(self.obstacle, mesh)[None, None] * jnp.where(guessed[None, None], sticks, H)
+        return Attached(plain.nodes, plain.blocks + between_nodes(mesh, H))
+
+    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+        """Nothing more: `attached` has it."""
+        return jnp.zeros_like(dx)

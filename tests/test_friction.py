@@ -1,0 +1,138 @@
+"""Coulomb friction at rigid obstacles: a block on an incline, its tangent, derivatives, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.physics.base import Free, Step
+from liverjax.physics.contact.friction import RoughObstacle
+from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.scenes.scene_file import scene_from
+from liverjax.solvers import attached
+
+pytestmark = pytest.mark.quick_to_compile
+
+SIDE, G, TAN = 0.1, 9.81, 0.4
+DT, STEPS = 2e-3, 50
+
+
+def block(mu: float, order: int = 1, **solve) -> lj.Scene:
+    """A stiff cube of 1 kg that lies on a plane; gravity leans from the normal by the angle of an incline."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    sole = lj.boundary.boundary_triangles(mesh, lj.boundary.select(mesh, {"z_max": 0.0}))
+    gravity = G * np.array([TAN, 0.0, -1.0]) / np.hypot(TAN, 1)
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=1e6, bulk=1e6),
+        body=lj.Body(density=1000.0, gravity=jnp.asarray(gravity)),
+        physics=(RoughObstacle(triangles=jnp.asarray(sole), stiffness=4e7, friction=mu),),
+        solve=lj.Solve(**solve),
+    )
+
+
+def velocity(scene: lj.Scene, result) -> float:
+    """Of the centre of mass along the incline, in the last step [m/s]."""
+    m = np.asarray(nodal_volumes(scene.mesh))
+    last = np.asarray(result.positions[-1] - result.positions[-2])[:, 0]
+    return float(m @ last / m.sum() / DT)
+
+
+def test_a_block_sticks_below_the_angle_of_friction_and_slides_above():
+    """Speed g (sin - mu cos) t; the shear is mu times the force of the plane."""
+    seen = {}
+    for mu in (0.5, 0.3):
+        scene = block(mu, kind="dynamic", dt=DT, steps=STEPS)
+        lj.check_scene(scene)
+        result = lj.simulate(scene).check()
+        force = np.asarray(lj.obstacle_forces(scene, result).force)[0]
+        seen[mu] = velocity(scene, result), np.linalg.norm(force[:, :2], axis=1) / -force[:, 2]
+    speed = G * (TAN - 0.3) / np.hypot(TAN, 1) * DT * STEPS
+    # The block rocks on its contact by some of the slip that sticking takes, mu F/(k A) = 10 um, at about 60 Hz.
+    rocks = 2 * np.pi * 60 * 1e-5
+    assert rocks < 0.05 * speed
+    assert abs(seen[0.3][0] - speed) < rocks and abs(seen[0.5][0]) < rocks
+    # The points slide in nearly one direction, more so as the rocking fades.
+    assert np.all(seen[0.3][1] <= 0.3 * (1 + 1e-9))
+    assert np.allclose(seen[0.3][1][5:], 0.3, rtol=1e-3) and np.allclose(seen[0.3][1][-20:], 0.3, rtol=1e-5)
+    assert np.all(seen[0.5][1][5:] < 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+def test_at_rest_the_plane_carries_the_weight(order):
+    """Sticking, its force is the weight along both directions; beyond the angle of friction no rest is found."""
+    scene = block(0.5, order, steps=2, tolerance=1e-10)
+    lj.check_scene(scene)
+    result = lj.simulate(scene).check()
+    weight = np.asarray(scene.body.gravity) * 1000.0 * SIDE**3
+    assert np.allclose(lj.obstacle_forces(scene, result).force[0, -1], weight, atol=1e-8 * G)
+    slides = lj.simulate(lj.with_parameters(scene, {"obstacle.0.friction": 0.3}))
+    assert slides.status[-1] != status.CONVERGED
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_tangent_is_the_derivative_of_the_force(order):
+    """Some points stick, some slide, some are in the air."""
+    scene = block(0.3, order)
+    mesh = scene.mesh
+    at_random = np.random.default_rng(14).normal(size=(2, *mesh.points.shape))
+    step = Step(mesh, mesh.points - jnp.array([[0.0, 0.0, 2e-5]]), 1.0, 1, None, False, None, Free(jnp.ones(())))
+    acting = scene.physics[0].freeze(None, step)
+    x, v = step.x + 1e-5 * np.array([[0.5, 0.5, 3.0]]) * at_random[0], jnp.asarray(at_random[1])
+    slip = np.linalg.norm(acting.slip_at(acting.points(x), 1.0), axis=0)
+    free = np.linalg.norm(replace(acting, friction=1e9).slip_at(acting.points(x), 1.0), axis=0)
+    kinds = {"open": np.any(slip == 0), "sticks": np.any((slip > 0) & (slip == free)), "slides": np.any(slip < free)}
+    assert all(kinds.values()), kinds
+    exact = jax.jvp(lambda x: acting.force(mesh, x, 1.0), (x,), (v,))[1]
+    K = acting.attached(mesh, x, 1.0)
+    found = jnp.stack(attached.product(K, tuple(v.T)), axis=1)
+    assert np.allclose(found, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+    assert not np.allclose(K.blocks, attached.symmetric(K).blocks, atol=1e-3 * np.abs(K.blocks).max())
+
+
+@pytest.mark.slow
+def test_derivative_of_the_way_by_the_coefficient():
+    """Of implicit Euler, -g cos n(n+1)/2 dt^2; difference quotients fall, bottom out and rise; 0 mu is no friction."""
+    scene = block(0.3, kind="dynamic", dt=DT, steps=STEPS, tolerance=1e-11)
+    m = nodal_volumes(scene.mesh) / SIDE**3
+
+    @jax.jit
+    def way(mu):
+        end = lj.simulate(lj.with_parameters(scene, {"obstacle.0.friction": mu})).positions[-1, :, 0]
+        return jnp.sum(m * end)
+
+    by, reverse = jax.jit(jax.jacfwd(way))(0.3), jax.grad(way)(0.3)
+    expected = -G / np.hypot(TAN, 1) * STEPS * (STEPS + 1) / 2 * DT**2
+    # In the first step, of which the way has 50 parts in 1275, the deepest points still stick.
+    assert np.isclose(by, expected, rtol=STEPS / (STEPS * (STEPS + 1) / 2)) and np.isclose(by, reverse, rtol=1e-7)
+    errors = [abs((way(0.3 + h) - way(0.3 - h)) / (2 * h) / by - 1) for h in (3e-2, 1e-4, 1e-9)]
+    assert errors[1] < 1e-5 and errors[1] < errors[0] and errors[1] < errors[2]
+    plain = {f: getattr(scene.physics[0], f) for f in ("triangles", "stiffness")}
+    smooth = lj.simulate(replace(scene, physics=(Obstacle(**plain),))).positions[-1, :, 0]
+    assert np.isclose(way(0.0), jnp.sum(m * smooth), rtol=1e-9)
+
+
+def test_bad_friction_is_one_sentence():
+    table = {"shape": "plane", "position": [0, 0, 0], "axis": [0, 0, 1], "friction": 0.3}
+    scene = {
+        "mesh": {"shape": "box", "size": [SIDE] * 3, "cells": [1, 1, 1]},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "obstacle": [table],
+    }
+    # Friction holds a body along the plane, so that nothing else has to.
+    found = scene_from(scene)
+    assert isinstance(found.physics[0], RoughObstacle)
+    with pytest.raises(InputError, match="nothing holds the body against every rigid motion"):
+        scene_from(scene | {"obstacle": [table | {"friction": 0.0}]})
+    with pytest.raises(InputError, match=r"obstacle\.0\.friction = -0\.1"):
+        scene_from(scene | {"obstacle": [table | {"friction": -0.1}]})
+    for choice in ({"linear_solver": "direct"}, {"robust": "projected"}):
+        with pytest.raises(InputError, match=r"obstacle\.0 has friction, whose forces have no energy"):
+            scene_from(scene | {"solve": choice})
