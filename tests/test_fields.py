@@ -8,6 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.jobs import fields
+from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.run import Result
 
@@ -134,3 +135,36 @@ def test_bad_fields_are_refused():
             fields.check(names, scene)
     with pytest.raises(InputError, match="must be a list of names"):
         scene_from(content(output={"fields": "cauchy_stress"}))
+
+
+def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
+    """Uniaxial tension has its stress for von Mises stress; what is not there is one sentence."""
+    from liverjax.__main__ import main
+    from liverjax.jobs import pictures
+
+    mesh, file = scene_from(content()).mesh, tmp_path / "result.h5"
+    X = np.asarray(mesh.points)
+    V = len(X)
+    with h5py.File(file, "w") as out:
+        out["reference"], out["tetrahedra"] = X, np.asarray(mesh.tetrahedra)
+        out["positions"] = np.stack([X, X * [1.1, 1.0, 1.0]])
+        out["fields/vertices/cauchy_stress"] = np.broadcast_to(np.diag([-70.0, 0.0, 0.0]), (2, V, 3, 3))
+        out["fields/vertices/green_strain"] = np.broadcast_to(np.diag([0.105, 0.0, -0.2]), (2, V, 3, 3))
+    assert np.allclose(pictures.of_result(file, "cauchy_stress").values, 70.0)
+    assert np.allclose(pictures.of_result(file, "green_strain", 1).values, 0.105)
+    drawn = pictures.of_result(file, "displacement")
+    assert np.allclose(drawn.values, 0.1 * np.abs(X[:, 0])) and np.allclose(drawn.after, X * [1.1, 1.0, 1.0])
+    assert len(drawn.triangles) == len(boundary_triangles(mesh))
+    assert main(["plot", str(file), "--field", "cauchy_stress", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "cauchy_stress.png").stat().st_size > 5000
+    assert "von Mises stress [Pa]: 70 to 70" in capsys.readouterr().out
+    for more, words in (
+        (["--field", "energy"], "has no field 'energy'"),
+        (["--step", "3"], "--step 3 is not in"),
+        (["yeoh"], "draw it alone"),
+    ):
+        assert main(["plot", str(file), *more, "--out", str(tmp_path)]) == 2
+        assert words in capsys.readouterr().err
+    (tmp_path / "other.h5").write_text("no")
+    assert main(["plot", str(tmp_path / "other.h5")]) == 2
+    assert "is no result of liverjax simulate" in capsys.readouterr().err

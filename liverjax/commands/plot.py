@@ -1,6 +1,7 @@
-"""``liverjax plot NAME | FILE.py:LAW …``: stress-stretch curves of laws."""
+"""``liverjax plot NAME | FILE.py:LAW …`` draws stress-stretch curves of laws; ``plot RESULT.h5`` a field of a run."""
 
 import argparse
+from pathlib import Path
 
 from liverjax import laws
 from liverjax.commands.arguments import LAW, add_out
@@ -11,16 +12,30 @@ from liverjax.core.files import writable
 def add(parsers: argparse._SubParsersAction) -> None:
     """Declare the command."""
     command = parsers.add_parser(
-        "plot", help="stress-stretch curves", description="Draw stress-stretch curves of laws."
+        "plot",
+        help="stress-stretch curves, or a field of a run",
+        description="Draw stress-stretch curves of laws, or the surface of a run coloured by a field.",
     )
-    command.add_argument("law", nargs="+", metavar="NAME|FILE.py:LAW", help=f"{LAW}; all for every shipped one")
+    command.add_argument(
+        "law",
+        nargs="+",
+        metavar="NAME|FILE.py:LAW|RESULT.h5",
+        help=f"{LAW}; all for every shipped one; or a result of liverjax simulate",
+    )
+    command.add_argument("--field", default="displacement", metavar="NAME", help="of a result: cauchy_stress, …")
+    command.add_argument("--step", type=int, metavar="N", help="of a result, from 1; default the last")
     command.add_argument("--stretch", nargs=2, type=float, default=(0.6, 1.6), metavar=("LOW", "HIGH"), help="0.6 1.6")
     add_out(command)
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draw the curves of laws."""
+    """Draw the curves of laws, or the field of a run."""
+    results = [Path(name) for name in options.law if name.endswith(".h5")]
+    if results:
+        if len(options.law) > 1:
+            raise InputError(f"{results[0]} is a result: draw it alone")
+        return _draw_field(results[0], options)
     from liverjax.laws import figures, gradient_check
 
     low, high = options.stretch
@@ -33,4 +48,15 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, (file.name,))
     figures.curves(named, file, (low, high))
     print(f"written: {file}")
+    return 0
+
+
+def _draw_field(result: Path, options: argparse.Namespace) -> int:
+    from liverjax.jobs import pictures
+
+    surface, file = pictures.of_result(result, options.field, options.step), options.out / f"{options.field}.png"
+    writable(options.out, (file.name,))
+    pictures.draw_surface(file, surface)
+    low, high = (float(f(surface.values)) for f in (min, max))
+    print(f"{surface.label}: {low:.4g} to {high:.4g}\nwritten: {file}")
     return 0

@@ -8,8 +8,8 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.files import whole
-from liverjax.core.plotting import BLUE, GREY, pyplot, save
 from liverjax.jobs.fields import FIELDS, at_vertices, reaction_table
+from liverjax.jobs.pictures import Surface, draw_surface
 from liverjax.mesh.files import meshio_cells
 from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene import Scene
@@ -85,26 +85,8 @@ def write_vtu(folder: Path, scene: Scene, result: Result, fields: dict[str, np.n
 
 def picture(file: Path, scene: Scene, result: Result) -> None:
     """The body's surface before (grey) and after, coloured by displacement."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    triangles = boundary_triangles(scene.mesh)
     before, after = np.asarray(scene.mesh.points), np.asarray(result.positions[-1])
-    moved = np.linalg.norm(after - before, axis=1)[triangles].mean(axis=1)
-    figure = pyplot().figure(figsize=(6.5, 5.5), layout="constrained")
-    axes = figure.add_subplot(projection="3d")
-    edges = Poly3DCollection(before[triangles], facecolor="none", edgecolor=GREY, lw=0.15)
-    surface = Poly3DCollection(after[triangles], lw=0.1, edgecolor="black")
-    surface.set_array(moved)
-    surface.set_cmap("viridis")
-    for collection in (edges, surface):
-        axes.add_collection3d(collection)
-    both = np.concatenate([before, after])
-    middle, half = (both.min(axis=0) + both.max(axis=0)) / 2, np.ptp(both, axis=0).max() / 2
-    for k, name in enumerate("xyz"):
-        getattr(axes, f"set_{name}lim")(middle[k] - half, middle[k] + half)
-        getattr(axes, f"set_{name}label")(f"{name} [m]")
-    axes.set_box_aspect((1, 1, 1))
-    figure.colorbar(surface, ax=axes, shrink=0.6, label="displacement [m]")
     worst = float(np.asarray(result.statistics.residual).max())
-    axes.set_title(f"step {len(result.times)}, largest residual {worst:.1e} of the forces", color=BLUE, fontsize=9)
-    save(figure, file)
+    title = f"step {len(result.times)}, largest residual {worst:.1e} of the forces"
+    moved = np.linalg.norm(after - before, axis=1)
+    draw_surface(file, Surface(before, after, boundary_triangles(scene.mesh), moved, "displacement [m]", title))

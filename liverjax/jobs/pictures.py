@@ -1,0 +1,111 @@
+"""Pictures of a body's surface, coloured by what was computed."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.names import hint
+from liverjax.core.plotting import BLUE, GREY, pyplot, save
+from liverjax.mesh.selection import boundary_triangles
+from liverjax.mesh.tetrahedra import tet_mesh
+
+
+class Surface(NamedTuple):
+    """What is drawn."""
+
+    before: np.ndarray  # (V, 3) [m]
+    after: np.ndarray  # (V, 3) [m]
+    triangles: np.ndarray  # (m, 3)
+    values: np.ndarray  # (V,) colours
+    label: str
+    title: str
+
+
+#: Of each field: the number that is drawn, and its name.
+DRAWN = {
+    "cauchy_stress": "von Mises stress [Pa]",
+    "green_strain": "largest principal strain [1]",
+    "principal_stretches": "largest stretch [1]",
+    "volume_ratio": "volume ratio J [1]",
+    "energy": "energy density [Pa]",
+    "fluid_velocity": "speed of the fluid [m/s]",
+}
+
+
+def draw_surface(file: Path, surface: Surface) -> None:
+    """The surface before (grey) and after, coloured, into a PNG."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    before, after, triangles = surface.before, surface.after, surface.triangles
+    figure = pyplot().figure(figsize=(6.5, 5.5), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    edges = Poly3DCollection(before[triangles], facecolor="none", edgecolor=GREY, lw=0.15)
+    filled = Poly3DCollection(after[triangles], lw=0.1, edgecolor="black")
+    filled.set_array(surface.values[triangles].mean(axis=1))
+    filled.set_cmap("viridis")
+    for collection in (edges, filled):
+        axes.add_collection3d(collection)
+    both = np.concatenate([before, after])
+    middle, half = (both.min(axis=0) + both.max(axis=0)) / 2, np.ptp(both, axis=0).max() / 2
+    for k, name in enumerate("xyz"):
+        getattr(axes, f"set_{name}lim")(middle[k] - half, middle[k] + half)
+        getattr(axes, f"set_{name}label")(f"{name} [m]")
+    axes.set_box_aspect((1, 1, 1))
+    figure.colorbar(filled, ax=axes, shrink=0.6, label=surface.label)
+    axes.set_title(surface.title, color=BLUE, fontsize=9)
+    save(figure, file)
+
+
+def of_result(file: Path, name: str, step: int | None = None) -> Surface:
+    """The surface of a result.h5 with a field, `displacement` or `pressure`.
+
+    Args:
+        file: as `liverjax simulate` writes it.
+        name: a field that the run has written.
+        step: from 1; None: the last.
+
+    Raises:
+        InputError: a file, field or step that is not there.
+    """
+    import h5py
+
+    try:
+        with h5py.File(file) as data:
+            tets, before, after = data["tetrahedra"][()][:, :4], data["reference"][()], data["positions"]
+            steps, fields = len(after), list(data.get("fields/vertices", ()))
+            known = ["displacement", *(["pressure"] if "pressure" in data else []), *fields]
+            if name not in known:
+                raise InputError(
+                    f"{file} has no field {name!r}: {hint(name, known)}; it has {', '.join(known)}, and liverjax "
+                    "simulate --fields writes more"
+                )
+            step = steps if step is None else step
+            if not 1 <= step <= steps:
+                raise InputError(f"--step {step} is not in {file}: give 1 to {steps}")
+            after = after[step - 1]
+            values = data[f"fields/vertices/{name}"][step - 1] if name in fields else None
+            if name == "pressure":
+                values = data["pressure"][step - 1]
+    except (OSError, KeyError) as error:
+        raise InputError(f"{file} is no result of liverjax simulate ({error}): give its result.h5") from None
+    V = int(tets.max()) + 1
+    if name == "displacement":
+        values, label = np.linalg.norm(after - before, axis=1), "displacement [m]"
+    else:
+        values, label = _drawn_number(name, np.asarray(values)), DRAWN.get(name, "pressure [Pa]")
+    triangles = np.asarray(boundary_triangles(tet_mesh(before[:V], tets)))
+    return Surface(before[:V], after[:V], triangles, values[:V], label, f"step {step} of {steps}")
+
+
+def _drawn_number(name: str, values: np.ndarray) -> np.ndarray:
+    """One number a vertex (V,) of a field (V, …)."""
+    if name == "cauchy_stress":
+        deviator = values - np.trace(values, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+        return np.sqrt(1.5 * np.sum(deviator**2, axis=(1, 2)))
+    if name == "green_strain":
+        return np.linalg.eigvalsh(values)[:, -1]
+    if name == "principal_stretches":
+        return values[:, 0]
+    return np.linalg.norm(values, axis=1) if name == "fluid_velocity" else values
