@@ -1,10 +1,12 @@
 """Runs of a reduced model: a step of Newton's method for n coordinates, with stresses at the sampled points alone."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax.core import status
 from liverjax.core.struct import param, struct
@@ -68,7 +70,7 @@ class _Equations(NamedTuple):
     q: jax.Array  # at the beginning
     motion: ReducedMotion | None
     dt: Any
-    newmark: bool
+    newmark: bool | None
 
 
 def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
@@ -86,9 +88,8 @@ def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
     return e.gradient + jnp.tensordot(q, e.model.slopes, axes=1)
 
 
-def _residual(e: _Equations, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (n,) and the size of all forces."""
-    F = _deformation(e, q)
+def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Out-of-balance forces (n,) and the size of all forces, with the deformation gradients F (9, S) of q."""
     P = jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in e.acting.stress(as_matrix(F)) for entry in row])
     internal = jnp.tensordot(e.model.slopes, e.model.weights[None] * P, axes=2)
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load)
@@ -117,44 +118,109 @@ def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
 
 
 class _Found(NamedTuple):
+    """The end of a step, and the inverse that the next step begins with."""
+
     q: jax.Array
     residual: jax.Array
+    iterations: jax.Array | np.ndarray
+    inverse: jax.Array
+
+
+class _At(NamedTuple):
+    """Where the iterations of a step are."""
+
+    q: jax.Array
+    F: jax.Array  # (9, S)
+    r: jax.Array
+    size: jax.Array  # of r, relative to the forces at work
+    inverse: jax.Array  # of the tangent, or near it (n, n) [m/N]
+    fresh: jax.Array  # the inverse is that of the tangent at q
+    slow: jax.Array  # the last iteration gained little
     iterations: jax.Array
+    tangents: jax.Array
 
 
-def _newton(e: _Equations, tolerance: Any, most: int) -> _Found:
-    """The coordinates at the end of a step; their derivatives are those of the solution, by one exact last step."""
-    fixed, tolerance = jax.lax.stop_gradient((e, tolerance))
-    fixed = fixed._replace(newmark=e.newmark)
-    start = fixed.q if fixed.motion is None else fixed.q + fixed.dt * fixed.motion.velocity
+#: An iteration that leaves more than this part of the residual calls for the tangent at hand, which costs ten of them.
+_LITTLE_GAIN = 0.5
 
-    def relative(r: jax.Array, size: jax.Array) -> jax.Array:
-        return jnp.linalg.norm(r) / jnp.maximum(size, jnp.finfo(r.dtype).tiny)
 
-    def unfinished(carry: tuple) -> jax.Array:
-        _, _, size, k = carry
-        return (size > tolerance) & (k < most)
+def _judged(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
+    r, size = _residual(e, q, F)
+    return r, jnp.linalg.norm(r) / jnp.maximum(size, jnp.finfo(r.dtype).tiny)
 
-    def usable(q: jax.Array) -> jax.Array:
-        return jnp.min(determinant(as_matrix(_deformation(fixed, q)))) > 0
 
-    def iterate(carry: tuple) -> tuple:
-        q, r, _, k = carry
-        dq = jnp.linalg.solve(_reduced_tangent(fixed, q), r)
-        # Halved until no sampled point is inverted, six times at most.
-        part = jax.lax.while_loop(
-            lambda part: (part > 0.02) & ~usable(q - part * dq), lambda part: 0.5 * part, jnp.ones((), q.dtype)
-        )
-        q = q - part * dq
-        r, size = _residual(fixed, q)
-        return q, r, relative(r, size), k + 1
+def _upright(F: jax.Array) -> jax.Array:
+    return jnp.min(determinant(as_matrix(F))) > 0
 
-    start = jnp.where(usable(start), start, fixed.q)
-    r, size = _residual(fixed, start)
-    q, _, size, k = jax.lax.while_loop(unfinished, iterate, (start, r, relative(r, size), jnp.zeros((), jnp.int32)))
-    q, size = jax.lax.stop_gradient((q, size))
-    last = jnp.linalg.solve(jax.lax.stop_gradient(_reduced_tangent(fixed, q)), _residual(e, q)[0])
-    return _Found(q - last, size, k)
+
+def _corrected(e: _Equations, at: _At) -> _At:
+    """One iteration with the inverse at hand, which then takes up what was seen of the forces (Broyden 1965)."""
+    dq = at.inverse @ at.r
+    dF = jnp.tensordot(dq, e.model.slopes, axes=1)
+    # Halved until no sampled point is inverted, six times at most.
+    part = jax.lax.while_loop(
+        lambda part: (part > 0.02) & ~_upright(at.F - part * dF), lambda part: 0.5 * part, jnp.ones((), dq.dtype)
+    )
+    q, F = at.q - part * dq, at.F - part * dF
+    r, size = _judged(e, q, F)
+    moved, change = -part * dq, r - at.r
+    row = moved @ at.inverse
+    seen = row @ change
+    inverse = at.inverse + jnp.outer((moved - at.inverse @ change) / jnp.where(seen == 0, 1.0, seen), row)
+    # An old inverse may lead astray: such a step is not taken.
+    before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
+    good = at.fresh | (after < before)
+    new = _At(q, F, r, size, inverse, jnp.array(False), jnp.array(False), at.iterations, at.tangents)
+    new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, at)
+    return new._replace(slow=~(after < _LITTLE_GAIN * before), fresh=jnp.array(False), iterations=at.iterations + 1)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _newton(newmark: bool, most: int, e: _Equations, tolerance: Any, inverse: jax.Array) -> _Found:
+    """The coordinates at the end of a step, from the inverse of the step before (zeros: none yet).
+
+    The tangent is taken anew only where the iterations gain little. Derivatives are those of the solution.
+    """
+    e = e._replace(newmark=newmark)
+
+    def unfinished(at: _At) -> jax.Array:
+        return (at.size > tolerance) & (at.tangents < most)
+
+    def inner(at: _At) -> _At:
+        going = lambda at: (at.size > tolerance) & ~at.slow  # noqa: E731
+        return jax.lax.while_loop(going, lambda at: _corrected(e, at), at._replace(slow=jnp.array(False)))
+
+    def refreshed(at: _At) -> _At:
+        own = jnp.linalg.inv(_reduced_tangent(e, at.q))
+        return at._replace(inverse=own, fresh=jnp.array(True), tangents=at.tangents + 1)
+
+    start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
+    start = jnp.where(_upright(_deformation(e, start)), start, e.q)
+    F, none = _deformation(e, start), jnp.zeros((), jnp.int32)
+    r, size = _judged(e, start, F)
+    begin = _At(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
+    at = inner(begin)
+    # Where the old inverse does not lead to the end, the step begins again.
+    begin = begin._replace(iterations=at.iterations)
+    at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
+    at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
+    # One more correction costs no forces.
+    return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
+
+
+@_newton.defjvp
+def _newton_derivative(newmark: bool, most: int, primals: tuple, tangents: tuple) -> tuple[_Found, _Found]:
+    e, de = primals[0]._replace(newmark=newmark), tangents[0]
+    found = _newton(newmark, most, *primals)
+    without = e._replace(newmark=None)
+
+    def forces(e: _Equations) -> jax.Array:
+        return _residual(e._replace(newmark=newmark), found.q, _deformation(e, found.q))[0]
+
+    change = jax.jvp(forces, (without,), (de,))[1]
+    dq = -jnp.linalg.solve(_reduced_tangent(e, found.q), change)
+    whole = np.zeros((), jax.dtypes.float0)
+    return found, _Found(dq, jnp.zeros_like(found.residual), whole, jnp.zeros_like(found.inverse))
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
@@ -194,16 +260,17 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """Coordinates, memory, motion at rest, and the mass matrix; the last two None without inertia."""
+    """Coordinates, memory, motion at rest, no inverse yet, mass matrix; motion and mass None without inertia."""
     n, S = model.slopes.shape[0], model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
+    inverse = jnp.zeros((n, n), q.dtype)
     memory = None if scene.viscosity is None else initial_history(scene.viscosity, S, q.dtype)
     if scene.solve.kind != "dynamic" or scene.body is None:
-        return q, memory, None, None
+        return q, memory, None, inverse, None
     nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
     mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
     newmark = scene.solve.integrator == "newmark"
-    return q, memory, ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q), mass
+    return q, memory, ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q), inverse, mass
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
@@ -213,19 +280,20 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:
-        q, memory, motion = carry
+        q, memory, motion, inverse = carry
         acting = solid.freeze(memory, step)
         newmark = solve.integrator == "newmark"
         load, gradient = given
-        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, newmark)
-        found = _newton(e, solve.tolerance, solve.newton_iterations)
+        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None)
+        found = _newton(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
+        e = e._replace(newmark=newmark)
         F = as_matrix(_deformation(e, found.q))
         memory = solid.advance(memory, acting, End(points, F, None))
         motion = None if motion is None else _kinematics(e, found.q)
         code = jnp.where(found.residual <= solve.tolerance, status.CONVERGED, status.STALLED)
         code = jnp.where(jnp.min(determinant(F)) <= 0, status.INVERTED, code)
         code = jnp.where(jnp.all(jnp.isfinite(found.q)), code, status.NOT_FINITE)
-        return (found.q, memory, motion), (found.q, code, found.iterations, found.residual)
+        return (found.q, memory, motion, found.inverse), (found.q, code, found.iterations, found.residual)
 
     return advance
 
