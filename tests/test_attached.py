@@ -160,7 +160,7 @@ def test_bad_ligaments_are_refused(table, words):
 # -- vessels ---------------------------------------------------------------------------------------------------------
 
 
-@ORDERS
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_vessel_in_a_stretched_body_pulls_as_a_bar(order):
     """In a uniform deformation every piece has the stretch |F t|: energy and force of one straight bar."""
     mesh, law = box(order), lj.laws.create("yeoh", c1=4e4, c2=1e4, c3=10.0, bulk=1e6)

@@ -28,6 +28,7 @@ def _moved(scene: lj.Scene, x: jax.Array) -> np.ndarray:
     return np.asarray(x) - np.asarray(scene.mesh.points)
 
 
+@pytest.mark.slow
 def test_explicit_dynamics_agrees_with_newmark():
     """Both are of second order, so on half the step they come four times as near to each other."""
     seconds, apart = 0.06, []
@@ -63,7 +64,7 @@ def test_corotational_agrees_with_implicit_euler_where_strains_are_small():
     assert np.log2(apart[1] / apart[0]) == pytest.approx(2, abs=0.3)
 
 
-@pytest.mark.parametrize("name", ["mooney_rivlin", "arruda_boyce"])
+@pytest.mark.parametrize("name", [pytest.param("mooney_rivlin", marks=pytest.mark.slow), "arruda_boyce"])
 @pytest.mark.parametrize("way", ["chapter", "standard", "autodiff"])
 def test_rivals_of_the_assembly_are_right_with_and_without_their_parts_written(way, name):
     """Sums of some hundred products that cancel to a few digits: within 1e-12 of the largest entry of the Hessian."""

@@ -63,6 +63,7 @@ def test_closed_form_on_measured_data(tmp_path, capsys):
     assert "profile 95 % (closed form)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.core
 def test_bfgs_option(tmp_path):
     code = main(

@@ -79,8 +79,9 @@ def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
 
 @pytest.mark.parametrize(
     ("ratio", "volumetric", "limit"),
-    [(3.0, "element", 0.01), pytest.param(1e3, "mixed", 0.02, marks=pytest.mark.slow)],
+    [(3.0, "element", 0.01), (1e3, "mixed", 0.02)],
 )
+@pytest.mark.slow
 def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, volumetric, limit):
     """A contact as wide as a tenth of the sphere, 1 % of the layer deep: half a thousand quadratic elements."""
     from fitting.rigs.thin_layer import Indenter, Layer
@@ -115,6 +116,7 @@ def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, vol
     assert found.depth[0, -1] < 2e-3 * depth
 
 
+@pytest.mark.slow
 def test_a_falling_cube_bounces_and_keeps_its_energy():
     """Newmark without damping: height and speed after the bounce are those before, as far as the steps resolve it."""
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))

@@ -52,7 +52,7 @@ KNOWN = {
 
 
 #: Laws of stretches compile for long, and differ in scalars only.
-LONG = ("logarithmic", "bogen", "veronda_westmann")
+LONG = ("logarithmic", "bogen", "veronda_westmann", "exponential")
 
 
 @pytest.mark.parametrize("name", [n if n not in LONG else pytest.param(n, marks=pytest.mark.slow) for n in KNOWN])

@@ -130,6 +130,7 @@ def test_exact_data_are_moved_by_no_end():
     assert not edges.moved(f) and not any("half decade" in w or "structured" in w for w in f.warnings)
 
 
+@pytest.mark.slow
 def test_springpots_are_compared_too():
     G = 300 + 100 * (1j * OMEGA) ** 0.4
     s = Sweep(OMEGA, G.real, G.imag)

@@ -70,6 +70,7 @@ def _terzaghi(steps: int) -> np.ndarray:
     return np.stack([1 - left @ (2 / M**2), left @ (2 / M * np.sin(M))])
 
 
+@pytest.mark.slow
 @pytest.mark.core
 def test_consolidation_in_few_steps():
     """The series has the error of the steps. That of layers is left: 0.0105, 0.0075 and 0.0043 with 6, 12 and 24.
@@ -238,6 +239,7 @@ def test_confined_compression_of_febio(febio, verified):
     assert max(off) < 0.01
 
 
+@pytest.mark.slow
 def test_pressure_in_float32_where_storage_is_lost_beside_what_flows():
     """Sealed, at a step of 1e7 diffusion times of an element: the mean is that of volumes, in either precision."""
     scene = column(6, 1, 1.0)

@@ -176,6 +176,7 @@ def test_a_springpot_has_the_errors_of_its_curvature():
     assert np.allclose(flat.std(axis=0), p.standard_errors * np.sqrt(20 / 18), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_relaxation_is_sampled_too(tmp_path):
     time = np.geomspace(0.01, 100, 60)
     noise = 1 + 0.01 * np.random.default_rng(0).standard_normal(60)

@@ -54,7 +54,7 @@ def test_unknowns_stand_for_positions_on_the_circle(rig, axis):
 
 PRONY = lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.1]))
 CASES = [
-    pytest.param("angle", None, None, id="elastic"),
+    pytest.param("angle", None, None, marks=pytest.mark.slow, id="elastic"),
     pytest.param("angle", PRONY, None, marks=pytest.mark.slow, id="viscous"),
     pytest.param("torque", PRONY, None, marks=pytest.mark.slow, id="torque"),
     pytest.param("angle", PRONY, 1000.0, marks=pytest.mark.slow, id="inertia"),

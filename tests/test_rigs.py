@@ -105,6 +105,7 @@ def test_the_table_of_converged_numbers_is_that_of_another_program(verified):
     assert min(stiffer) > -1e-6 and max(stiffer) < 0.05
 
 
+@pytest.mark.slow
 def test_the_default_mesh_is_within_one_percent(verified):
     errors = _errors("tension", 1.0, (3.0, 1e4))
     verified("tension of a glued cylinder, K/mu 3 and 1e4", "axisymmetric solver", abs(errors).max(), 0.01)

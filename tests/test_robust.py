@@ -212,7 +212,8 @@ def inverted_start(part: float, seed: int) -> jax.Array:
 STARTS = {"finite everywhere": laws.typical("stable_neo_hookean"), "not finite": laws.NeoHookean(mu=770.0, bulk=7000.0)}
 
 
-@pytest.mark.parametrize("name", ["finite everywhere", pytest.param("not finite", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(STARTS))
 def test_from_inverted_starts_the_energy_falls_to_the_minimum(name):
     """In motion a start cannot be left; in one very long step inertia does nothing."""
     scene = replace(HANGING, law=STARTS[name], solve=lj.Solve(kind="dynamic", dt=1e4, robust="projected"))
@@ -239,6 +240,7 @@ def test_at_rest_every_start_leads_to_the_same_equilibrium(name):
         assert np.abs(np.asarray(result.positions - rest.positions)).max() < 1e-6 * 0.1
 
 
+@pytest.mark.slow
 def test_without_it_the_code_tells():
     result = lj.simulate(replace(HANGING, solve=lj.Solve()), start=inverted_start(0.2, 1))
     assert int(result.status[0]) != status.CONVERGED

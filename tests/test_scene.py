@@ -251,6 +251,7 @@ def test_a_body_that_cannot_move_is_pointed_out():
     scene_from(content | {"fixed": [{"where": {"z_max": 0.0}}]})
 
 
+@pytest.mark.slow
 def test_density_is_one_number_or_one_a_node():
     """By node: a body of two halves weighs what both weigh; other shapes are refused."""
     mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 3))  # 16 nodes, 18 elements

@@ -174,6 +174,7 @@ def test_order_of_the_integrators(integrator, order, verified):
     assert abs(observed - order) < 0.25
 
 
+@pytest.mark.slow
 def test_implicit_euler_only_dissipates():
     mesh = box()
     scene = lj.Scene(
@@ -202,7 +203,8 @@ def test_implicit_euler_only_dissipates():
     assert energies[0] - energies[-1] > 1e-3 * scale
 
 
-@pytest.mark.parametrize("integrator", ["euler", pytest.param("newmark", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["euler", "newmark"])
 def test_momentum_changes_by_the_outer_forces(integrator):
     # Sum of m a = weight + reactions, in every step, whatever happens inside.
     mesh = box()
@@ -397,6 +399,7 @@ def test_one_step_of_newton_solves_to_the_tolerance_asked_for():
     assert float(lj.simulate(light).statistics.residual[0]) < 1e-9
 
 
+@pytest.mark.slow
 def test_one_step_of_newton_takes_the_regularised_stiffness():
     """The chapter's own scheme (4.1.2 iii), against a sparse solve with the assembled matrix, from a pressed start."""
     scene = hanging(steps=1, newton="one_step", robust="regularised", tolerance=1e-9)
@@ -416,6 +419,7 @@ def test_one_step_of_newton_takes_the_regularised_stiffness():
     assert np.abs(np.asarray(plain) - expected).max() > 1e-3 * np.abs(expected - x).max()
 
 
+@pytest.mark.slow
 def test_a_tolerance_below_roundoff_stalls_at_the_answer():
     """In float32 no residual of 1e-8 can be met: the step says so, is not cut to pieces, and is near the root."""
     mesh = box()
@@ -445,7 +449,8 @@ def test_single_precision_says_so():
     assert jax.eval_shape(lj.simulate, once).positions.dtype == jnp.float32
 
 
-@pytest.mark.parametrize(("cells", "allowed"), [((16,), 0.1), pytest.param((32, 64), 0.01, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("cells", "allowed"), [((16,), 0.1), ((32, 64), 0.01)])
 def test_cooks_membrane(cells, allowed, verified):
     # Miehe 1994, plane strain: the middle of the right edge rises by 14.74 mm.
     errors = []
@@ -475,6 +480,7 @@ def test_cooks_membrane(cells, allowed, verified):
     assert order is None or errors[0] / errors[1] > 3
 
 
+@pytest.mark.slow
 def test_what_ends_unloaded_has_converged():
     # Down and back to rest, with a bend inside a step: roundoff is no unbalanced force.
     mesh = box(1)

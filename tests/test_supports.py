@@ -68,6 +68,7 @@ def test_springs_along_the_surface_carry_shear():
     assert np.allclose(moved[part(mesh, z_max=0.0), 0], 3.0 / 2e3, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_springs_on_nodes():
     mesh = box()
     nodes = jnp.asarray(part(mesh, z_max=0.0))

@@ -161,6 +161,7 @@ def test_killed_and_resumed(files):
     assert content(out) == content(whole)
 
 
+@pytest.mark.slow
 def test_two_devices_find_the_same(files):
     """In a process of its own: the number of devices is fixed at the start."""
     assert main(command(files, "--out", str(files / "one.h5"))) == 0

@@ -51,7 +51,7 @@ def test_assembled_stiffness_is_the_sparse_one():
     assert np.abs(np.stack(block_matrix.product(A, V.T), axis=-1) - expected).max() < 1e-13 * abs(K).max() * 10
 
 
-@pytest.mark.parametrize("part", ["all", "isochoric"])
+@pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_viscous_and_porous_tangent_against_autodiff(part):
     prony = lj.Prony(ratios=PRONY.ratios, relaxation_times=PRONY.relaxation_times, part=part)
     scene = lj.Scene(mesh=MESH, law=LAW, viscosity=prony, porosity=SPONGE)

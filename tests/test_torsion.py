@@ -69,13 +69,14 @@ def test_cycle_answers_the_discrete_formula(rig, law, prony, scheme, by, verifie
     assert np.abs(_complex(one) / _discrete(prony, OMEGA, 50) - 1).max() < 0.1 * STRAIN
 
 
+@pytest.mark.slow
 def test_from_rest_the_transient_dies_to_the_same_answer(rig, law, prony):
     drive = Drive(by="angle", start="rest", cycles=12)
     m = torsion.moduli(rig, law, prony, OMEGA[1:2], _amplitude(rig, "angle"), drive)
     assert np.abs(_complex(m) / _discrete(prony, OMEGA[1:2], 50) - 1).max() < 1e-6
 
 
-@pytest.mark.parametrize(("scheme", "order"), [("exponential", 2), ("chapter", 1)])
+@pytest.mark.parametrize(("scheme", "order"), [("exponential", 2), pytest.param("chapter", 1, marks=pytest.mark.slow)])
 def test_observed_order_in_time(rig, law, prony, scheme, order, verified):
     prony = replace(prony, scheme=scheme)
     exact = 770 * (1 - viscosity.complex_ratios(prony, OMEGA[2:]).sum(axis=0))
@@ -123,10 +124,11 @@ def test_relaxing_the_isochoric_part_alone(rig, law, prony):
 
 
 #: Radius and height [m]: of the README's data, of a small rig, of a tall and of a flat sample.
-PLATES = [(0.004, 0.0092), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((0.01, 0.004), (0.01, 0.041)))]
+PLATES = [(0.004, 0.0092), (0.01, 0.004), (0.01, 0.041), (0.02, 0.001)]
 
 
-@pytest.mark.parametrize(("radius", "height"), [*PLATES, pytest.param(0.02, 0.001, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("radius", "height"), PLATES)
 def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
     """What is left after the correction is of the order of the strain, on any mesh."""
     rig, strain = torsion.make_rig(radius, height, torsion.linear_cell_for(radius, height)), 1e-3
@@ -188,7 +190,8 @@ def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatc
 LAWS_OWN = {"neo_hookean": {"bulk": 1.0}, "mooney_rivlin": {"c10": 1.0, "c01": 1.0}}
 
 
-@pytest.mark.parametrize("name", ["neo_hookean", pytest.param("mooney_rivlin", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["neo_hookean", "mooney_rivlin"])
 def test_gradients_against_central_differences(rig, name):
     """V-shaped error curve: falls with the step (truncation), rises again (roundoff), lowest below 1e-6."""
     base = lj.laws.typical(name)
@@ -245,7 +248,8 @@ def test_torque_history_against_febio(febio, prony, verified):
     assert off < 1e-6
 
 
-@pytest.mark.parametrize("cell_size", [0.005, pytest.param(0.0035, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cell_size", [0.005, 0.0035])
 def test_inertia_against_the_torsional_wave(law, prony, cell_size, verified):
     """A tall sample: M = pi r^4/2 G* k cot(k h) theta, k = omega sqrt(rho/G*); at 41 mm inertia is no small thing."""
     height, omega = 0.041, 2 * np.pi * 2.0

@@ -90,7 +90,7 @@ def test_coefficients_are_exact_for_any_step(scheme, ratio):
         assert abs(ours - float(theirs)) <= 8 * np.finfo(float).eps * max(abs(float(theirs)), 1e-300)
 
 
-@pytest.mark.parametrize("part", viscosity.PARTS)
+@pytest.mark.parametrize("part", ["isochoric", pytest.param("all", marks=pytest.mark.slow)])
 def test_step_relaxation_follows_alpha(part, table_2):
     law = lj.laws.typical("neo_hookean")
     prony = replace(table_2, part=part)
