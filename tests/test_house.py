@@ -67,7 +67,7 @@ STOREYS = {
         "jobs",
         "commands",
     ),
-    "fitting": ("readers", "rigs", "methods", "fits", "reports", "commands"),
+    "fitting": ("readers", "rigs", "methods", "waves", "fits", "reports", "commands"),
 }
 #: Files of a package that belong to no room: what users import, and the way in.
 DOORS = {"liverjax": {"check"}, "fitting": {"fit", "joint", "rheometer", "torsion"}}

@@ -41,7 +41,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         dest="others",
         default=[],
         metavar="TEST",
-        help="further tests of the same material (relaxation, creep, sweep): one Prony series for all",
+        help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")

@@ -50,9 +50,12 @@ def _read_one_sweep(options: argparse.Namespace, path: Path) -> "Measured":
 
 
 def _any(options: argparse.Namespace, path: Path) -> "Measured":
-    """A test in time, or another sweep."""
+    """Shear waves, a test in time, or another sweep."""
     from fitting.readers import rheometer, time_tests
+    from fitting.waves import dispersion
 
+    if dispersion.names_velocities(path):
+        return dispersion.read(path, options.density)
     try:
         sweep = rheometer.read_sweep(path)
     except InputError as no_sweep:

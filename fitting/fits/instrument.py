@@ -52,29 +52,29 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
         shorter = some(sweep, kept)
         part = _error_of_inertia(viscoelastic.closed_form(shorter, fit.modes), shorter)[:2]
     found = InertiaError(value, error, *part)
-    details = fit.details | {"instrument": as_numbers(found)}
+    details = fit.details | {"instrument": inertia_numbers(found)}
     if not found.steady:
-        moved = "too few points are left to check it" if found.part is None else f"it is {_share(found.part)} there"
+        moved = "too few points are left to check it" if found.part is None else f"it is {_cent(found.part)} there"
         told = (
-            f"the instrument's inertia seems off by {_share(value)} (standard error {_share(error)}), but not "
+            f"the instrument's inertia seems off by {_cent(value)} (standard error {_cent(error)}), but not "
             f"without the last half decade ({moved}): the misfit of the model poses as inertia, so it is not corrected"
         )
         return fit._replace(details=details, warnings=(*fit.warnings, told)), sweep
     corrected = _shifted(sweep, value)
     note = (
-        f"the inertia that the instrument subtracted is taken to be off by {_share(value)} (standard error "
-        f"{_share(error)}, prior {_share(raw_torque.UNCERTAINTY)}), and the storage moduli are corrected for it"
+        f"the inertia that the instrument subtracted is taken to be off by {_cent(value)} (standard error "
+        f"{_cent(error)}, prior {_cent(raw_torque.UNCERTAINTY)}), and the storage moduli are corrected for it"
     )
     corrected = corrected._replace(notes=(*sweep.notes, note))
     spread = _with_direction(refitted, corrected, error)
     return refitted._replace(details=refitted.details | details, uncertainty=spread), corrected
 
 
-def _share(value: float) -> str:
+def _cent(value: float) -> str:
     return f"{100 * value:.2g} %"
 
 
-def as_numbers(found: InertiaError) -> dict[str, Any]:
+def inertia_numbers(found: InertiaError) -> dict[str, Any]:
     """The part `instrument` of fit.json."""
     return {
         "inertia_off_by": found.value,

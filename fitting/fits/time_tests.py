@@ -14,6 +14,7 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.time_tests import TimeTest
+from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 
 #: Answers that are fitted at most: of longer records those nearest to equal steps of log time.
@@ -161,13 +162,18 @@ def response(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax
     """What a test measures: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
 
     Args:
-        kind: "sweep", "relaxation" or "creep".
+        kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: of a test in time: what is driven (n,), and the rows (m,) that are answered.
+        drive: of a test in time: what is driven (n,), and the rows (m,) that are answered; of dispersion: the density,
+            and the numbers (m,) that were measured, of velocities [m/s] followed by attenuations [1/m].
     """
     if kind == "sweep":
         return jax.numpy.concatenate(generalised_maxwell.moduli(model, at))
+    if kind == "dispersion":
+        density, measured = drive
+        waves = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(model, at), at, density)
+        return jax.numpy.concatenate(waves)[measured]
     driven, rows = drive
     return (time_response.stress_response if kind == "relaxation" else time_response.strain_response)(
         model, at, driven

@@ -1,4 +1,6 @@
-"""One Prony series for several tests of one material in closed form: sweeps, relaxation, creep; and what each adds.
+"""One Prony series for several tests of one material in closed form, and what each adds.
+
+Tests are sweeps, relaxation, creep, and phase velocities of shear waves.
 
 Every test has noise of its own, whose size is found with the fit: the weights of a test are what it leaves over.
 """
@@ -20,6 +22,8 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
+from fitting.waves import shear_waves
+from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 
 #: Rounds of fit and weights, smallest relative noise that a test is given, and starts.
@@ -27,7 +31,7 @@ ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
 #: The misfit of a test in the common fit over that by itself, above which the tests do not agree.
 APART = 1.5
 
-Measured = Sweep | TimeTest
+Measured = Sweep | TimeTest | Dispersion
 
 
 class Band(NamedTuple):
@@ -39,7 +43,7 @@ class Band(NamedTuple):
 class Share(NamedTuple):
     """What one test says of the common parameters."""
 
-    name: str  # sweep, relaxation or creep
+    name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # measured numbers
     noise: float  # relative size of what the common fit leaves
@@ -58,7 +62,7 @@ class Together(NamedTuple):
     uncertainty: Estimate
     converged: bool
     shares: list[Share]
-    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], or the answers
+    fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the answers
     tried: list[dict[str, Any]]
     warnings: tuple[str, ...]
     run_time: float
@@ -74,6 +78,9 @@ def _reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
     """Arrays that predict a test, its measured numbers and their scales."""
     if isinstance(test, Sweep):
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
+    if isinstance(test, Dispersion):
+        measured = test.measured
+        return (test.angular_frequency, test.density, np.arange(len(measured))), measured, measured
     _, (at, driven, rows, answer, scales) = time_tests.residuals_of(test, Kind())
     return (at, driven, rows), answer, scales
 
@@ -93,8 +100,10 @@ def _all_residuals(kinds: tuple[str, ...], fluid: bool) -> Callable[..., jax.Arr
 
 
 def name_of(test: Measured) -> str:
-    """sweep, relaxation or creep."""
-    return "sweep" if isinstance(test, Sweep) else test.kind
+    """sweep, dispersion, relaxation or creep."""
+    if isinstance(test, TimeTest):
+        return test.kind
+    return "sweep" if isinstance(test, Sweep) else "dispersion"
 
 
 def fit(
@@ -225,8 +234,20 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
     x = test.angular_frequency[:, None] * times
     one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
     A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])])
-    b = np.concatenate([test.storage, test.loss])
+    b = np.concatenate(_moduli_of(test))
+    A = A[: len(b)]
     return A / b[:, None], np.ones(len(b))
+
+
+def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
+    """G' and G'' [Pa]; of velocities alone nearly |G|, in place of G'."""
+    if isinstance(test, Sweep):
+        return test.storage, test.loss
+    if test.attenuation is None:
+        return (test.density * test.velocity**2,)
+    found = shear_waves.moduli_of(test.velocity, test.attenuation, test.angular_frequency, test.density)
+    # Where noise makes them negative they are nothing to begin with.
+    return tuple(np.maximum(G, 1e-2 * np.abs(found[0]).max()) for G in found)
 
 
 def _told_of_all(chosen: Together, tried: list[Together], band: Band) -> Together:

@@ -16,6 +16,7 @@ from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
 from fitting.reports import posterior_report
+from fitting.waves import shear_waves
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
 
@@ -64,6 +65,9 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
         "noise_factor": u.noise,
         "mean_relative_error": float(errors.mean()),
         "max_relative_error": float(errors.max()),
+        "shear_waves": shear_waves.waves_of_moduli(
+            fit.storage, fit.loss, sweep.angular_frequency, fit.details.get("density_kg_m3")
+        ),
         "warnings": list(fit.warnings),
         "run_time_s": fit.run_time,
         "compile_time_s": fit.compile_time,

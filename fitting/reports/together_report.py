@@ -8,11 +8,23 @@ import numpy as np
 
 from fitting.fits.time_tests import thinned
 from fitting.fits.together import Share, Together
+from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
 from fitting.reports.sweep_report import numbers
+from fitting.waves import shear_waves
+from fitting.waves.dispersion import Dispersion
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
+
+#: Curves of a test over frequency, and what its panel shows.
+CURVES = {"sweep": ("G'", "G''"), "dispersion": ("phase velocity [m/s]", "attenuation [1/m]")}
+QUANTITIES = {
+    "sweep": "modulus [Pa]",
+    "dispersion": "shear waves",
+    "relaxation": "stress [Pa]",
+    "creep": "strain [1]",
+}
 
 
 def write(out: Path, found: Together) -> dict[str, Any]:
@@ -37,6 +49,7 @@ def write(out: Path, found: Together) -> dict[str, Any]:
             "correlation_names": list(u.names),
             "mean_relative_error": float(errors @ points / points.sum()),
             "max_relative_error": max(_largest(found)),
+            "shear_waves": _waves(found),
             "tests": [_share_of_test(s, n) for s in found.shares],
             "warnings": list(found.warnings),
             "run_time_s": found.run_time,
@@ -48,6 +61,14 @@ def write(out: Path, found: Together) -> dict[str, Any]:
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(found), out / "fit.png")
     return content
+
+
+def _waves(found: Together) -> dict[str, Any]:
+    """Shear waves over the band of all tests, four a decade."""
+    high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
+    omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
+    density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
+    return shear_waves.waves_of_moduli(*moduli(found.model, omega), omega, density)
 
 
 def _equilibrium(found: Together) -> float:
@@ -79,6 +100,8 @@ def _measured(found: Together, k: int) -> tuple[np.ndarray, np.ndarray]:
     test = found.tests[k]
     if isinstance(test, Sweep):
         return test.angular_frequency / (2 * np.pi), np.concatenate([test.storage, test.loss])
+    if isinstance(test, Dispersion):
+        return test.angular_frequency / (2 * np.pi), test.measured
     rows = thinned(test)
     return test.time[rows], test.answer[rows]
 
@@ -121,15 +144,15 @@ def figure(found: Together) -> Any:
     axes = np.atleast_1d(fig.subplots(1, count))
     for k, (test, panel) in enumerate(zip(found.tests, axes, strict=True)):
         x, y = _measured(found, k)
-        sweep = isinstance(test, Sweep)
-        pairs = [("G'", 0, BLUE), ("G''", 1, ORANGE)] if sweep else [("measured", 0, BLUE)]
-        for label, half, colour in pairs:
+        share = found.shares[k]
+        labels = CURVES.get(share.name, ("measured",))[: len(y) // len(x)]
+        for half, (label, colour) in enumerate(zip(labels, (BLUE, ORANGE), strict=False)):
             part = slice(half * len(x), (half + 1) * len(x))
             panel.plot(x, y[part], "o", color=colour, ms=3, mfc="none", label=label)
-            panel.plot(x, found.fitted[k][part], "-", color=colour if sweep else ORANGE, lw=1.2)
-        share = found.shares[k]
-        unit = "modulus [Pa]" if sweep else "stress [Pa]" if share.name == "relaxation" else "strain [1]"
-        panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]" if sweep else "time [s]", ylabel=unit)
+            panel.plot(x, found.fitted[k][part], "-", color=colour if len(labels) > 1 else ORANGE, lw=1.2)
+        spectral = isinstance(test, (Sweep, Dispersion))
+        panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]" if spectral else "time [s]")
+        panel.set_ylabel(QUANTITIES[share.name])
         panel.set_title(
             f"{share.name}: misfit {100 * share.noise:.2g} %\nby itself {100 * share.alone:.2g} %", fontsize=9
         )

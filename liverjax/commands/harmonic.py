@@ -19,10 +19,10 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
     from liverjax.core.versions import versions
     from liverjax.jobs import waves
 
-    _refuse(options)
+    _refuse_options(options)
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
-    ran = waves.solved(scene, options.about, options.mesh_error)
+    ran = waves.solved_waves(scene, options.about, options.mesh_error)
     waves.write_waves(target, scene, ran, {"scene": text, "run_time_s": ran.seconds, "versions": versions()})
     written = [str(target)]
     if options.vtu:
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
     return 0
 
 
-def _refuse(options: argparse.Namespace) -> None:
+def _refuse_options(options: argparse.Namespace) -> None:
     given = {"fields": options.fields, "reactions": options.reactions, "png": options.png, "resume": options.resume}
     for name, value in given.items():
         if value:

@@ -25,7 +25,7 @@ class Waves(NamedTuple):
     seconds: float
 
 
-def solved(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
+def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     """The motion of a scene of kind harmonic.
 
     Args:
@@ -36,14 +36,14 @@ def solved(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     Raises:
         InputError: as `harmonic`; a file that is no result of this mesh.
     """
-    x = None if about is None else _positions(about, scene)
+    x = None if about is None else _last_positions(about, scene)
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
     seconds = time.perf_counter() - begin
     return Waves(found, harmonic_mesh_error(scene, found, about=x) if mesh_error else None, seconds)
 
 
-def _positions(file: Path, scene: Scene) -> jax.Array:
+def _last_positions(file: Path, scene: Scene) -> jax.Array:
     import h5py
 
     try:

@@ -124,10 +124,10 @@ def _products(order: int) -> np.ndarray:
         functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]
     else:
         functions = [{tuple(2 * n for n in v): 2.0, v: -1.0} for v in vertex]
-        functions += [{_power(vertex, i, j): 4.0} for i, j in PAIRS]
+        functions += [{_exponents(vertex, i, j): 4.0} for i, j in PAIRS]
     if order == 3:
-        functions += [{_power(vertex, i, i, j): 1.0, _power(vertex, i, j, j): -1.0} for i, j in PAIRS]
-        functions += [{_power(vertex, i, j, k): 27.0} for i, j, k in FACES]
+        functions += [{_exponents(vertex, i, i, j): 1.0, _exponents(vertex, i, j, j): -1.0} for i, j in PAIRS]
+        functions += [{_exponents(vertex, i, j, k): 27.0} for i, j, k in FACES]
 
     def integral(f: dict[tuple, float], g: dict[tuple, float]) -> float:
         total = 0.0
@@ -139,7 +139,7 @@ def _products(order: int) -> np.ndarray:
     return np.array([[integral(f, g) for g in functions] for f in functions])
 
 
-def _power(vertex: list[tuple], *which: int) -> tuple:
+def _exponents(vertex: list[tuple], *which: int) -> tuple:
     """Exponents of a product of linear functions."""
     return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))
 

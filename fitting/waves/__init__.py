@@ -1,0 +1,1 @@
+"""Shear waves: what a material does to them, and what they say of a material."""

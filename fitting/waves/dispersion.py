@@ -1,0 +1,143 @@
+"""Phase velocities of shear waves over frequency, with or without attenuation, from files: as ultrasound gives them."""
+
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers.text_tables import split_line, text_of, to_number
+from fitting.waves.shear_waves import DENSITY
+from liverjax.core.errors import InputError
+
+#: Units of every quantity and their factors to SI; the first is taken where none is given. 1 Np is a factor of e.
+UNITS = {
+    "frequency": {"Hz": 2 * np.pi, "kHz": 2e3 * np.pi, "rad/s": 1.0, "rad_s": 1.0},
+    "velocity": {"m/s": 1.0, "m_s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "attenuation": {"1/m": 1.0, "Np/m": 1.0, "1/cm": 1e2, "Np/cm": 1e2, "1/mm": 1e3}
+    | {"dB/m": np.log(10) / 20, "dB/cm": 5 * np.log(10)},
+}
+#: Words that begin a heading, and the quantity.
+WORDS = (
+    ("angular frequency", "frequency"),
+    ("frequency", "frequency"),
+    ("phase velocity", "velocity"),
+    ("shear wave speed", "velocity"),
+    ("velocity", "velocity"),
+    ("speed", "velocity"),
+    ("attenuation", "attenuation"),
+)
+#: Frequencies that a file must have.
+FEWEST = 3
+
+
+class Dispersion(NamedTuple):
+    """Shear waves of a material in SI units, sorted by frequency."""
+
+    angular_frequency: np.ndarray  # (n,) [rad/s]
+    velocity: np.ndarray  # (n,) [m/s]
+    attenuation: np.ndarray | None  # (n,) [1/m]
+    density: float  # [kg/m^3]
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def resolved(self) -> tuple[float, float]:
+        """Shortest and longest relaxation time [s] that the frequencies resolve."""
+        return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Velocities, then attenuations where there are."""
+        return self.velocity if self.attenuation is None else np.concatenate([self.velocity, self.attenuation])
+
+
+def names_velocities(path: str | os.PathLike) -> bool:
+    """Whether a line of the file names a frequency and a velocity."""
+    return _header(text_of(Path(path), "shear waves").splitlines()) is not None
+
+
+def read(path: str | os.PathLike, density: float | None = None) -> Dispersion:
+    """Read a table with a header such as ``frequency_Hz,phase_velocity_m/s,attenuation_Np/m``.
+
+    Args:
+        path: text.
+        density: of the material [kg/m^3]; None takes `DENSITY`, with a note.
+
+    Raises:
+        InputError: one sentence naming file, line or column, value and remedy.
+    """
+    lines = text_of(Path(path), "shear waves").splitlines()
+    header = _header(lines)
+    if header is None:
+        raise InputError(f"{path}: no header names frequency_Hz and phase_velocity_m/s; add that header")
+    notes = [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is taken; --density gives another"]
+    columns = _columns(str(path), lines, header)
+    order = np.argsort(columns["frequency"], kind="stable")
+    columns = {q: v[order] for q, v in columns.items()}
+    for quantity, values in columns.items():
+        bad = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
+        if bad.size:
+            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be a number above 0: mend or remove its row")
+    if len(np.unique(columns["frequency"])) < FEWEST:
+        raise InputError(
+            f"{path}: {len(order)} rows of numbers are below the header; give {FEWEST} frequencies or more"
+        )
+    return Dispersion(
+        columns["frequency"],
+        columns["velocity"],
+        columns.get("attenuation"),
+        DENSITY if density is None else density,
+        str(path),
+        tuple(notes),
+    )
+
+
+def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | None:
+    """Line, delimiter, and place and unit of every quantity of the first line that names what is needed."""
+    for k, line in enumerate(lines):
+        delimiter, cells = split_line(line.lstrip("# "))
+        found: dict[str, tuple[int, str]] = {}
+        for place, cell in enumerate(cells):
+            named = _quantity_named(cell)
+            if named:
+                found.setdefault(named[0], (place, named[1]))
+        if {"frequency", "velocity"} <= set(found):
+            return k, delimiter, found
+    return None
+
+
+def _quantity_named(cell: str) -> tuple[str, str] | None:
+    """Quantity and unit of a heading: "Phase velocity (m/s)", "attenuation_Np/m"."""
+    parts = re.match(r'^"?([^\[(]*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?"?$', cell.strip())
+    if parts is None:
+        return None
+    name = parts.group(1).replace("_", " ").strip()
+    for word, quantity in WORDS:
+        if name.lower().startswith(word):
+            rest = parts.group(1).strip()[len(word) :].strip("_ ")
+            return quantity, (parts.group(2) or rest).replace("s-1", "1/s")
+    return None
+
+
+def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray]:
+    k, delimiter, found = header
+    factors = {}
+    for quantity, (_, unit) in found.items():
+        unit = unit or ("rad/s" if "angular" in lines[k].lower() and quantity == "frequency" else "")
+        known = UNITS[quantity]
+        if unit and unit not in known:
+            raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(known)}")
+        factors[quantity] = known[unit] if unit else next(iter(known.values()))
+    rows = []
+    for number, line in enumerate(lines[k + 1 :], k + 2):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        _, cells = split_line(line, delimiter)
+        values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
+        if any(v is None for v in values):
+            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is no number; mend it")
+        rows.append(values)
+    table = np.array(rows, float).reshape(-1, len(found))
+    return {q: table[:, j] * factors[q] for j, q in enumerate(found)}

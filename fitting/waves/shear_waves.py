@@ -1,0 +1,46 @@
+"""Plane shear waves in a viscoelastic solid: phase velocity and attenuation from the complex modulus, and back.
+
+A wave exp(i omega t - i k z) has k^2 = rho omega^2 / G*, with k = omega / c - i alpha (Catheline et al. 2004, J.
+Acoust. Soc. Am. 116, 3734).
+"""
+
+from typing import Any
+
+import numpy as np
+
+#: Of soft tissue [kg/m^3], where none is given.
+DENSITY = 1060.0
+
+
+def velocity_and_attenuation(storage: Any, loss: Any, omega: Any, density: Any) -> tuple[Any, Any]:
+    """Phase velocity c [m/s] and attenuation alpha [1/m] of the amplitude, of moduli (n,) [Pa]; NumPy or JAX.
+
+    Args:
+        storage, loss: G', G'' [Pa].
+        omega: angular frequencies [rad/s].
+        density: [kg/m^3].
+    """
+    size = (storage**2 + loss**2) ** 0.5
+    # |G| - G' as G''^2 / (|G| + G'): nothing cancels where the loss is small.
+    velocity = size * (2 / (density * (size + storage))) ** 0.5
+    return velocity, omega * loss * (density / (2 * (size + storage))) ** 0.5 / size
+
+
+def moduli_of(velocity: Any, attenuation: Any, omega: Any, density: Any) -> tuple[Any, Any]:
+    """G' and G'' [Pa] of waves: the inverse of `velocity_and_attenuation`."""
+    real, imaginary = omega / velocity, attenuation
+    square = (real**2 + imaginary**2) ** 2
+    scale = density * omega**2 / square
+    return scale * (real**2 - imaginary**2), scale * 2 * real * imaginary
+
+
+def waves_of_moduli(storage: np.ndarray, loss: np.ndarray, omega: np.ndarray, density: float | None) -> dict[str, Any]:
+    """The part `shear_waves` of fit.json: waves of a fitted model with moduli (n,) [Pa]."""
+    density = DENSITY if density is None else density
+    velocity, attenuation = velocity_and_attenuation(storage, loss, omega, density)
+    return {
+        "density_kg_m3": density,
+        "frequency_Hz": (omega / (2 * np.pi)).tolist(),
+        "phase_velocity_m_s": velocity.tolist(),
+        "attenuation_1_m": attenuation.tolist(),
+    }

@@ -1,0 +1,94 @@
+"""Phase velocity and attenuation of shear waves: formulas, files, and fits together with other tests."""
+
+import json
+
+import mpmath
+import numpy as np
+import pytest
+
+from fitting.__main__ import main
+from fitting.fits import together
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
+from fitting.waves import dispersion, shear_waves
+from fitting.waves.dispersion import Dispersion
+from liverjax import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+TRUTH = Maxwell(np.float64(3000.0), np.array([0.4, 0.3]), np.array([0.3, 0.002]))
+LOW, HIGH = np.geomspace(0.6, 60, 15), 2 * np.pi * np.linspace(60, 500, 12)
+
+
+def test_the_formulas_are_those_of_the_complex_wave_number():
+    """k = omega sqrt(rho / G*), with 50 digits."""
+    mpmath.mp.dps = 50
+    for storage, loss, omega in ((3000.0, 800.0, 400.0), (3000.0, 1e-9, 400.0), (10.0, 5e3, 1e5)):
+        k = omega * mpmath.sqrt(1000 / mpmath.mpc(storage, loss))
+        velocity, attenuation = shear_waves.velocity_and_attenuation(storage, loss, omega, 1000.0)
+        assert np.isclose(velocity, float(omega / k.real), rtol=1e-14)
+        assert np.isclose(attenuation, float(-k.imag), rtol=1e-14)
+        back = shear_waves.moduli_of(velocity, attenuation, omega, 1000.0)
+        # G' is a difference of squares where the loss is larger.
+        assert np.allclose(back, (storage, loss), rtol=0, atol=1e-14 * abs(complex(storage, loss)))
+
+
+def waves(noise: float, attenuation: bool = True) -> Dispersion:
+    c, a = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(TRUTH, HIGH), HIGH, 1060.0)
+    factor = 1 + noise * np.random.default_rng(3).standard_normal((2, len(HIGH)))
+    return Dispersion(HIGH, c * factor[0], a * factor[1] if attenuation else None, 1060.0, source="waves.csv")
+
+
+def sweep(noise: float) -> Sweep:
+    factor = 1 + noise * np.random.default_rng(4).standard_normal((2, len(LOW)))
+    G = generalised_maxwell.moduli(TRUTH, LOW)
+    return Sweep(LOW, G[0] * factor[0], G[1] * factor[1], source="sweep.csv")
+
+
+@pytest.mark.parametrize("attenuation", [True, False])
+def test_waves_add_the_short_time_that_the_sweep_does_not_see(attenuation):
+    found = together.fit([sweep(0.01), waves(0.01, attenuation)], 2)
+    u = found.uncertainty
+    assert found.converged
+    assert np.all(np.abs(u.values - [3000, 0.4, 0.3, 0.3, 0.002]) < 4 * u.standard_errors)
+    without_sweep, without_waves = (s.errors_without for s in found.shares)
+    assert without_waves[4] > 5 * u.standard_errors[4] and without_sweep[3] > 5 * u.standard_errors[3]
+    assert [s.points for s in found.shares] == [30, 24 if attenuation else 12]
+
+
+def test_the_command_reads_waves_and_writes_waves(tmp_path):
+    s, w = sweep(0.01), waves(0.01)
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", np.column_stack([LOW, s.storage, s.loss]), delimiter=",", header=head, comments="")
+    table = np.column_stack([HIGH / (2 * np.pi), 100 * w.velocity, 20 / np.log(10) * w.attenuation / 100])
+    head = "frequency (Hz);phase velocity (cm/s);attenuation (dB/cm)"
+    np.savetxt(tmp_path / "w.csv", table[::-1], delimiter=";", header=head, comments="# ultrasound\n", fmt="%.12g")
+    read = dispersion.read(tmp_path / "w.csv", 1060.0)
+    assert np.allclose([read.angular_frequency, read.velocity, read.attenuation], [HIGH, w.velocity, w.attenuation])
+    arguments = [str(tmp_path / "s.csv"), "--with", str(tmp_path / "w.csv"), "--modes", "2", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert [t["test"] for t in content["tests"]] == ["sweep", "dispersion"] and (tmp_path / "fit.png").is_file()
+    told = content["shear_waves"]
+    ours = np.interp(100.0, told["frequency_Hz"], told["phase_velocity_m_s"])
+    c, _ = shear_waves.velocity_and_attenuation(
+        *generalised_maxwell.moduli(TRUTH, np.array([200 * np.pi])), 200 * np.pi, 1060.0
+    )
+    assert np.isclose(ours, c[0], rtol=0.01)  # between two of four points a decade
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("frequency_Hz,phase_velocity_m/s\n50,1.5\n60,x\n70,1.7\n", "line 3"),
+        ("frequency_Hz,phase_velocity_m/s\n50,1.5\n60,-1.6\n70,1.7\n", "velocity -1.6 must be"),
+        ("frequency_Hz,phase_velocity_m/s\n50,1.5\n60,1.6\n", "2 rows"),
+        ("frequency_Hz,phase_velocity_furlong\n50,1.5\n60,1.6\n70,1.7\n", "unit 'furlong' of velocity"),
+        ("frequency_Hz,storage_modulus_Pa\n50,1.5\n", "no header names"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path, text, words):
+    (tmp_path / "w.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        dispersion.read(tmp_path / "w.csv")
