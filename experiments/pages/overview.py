@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import elements, rigs
+from experiments.pages import bodies, elements, rigs
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
 from experiments.pages.stability import Returned, returned
@@ -444,6 +444,16 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         "has linear tetrahedra alone, and no error of the mesh",
     ),
     "liver_mesh": ("how far is the phantom's answer known: two meshes, two orders?", elements.phantom, ""),
+    "liver_in_place": (
+        "the phantom with capsule, ligaments, vessels, on a plane, and its unloaded shape: what does each change?",
+        bodies.in_place,
+        "names capsule, vessels and boundary conditions as what its liver lacks",
+    ),
+    "indentation": (
+        "a sphere on a layer: how wrong is a half-space, and how well do noisy curves give modulus and contact point?",
+        bodies.indented,
+        "",
+    ),
     "stability_rigs": ("error of tension, indentation and creep against run time: mesh, elements", rigs.came_out, ""),
     "stability_cost": ("what does robustness at hand cost where it is not needed?", _cost, ""),
     "laws_table": ("every law: error of its terms beside time and compile time", _laws, ""),

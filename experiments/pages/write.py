@@ -4,7 +4,17 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.pages import elements, front, identification, overview, porosity, stability, tables, verification
+from experiments.pages import (
+    bodies,
+    elements,
+    front,
+    identification,
+    overview,
+    porosity,
+    stability,
+    tables,
+    verification,
+)
 from experiments.pages.results import RESULTS
 
 HERE = Path(__file__).parent.parent
@@ -14,7 +24,12 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     HERE.parent / "fitting" / "README.md": front.FITS,
     HERE.parent / "liverjax" / "README.md": front.SIMULATOR,
     HERE / "README.md": overview.PARTS,
-    HERE / "TABLES.md": tables.PARTS | elements.PARTS | porosity.PARTS | identification.PARTS | stability.PARTS,
+    HERE / "TABLES.md": tables.PARTS
+    | elements.PARTS
+    | porosity.PARTS
+    | identification.PARTS
+    | stability.PARTS
+    | bodies.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
 }
 

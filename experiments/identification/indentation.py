@@ -1,0 +1,94 @@
+"""Indentation of a bonded layer: what a half-space and the published series make of it, and how well fits do.
+
+The force of a sphere on a layer comes from the integral equation of the contact (`fitting.rigs.thin_layer`). A fit that
+takes the layer for a half-space (Hertz) finds a modulus that is too high by the factor shown; the series of Dimitriadis
+et al. 2002 (Biophys. J. 82:2798) holds for thin contacts only. Then curves with 5 % of noise are fitted, modulus and
+contact point together: median errors, how often 95 % intervals cover, and seconds a curve.
+
+``python -m experiments indentation`` (a minute) writes results/indentation.json.
+"""
+
+import time
+
+import numpy as np
+
+from experiments.common import either, plt, save
+from fitting.methods.contact_point import fit_contact
+from fitting.rigs.thin_layer import Indenter, Layer
+from liverjax.core.plotting import COLOURS
+
+RADIUS, MODULUS, DEEPEST = 5e-3, 2400.0, 5e-4
+#: Thickness over the contact radius of the half-space, sqrt(R d).
+THICKNESSES = (0.5, 1.0, 2.0, 4.0, 10.0)
+POISSONS = (0.3, 0.4, 0.499)
+CURVES, NOISE = either(1000, 100), 0.05
+
+
+def hertz(depth: np.ndarray, poisson: float) -> np.ndarray:
+    """Force per unit modulus [N/Pa] of a half-space."""
+    return 4 / 3 / (1 - poisson**2) * np.sqrt(RADIUS) * depth**1.5
+
+
+def series(depth: np.ndarray, poisson: float, thickness: float) -> np.ndarray:
+    """The same of a bonded layer by the series of Dimitriadis et al."""
+    a = -(1.2876 - 1.4678 * poisson + 1.3442 * poisson**2) / (1 - poisson)
+    b = (0.6387 - 1.0277 * poisson + 1.5164 * poisson**2) / (1 - poisson)
+    chi, pi = np.sqrt(RADIUS * depth) / thickness, np.pi
+    third = 8 / pi**3 * (a**3 + 4 * pi**2 / 15 * b)
+    fourth = 16 * a / pi**4 * (a**3 + 3 * pi**2 / 5 * b)
+    more = -2 * a / pi * chi + 4 * a**2 / pi**2 * chi**2 - third * chi**3 + fourth * chi**4
+    return hertz(depth, poisson) * (1 + more)
+
+
+def thin_layers() -> list[dict]:
+    """Modulus of a half-space over the true one at the deepest point, and the error of the series."""
+    rows = []
+    for poisson in POISSONS:
+        for ratio in THICKNESSES:
+            h = ratio * np.sqrt(RADIUS * DEEPEST)
+            force = Layer(Indenter("sphere", h, poisson, RADIUS)).force(np.array([DEEPEST]))[0]
+            factor = float(force / hertz(np.array([DEEPEST]), poisson)[0])
+            by_series = float(series(np.array([DEEPEST]), poisson, h)[0] / force - 1)
+            rows.append({"poisson": poisson, "thickness": ratio, "hertz": factor, "series_error": by_series})
+            print(rows[-1], flush=True)
+    return rows
+
+
+def fits() -> list[dict]:
+    """Modulus and contact point of noisy curves of three layers."""
+    start, rows = 1e-4, []
+    depth = np.linspace(0.0, DEEPEST + start, 80)
+    for ratio in (1.0, 2.0, 10.0):
+        h, rng = ratio * np.sqrt(RADIUS * DEEPEST), np.random.default_rng(0)
+        layer = Layer(Indenter("sphere", h, 0.5, RADIUS))
+        force = MODULUS * layer.force(depth - start)
+        begin, found = time.perf_counter(), []
+        for _ in range(CURVES):
+            found.append(fit_contact(depth, force + NOISE * force.max() * rng.normal(size=len(depth)), layer.force))
+        seconds = (time.perf_counter() - begin) / CURVES
+        row = {"thickness": ratio, "curves": CURVES, "seconds": seconds}
+        for k, (name, true) in enumerate((("modulus", MODULUS), ("contact_point", start))):
+            values = np.array([getattr(f, name) for f in found])
+            errors = np.array([f.standard_errors[k] for f in found])
+            row[f"{name}_off"] = float(np.median(np.abs(values - true)) / (true if k == 0 else DEEPEST))
+            row[f"{name}_covered"] = float(np.mean(np.abs(values - true) < found[0].quantile * errors))
+        rows.append(row)
+        print(row, flush=True)
+    return rows
+
+
+def main() -> None:
+    """Both tables and a figure of the factors."""
+    layers, noisy = thin_layers(), fits()
+    figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
+    for poisson, colour in zip(POISSONS, COLOURS, strict=False):
+        own = [r for r in layers if r["poisson"] == poisson]
+        axes.loglog([r["thickness"] for r in own], [r["hertz"] for r in own], "o-", color=colour, label=f"{poisson:g}")
+    axes.set_xlabel("thickness of the layer over the contact radius")
+    axes.set_ylabel("modulus by Hertz over the true one")
+    axes.legend(title="Poisson's ratio")
+    save("indentation", {"layers": layers, "fits": noisy, "noise": NOISE}, figure)
+
+
+if __name__ == "__main__":
+    main()
