@@ -1,8 +1,12 @@
 """Strict numerics for every test: 64 bit, no silent rank promotion; data of other programs where it is present."""
 
+import os
+
+# Two workers have two cores: threads of their own would wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import gc
 import json
-import os
 import shutil
 import tempfile
 from importlib.metadata import version
