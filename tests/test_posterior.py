@@ -99,6 +99,13 @@ def test_the_draws_of_one_mode_have_the_moments_of_quadrature():
     assert found.r_hat.max() < 1.01
 
 
+def test_data_without_noise_have_a_narrow_posterior_and_no_warning():
+    sweep = one_mode(0.0, 1)
+    found = posterior.of_sweep(viscoelastic.closed_form(sweep, 1), sweep, 200)
+    assert not found.warnings()
+    assert np.allclose(found.draws, [700.0, 420.0, 0.4, 0.3], rtol=100 * posterior.QUIETEST)
+
+
 def calibration(modes: int, count: int, noise: float, monkeypatch) -> np.ndarray:
     """Chances of ranks of the truth among its draws (K,), were they uniform; truths are drawn from the prior."""
     monkeypatch.setattr(tempering, "CHAINS", 1)

@@ -70,8 +70,8 @@ class Posterior(NamedTuple):
         ]
 
 
-#: R-hat below which the chains agree.
-AGREED = 1.01
+#: R-hat below which the chains agree, and the smallest relative error of data: without one a posterior is a point.
+AGREED, QUIETEST = 1.01, 1e-6
 
 
 class Target(NamedTuple):
@@ -90,7 +90,7 @@ class Target(NamedTuple):
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
     """Log of the integral of s^-m exp(-square / 2 s^2) ds / s over all s, or over s >= 1 where deviations are given."""
-    half = 0.5 * np.maximum(square, 1e-26 * count)  # an exact fit has no posterior but a point
+    half = 0.5 * np.maximum(square, QUIETEST**2 * count)
     out = -0.5 * count * np.log(half)
     return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
 
