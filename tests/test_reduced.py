@@ -35,7 +35,7 @@ def _every_motion(scene: lj.Scene) -> jax.Array:
     return jnp.asarray(np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape))
 
 
-@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_all_motions_and_all_points_are_the_full_model(order):
     # Another path to the same numbers: Newton's method on dense matrices, memory and inertia of coordinates.
     scene = _bar((1, 1, 1), order, viscosity=PRONY, solve=MOVING)
