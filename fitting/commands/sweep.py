@@ -75,6 +75,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
     )
+    command.add_argument("--report", action="store_true", help="one page with pictures and numbers too, report.pdf")
     command.add_argument(
         "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
     )
@@ -124,6 +125,11 @@ def run(options: argparse.Namespace) -> int:
         print(posterior_report.table(posterior))
     if options.cards:
         write_cards(options.out, fits[-1].model)
+    if options.report:
+        from fitting.reports import one_page
+
+        one_page.write(options.out / "report.pdf", sweep, fits, content)
+        print(f"written: {options.out}/report.pdf")
     for name, (low, high) in (profile or {}).items():
         ends = ("below reach" if low is None else f"{low:.4g}", "beyond reach" if high is None else f"{high:.4g}")
         print(f"profile 95 % (closed form): {name} from {ends[0]} to {ends[1]}")
@@ -180,6 +186,7 @@ def _check_samples(options: argparse.Namespace) -> None:
         ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
         ("--profile", options.profile, "leave it out, or give one file"),
         ("--samples", options.samples is not None, "leave it out, or give one file"),
+        ("--report", options.report, "leave it out, or give one file"),
         ("--model spectrum", options.model == "spectrum", "give --model prony, fractional or auto"),
     ):
         if asked:
@@ -192,6 +199,7 @@ def _check_together(options: argparse.Namespace) -> None:
         ("--method torsion", options.method == "torsion"),
         ("--profile", options.profile),
         ("--samples", options.samples is not None),
+        ("--report", options.report),
         (f"--model {options.model}", options.model != "prony"),
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):

@@ -172,8 +172,8 @@ def figure(sweep: Sweep, fits: list[Fit]) -> Any:
     left, right = halves
     top, rest = left.subplots(2, 1, sharex=True, height_ratios=(height - 1.9, 1.9))
     times, table = right.subplots(2, 1, height_ratios=(height - foot, foot))
-    _moduli(top, rest, sweep, fits)
-    _time_constants(times, sweep, fits)
+    draw_moduli(top, rest, sweep, fits)
+    draw_time_constants(times, sweep, fits)
     table.axis("off")
     text = table.text(0, 1, "\n".join(lines), family="monospace", fontsize=8, va="top", transform=table.transAxes)
     text.set_in_layout(False)  # its axes are as large as it is
@@ -185,8 +185,8 @@ def figure(sweep: Sweep, fits: list[Fit]) -> Any:
     return fig
 
 
-def _moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
-    """Data, the closed form as a fine line, what was simulated, and the relative difference below."""
+def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
+    """Data, the closed form as a fine line and what was simulated on `top`, the relative differences on `rest`."""
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
@@ -226,8 +226,12 @@ def _legend_above(axes: Any, columns: int) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.3, fontsize=8, ncols=columns, frameon=False)
 
 
-def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
-    """Strength against time constant with 95 % intervals, and the band that the frequencies resolve."""
+def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int = 2) -> None:
+    """Strength against time constant with 95 % intervals, and the band that the frequencies resolve.
+
+    Args:
+        columns: of the legend.
+    """
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
     axes.axvspan(low, high, color=GREY, alpha=0.12, label="resolved by the data")
     for fit, colour, marker in zip(fits, (GREEN, "black"), "ox", strict=False):
@@ -241,7 +245,7 @@ def _time_constants(axes: Any, sweep: Sweep, fits: list[Fit]) -> None:
         )
     axes.set(xscale="log", xlabel="relaxation time [s]", ylabel="ratio of G0 [1]")
     axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # room above the largest
-    _legend_above(axes, 2)
+    _legend_above(axes, columns)
 
 
 def _parameter_rows(fit: Fit) -> list[str]:

@@ -1,0 +1,59 @@
+"""A fit on one page to print or to file: pictures, numbers, what was left out and what to be careful of."""
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from fitting.fits.viscoelastic import Fit
+from fitting.readers.rheometer import Sweep
+from fitting.reports import sweep_report
+from liverjax.core.plotting import pyplot, save
+
+#: A4 [inch], the part of its height that is text, and the margin.
+WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
+#: Characters of a line, and the size [pt] at which so many fit; a longer text is smaller.
+CHARACTERS, SIZE = 104, 8.0
+
+
+def write(file: Path, sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> None:
+    """Write the page as PDF (or what else the name of the file says).
+
+    Args:
+        sweep, fits: as of `sweep_report.write`.
+        content: of fit.json.
+    """
+    save(page(sweep, fits, content), file)
+
+
+def page(sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> Any:
+    """The page as a figure."""
+    figure = pyplot().figure(figsize=(WIDTH, HEIGHT))
+    place = {"left": 0.12, "right": 0.96, "top": 0.91, "bottom": TEXT + 0.04, "wspace": 0.3}
+    grid = figure.add_gridspec(2, 2, width_ratios=(3, 2), height_ratios=(3, 1), **place)
+    top = figure.add_subplot(grid[0, 0])
+    sweep_report.draw_moduli(top, figure.add_subplot(grid[1, 0], sharex=top), sweep, fits)
+    sweep_report.draw_time_constants(figure.add_subplot(grid[:, 1]), sweep, fits, 1)
+    figure.suptitle(
+        f"{Path(sweep.source).name or 'sweep'}: {content['model']}, {content['method']}", fontsize=11, y=0.975
+    )
+    lines = text_of_page(sweep, fits, content)
+    size = min(SIZE, 72 * HEIGHT * (TEXT - 0.5 * MARGIN) / (1.25 * len(lines)))
+    figure.text(MARGIN, TEXT - 0.01, "\n".join(lines), family="monospace", fontsize=size, va="top", linespacing=1.2)
+    return figure
+
+
+def text_of_page(sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> list[str]:
+    """The lines below the pictures."""
+    f = content["shear_waves"]["frequency_Hz"]
+    rows = [
+        f"{len(f)} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz; errors are standard errors",
+        "",
+        *sweep_report.table(sweep, fits).splitlines(),
+    ]
+    for head, sentences in (("Notes", content["notes"]), ("To be careful of", content["warnings"])):
+        if sentences:
+            rows += ["", f"{head}:"]
+        for sentence in sentences:
+            rows += textwrap.wrap(sentence, CHARACTERS, initial_indent="- ", subsequent_indent="  ")
+    used = ", ".join(f"{name} {version}" for name, version in content["versions"].items())
+    return [*rows, "", *textwrap.wrap(used, CHARACTERS)]
