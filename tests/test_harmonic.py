@@ -276,7 +276,7 @@ kind = "harmonic"
 
 def test_scene_files(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
-    scene.write_text(FILE + "frequencies_Hz = [40.0, 60.0]\n")
+    scene.write_text(FILE + "frequencies = [40.0, 60.0]\n")
     out = ["--out", str(tmp_path / "out")]
     assert main(["simulate", str(scene), *out, "--vtu", "--mesh-error"]) == 0
     assert "60 Hz: at most" in capsys.readouterr().out
@@ -298,14 +298,31 @@ def test_scene_files(tmp_path, capsys):
     assert np.abs(about.displacement - expected.displacement).max() > 1e-7
 
 
+def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
+    heavy = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]") + "frequencies = [40.0]\n"
+    (tmp_path / "scene.toml").write_text(heavy)
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "out")]) == 0
+    still = FILE.split("[[displaced]]")[0].replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]")
+    still += "[[fixed]]\nwhere = {x_max = 0.0}\n"
+    (tmp_path / "still.toml").write_text(still)
+    rest = lj.simulate(lj.load_scene(tmp_path / "still.toml")).check().positions[-1]
+    expected = lj.harmonic(lj.load_scene(tmp_path / "scene.toml"), about=rest).displacement
+    with h5py.File(tmp_path / "out" / "result.h5") as file:
+        found = file["displacement"][()]
+    # Newton's tolerance of 1e-8; without the state the motion is another one.
+    assert np.allclose(found, expected, rtol=1e-5, atol=1e-10)
+    bare = lj.harmonic(lj.load_scene(tmp_path / "scene.toml")).displacement
+    assert np.abs(bare - expected).max() > 1e-3 * np.abs(expected).max()
+
+
 @pytest.mark.parametrize(
     ("line", "more", "words"),
     [
-        ("", [], "frequencies_Hz = [60.0] go together"),
-        ("frequencies_Hz = 60.0\n", [], "must be a list"),
-        ("frequencies_Hz = [-60.0]\n", [], "frequencies_Hz"),
-        ("frequencies_Hz = [60.0]\n", ["--png"], "--png is for runs in time"),
-        ("frequencies_Hz = [60.0]\n", ["--about", "none.h5"], "holds no positions"),
+        ("", [], "frequencies = [60.0] (Hz) go together"),
+        ("frequencies = 60.0\n", [], "must be a list"),
+        ("frequencies = [-60.0]\n", [], "frequencies"),
+        ("frequencies = [60.0]\n", ["--png"], "--png is for runs in time"),
+        ("frequencies = [60.0]\n", ["--about", "none.h5"], "holds no positions"),
     ],
 )
 def test_bad_scene_files_are_refused(tmp_path, capsys, line, more, words):
@@ -318,7 +335,7 @@ def test_bad_scene_files_are_refused(tmp_path, capsys, line, more, words):
 def test_runs_in_time_refuse_a_harmonic_scene():
     scene = slab(2, 1)
     with pytest.raises(lj.InputError, match=r"call lj\.harmonic"):
-        lj.simulate(replace(scene, solve=lj.Solve(kind="harmonic", frequencies_Hz=jnp.array([60.0]))))
+        lj.simulate(replace(scene, solve=lj.Solve(kind="harmonic", frequencies=jnp.array([60.0]))))
     with pytest.raises(lj.InputError, match="needs frequencies_Hz"):
         lj.harmonic(scene)
 

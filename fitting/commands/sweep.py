@@ -43,6 +43,14 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="TEST",
         help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
+    command.add_argument(
+        "--predict",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="TEST",
+        help="tests of the same material that are not fitted: how well the fit predicts them",
+    )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
@@ -117,8 +125,11 @@ def run(options: argparse.Namespace) -> int:
     if options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
     posterior = _posterior(options, sweep, fits[-1])
+    predictions = _predictions(options, sweep, fits[-1])
     content = sweep_report.write(options.out, sweep, fits, profile, posterior)
     print(sweep_report.table(sweep, fits))
+    for told in predictions:
+        print(told)
     if posterior is not None:
         from fitting.reports import posterior_report
 
@@ -137,6 +148,17 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")
     return 0 if fits[-1].converged else 1
+
+
+def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> list[str]:
+    """A sentence on each test that the fit is asked to predict."""
+    if not options.predict:
+        return []
+    from fitting.commands.together import read_any
+    from fitting.reports import prediction
+
+    tests = [read_any(options, path) for path in options.predict]
+    return [prediction.sentence(prediction.predict(fit, sweep.resolved, test)) for test in tests]
 
 
 def write_cards(out: Path, model: "Maxwell") -> None:
@@ -187,6 +209,7 @@ def _check_samples(options: argparse.Namespace) -> None:
         ("--profile", options.profile, "leave it out, or give one file"),
         ("--samples", options.samples is not None, "leave it out, or give one file"),
         ("--report", options.report, "leave it out, or give one file"),
+        ("--predict", bool(options.predict), "leave it out, or give one file"),
         ("--model spectrum", options.model == "spectrum", "give --model prony, fractional or auto"),
     ):
         if asked:
@@ -200,6 +223,7 @@ def _check_together(options: argparse.Namespace) -> None:
         ("--profile", options.profile),
         ("--samples", options.samples is not None),
         ("--report", options.report),
+        ("--predict", bool(options.predict)),
         (f"--model {options.model}", options.model != "prony"),
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):

@@ -20,7 +20,7 @@ def run(options: argparse.Namespace) -> int:
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
-    tests = [_read_one_sweep(options, options.sweep[0]), *(_any(options, path) for path in options.others)]
+    tests = [_read_one_sweep(options, options.sweep[0]), *(read_any(options, path) for path in options.others)]
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
@@ -49,7 +49,7 @@ def _read_one_sweep(options: argparse.Namespace, path: Path) -> "Measured":
     return rheometer.without_inertia(sweep, options.radius, options.height)
 
 
-def _any(options: argparse.Namespace, path: Path) -> "Measured":
+def read_any(options: argparse.Namespace, path: Path) -> "Measured":
     """Shear waves, a test in time, or another sweep."""
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion

@@ -74,7 +74,7 @@ class Together(NamedTuple):
         return len(self.model.ratios)
 
 
-def _reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
+def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
     """Arrays that predict a test, its measured numbers and their scales."""
     if isinstance(test, Sweep):
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
@@ -118,7 +118,7 @@ def fit(
     """
     tests = list(tests)
     band = Band(_resolved(tests))
-    largest = (sum(len(_reported_numbers(t)[1]) for t in tests) - 2) // 2
+    largest = (sum(len(reported_numbers(t)[1]) for t in tests) - 2) // 2
     if modes != "auto" and not 1 <= int(modes) <= largest:
         raise InputError(f"--modes {modes} is out of range: give 1 to {largest} for these files, or auto")
     top = min(uncertainty.supported_modes(band), largest)
@@ -169,7 +169,7 @@ def _criterion(fit: Together) -> float:
 
 def _one_test(tests: list[Measured], band: Band, modes: int, kind: Kind) -> Together:
     """Fit and weights in turn, for one number of modes."""
-    parts = [_reported_numbers(t) for t in tests]
+    parts = [reported_numbers(t) for t in tests]
     function = _all_residuals(tuple(map(name_of, tests)), kind.name == FLUID.name)
     best = viscoelastic.best_of(levenberg_marquardt, function)
     starts = _starts_of_all(tests, band, modes, kind)
@@ -291,7 +291,7 @@ def _shares(fit: Together) -> list[Share]:
 
     Tests without weight are taken out by infinite deviations: the program is there already.
     """
-    parts = [_reported_numbers(t) for t in fit.tests]
+    parts = [reported_numbers(t) for t in fit.tests]
     counts = [len(y) for _, y, _ in parts]
     place = np.repeat(np.arange(len(parts)), counts)
     function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)

@@ -11,8 +11,11 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
+from liverjax.core.struct import replace
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene
+from liverjax.simulation.run import simulate
+from liverjax.simulation.unloaded import resting
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import harmonic_mesh_error
 
@@ -30,17 +33,30 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
     Args:
         scene: `Scene`.
-        about: result.h5 of a run of the same mesh, whose last positions are the state that moves.
+        about: result.h5 of a run of the same mesh, whose last positions are the state that moves; None: the state of
+            rest under gravity, where there is gravity.
         mesh_error: estimate what the mesh leaves out.
 
     Raises:
         InputError: as `harmonic`; a file that is no result of this mesh.
     """
-    x = None if about is None else _last_positions(about, scene)
+    x = _under_its_weight(scene) if about is None else _last_positions(about, scene)
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
     seconds = time.perf_counter() - begin
     return Waves(found, harmonic_mesh_error(scene, found, about=x) if mesh_error else None, seconds)
+
+
+def _under_its_weight(scene: Scene) -> jax.Array | None:
+    """Positions at rest under gravity, with stresses that have relaxed; None where there is none."""
+    if scene.body is None or not np.any(np.asarray(scene.body.gravity)):
+        return None
+    still = resting(replace(scene, traction=(), body=replace(scene.body, times=None, history=None)))
+    solve = replace(still.solve, dt=None, steps=4, frequencies=None)
+    try:
+        return simulate(replace(still, solve=solve)).check().positions[-1]
+    except RuntimeError as error:
+        raise InputError(f"no state of rest under gravity was found ({error}): give one by --about") from None
 
 
 def _last_positions(file: Path, scene: Scene) -> jax.Array:

@@ -34,7 +34,7 @@ class Solve:
     """How the scene is solved; all but the time step and the tolerance is static."""
 
     dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
-    kind: str = static(default="static", about="static: no inertia; dynamic; harmonic: waves at `frequencies_Hz`")
+    kind: str = static(default="static", about="static: no inertia; dynamic; harmonic: waves at `frequencies`")
     steps: int = static(default=1, about="load steps, or time steps of dt", lower=1)
     tolerance: Any = param("1", "of the residual, relative to the forces at work", above=0.0, default=1e-8)
     newton: str = static(
@@ -58,7 +58,7 @@ class Solve:
     robust: str = static(
         default="off", about="projected or regularised: make the energy least where a step cannot be followed"
     )
-    frequencies_Hz: Any = param("Hz", "(F,) of harmonic motion", above=0.0, default=None)
+    frequencies: Any = param("Hz", "(F,) of harmonic motion", above=0.0, default=None)
     reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
     reduced_tolerance: Any = param(
         "1", "estimated error over the largest displacement, above which the full model runs", above=0.0, default=0.01

@@ -37,8 +37,8 @@ def check_choices(scene: Scene) -> None:
         value = getattr(scene.solve, key)
         if value not in allowed:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
-    if (scene.solve.kind == "harmonic") != (scene.solve.frequencies_Hz is not None):
-        raise InputError("[solve] kind = 'harmonic' and frequencies_Hz = [60.0] go together: give both, or neither")
+    if (scene.solve.kind == "harmonic") != (scene.solve.frequencies is not None):
+        raise InputError("[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) go together: give both, or neither")
     _loaded(scene)
     rubs = [name for name, physics in _named_physics(scene) if not physics.conservative]
     if rubs and (scene.solve.linear_solver == "direct" or scene.solve.robust != "off"):

@@ -390,8 +390,8 @@ def _read_solve(table: dict) -> Solve:
     values |= {
         key: _number(f"[solve] {key}", values[key]) for key in ("dt", "tolerance", "reduced_tolerance") if key in values
     }
-    if "frequencies_Hz" in values:
-        values["frequencies_Hz"] = jnp.asarray(_numbers("[solve] frequencies_Hz", values["frequencies_Hz"]))
+    if "frequencies" in values:
+        values["frequencies"] = jnp.asarray(_numbers("[solve] frequencies", values["frequencies"]))
     if not isinstance(values.get("reduced", ""), str):
         raise InputError(f'[solve] reduced = {values["reduced"]!r} is no file: write reduced = "model.h5"')
     return Solve(**values)

@@ -45,7 +45,7 @@ def unload(scene: Scene) -> Unloaded:
     Raises:
         InputError: no reference shape was found; traced numbers pass.
     """
-    points, code, relative = _found_shape(_resting(scene))
+    points, code, relative = _found_shape(resting(scene))
     if not isinstance(code, jax.core.Tracer) and int(code) != status.CONVERGED:
         raise InputError(
             '[mesh] is = "loaded": no reference shape was found that these loads bring to the given one (the rest is '
@@ -56,7 +56,7 @@ def unload(scene: Scene) -> Unloaded:
     return Unloaded(replace(scene, mesh=mesh, points_are="reference"), code, relative)
 
 
-def _resting(scene: Scene) -> Scene:
+def resting(scene: Scene) -> Scene:
     """The same body at rest for long under the loads of time 0."""
     law = scene.law
     if scene.viscosity is not None:

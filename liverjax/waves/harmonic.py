@@ -23,7 +23,7 @@ MASSES = ("consistent", "lumped")
 #: What the equations of one instant need of [solve].
 _STILL = {
     "kind": "static",
-    "frequencies_Hz": None,
+    "frequencies": None,
     "dt": None,
     "steps": 1,
     "linear_solver": "cg",
@@ -81,7 +81,7 @@ def harmonic(
         InputError: what has no harmonic motion here (porosity, pressures that follow, rigid plates, mixed or averaged
             volumes), shapes and values that cannot be used.
     """
-    omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies_Hz if frequencies_Hz is None else frequencies_Hz)
+    omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
     scene = _small(scene, mass)
     mesh = scene.mesh
     number, elements = len(omegas), mesh.number_of_elements

@@ -1,0 +1,96 @@
+"""What a fitted model says of a test that it has not seen: how far off it is, and whether its errors own up to that."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+from fitting.fits import time_tests
+from fitting.fits.together import Measured, name_of, reported_numbers
+from fitting.fits.viscoelastic import Fit
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.time_tests import TimeTest
+
+
+class Prediction(NamedTuple):
+    """A test beside its prediction; numbers as `fitting.fits.together.Together.fitted` has them."""
+
+    name: str  # sweep, dispersion, relaxation or creep
+    source: str
+    predicted: np.ndarray  # (m,)
+    measured: np.ndarray  # (m,)
+    standard_errors: np.ndarray  # (m,) of the prediction, infinite where the fit leaves it free
+    scales: np.ndarray  # (m,) what errors are relative to
+    inside: np.ndarray  # (m,) whether the test is there in the band that the fit has seen
+
+    @property
+    def relative_errors(self) -> np.ndarray:
+        """|predicted - measured| over the scales (m,)."""
+        return np.abs(self.predicted - self.measured) / self.scales
+
+    @property
+    def factor(self) -> float:
+        """What the prediction times would fit best: another sample or strain often is a factor, all else alike."""
+        y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
+        return float(p @ y / (p @ p))
+
+    @property
+    def covered(self) -> float:
+        """Part of the numbers inside the band within two standard errors of the prediction and their own scatter."""
+        off = (self.predicted - self.measured)[self.inside]
+        own = self.scales[self.inside] * _scatter(off / self.scales[self.inside])
+        return float(
+            np.mean(np.abs(off) < scipy.stats.norm.ppf(0.975) * np.hypot(self.standard_errors[self.inside], own))
+        )
+
+
+def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Prediction:
+    """The prediction of a test.
+
+    Args:
+        fit: of a sweep; its model is that of its Prony modes.
+        resolved: shortest and longest relaxation time [s] that the sweep has seen.
+        test: that was not fitted.
+    """
+    at, measured, scales = reported_numbers(test)
+    vector, n = np.asarray(fit.uncertainty.values, float), fit.modes
+
+    def answers(p: jax.Array) -> jax.Array:
+        model = Maxwell(p[0], p[1 : n + 1], p[n + 1 :])
+        return time_tests.response(name_of(test), model, *map(jnp.asarray, at))
+
+    slopes = np.asarray(jax.jacfwd(answers)(jnp.asarray(vector)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.linalg.norm(slopes @ fit.uncertainty.root, axis=1)
+    low, high = resolved
+    if isinstance(test, TimeTest):
+        place = np.asarray(at[0])[np.asarray(at[2])]
+    else:
+        omega = np.asarray(at[0])
+        place = np.tile(1 / omega, len(measured) // len(omega))
+    inside = (place >= low * (1 - 1e-9)) & (place <= high * (1 + 1e-9))
+    errors = np.where(errors < 1e30, errors, np.inf)
+    return Prediction(name_of(test), test.source, np.asarray(answers(jnp.asarray(vector))), measured, errors, scales, inside)
+
+
+def _scatter(residuals: np.ndarray) -> float:
+    """Standard deviation of what has no trend: third differences of independent noise have 20 times its variance."""
+    return float(np.median(np.abs(np.diff(residuals, 3)))) / 0.6745 / np.sqrt(20) if len(residuals) > 3 else 0.0
+
+
+def sentence(found: Prediction) -> str:
+    """What a user should know of it, in a line."""
+    share, inside = len(found.measured), int(found.inside.sum())
+    name = f"{found.name} {found.source}"
+    if not inside:
+        return f"{name}: predicted, but all of its {share} numbers lie outside the band of the sweep"
+    off = 100 * found.relative_errors[found.inside].mean()
+    told = (
+        f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers within the "
+        f"95 % of the prediction"
+    )
+    if abs(found.factor - 1) > 0.005 * off:  # half of the error is one factor
+        told += f"; {found.factor:.3g} times the prediction would fit it best"
+    return told + (f"; {share - inside} numbers outside the band are not counted" if inside < share else "")

@@ -1,0 +1,73 @@
+"""Tests that a fit predicts without having seen them."""
+
+import numpy as np
+import pytest
+from conftest import SHARED
+
+from fitting.__main__ import main
+from fitting.fits import viscoelastic
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.time_tests import TimeTest
+from fitting.reports import prediction
+from fitting.waves import shear_waves
+from fitting.waves.dispersion import Dispersion
+
+pytestmark = pytest.mark.quick_to_compile
+
+TRUTH = Maxwell(np.float64(800.0), np.array([0.3, 0.4]), np.array([3.0, 0.1]))
+OMEGA, TIME = np.geomspace(0.05, 100, 25), np.geomspace(0.02, 100, 30)
+
+
+def sweep(noise: float, seed: int) -> Sweep:
+    factor = 1 + noise * np.random.default_rng(seed).standard_normal((2, len(OMEGA)))
+    G = generalised_maxwell.moduli(TRUTH, OMEGA)
+    return Sweep(OMEGA, G[0] * factor[0], G[1] * factor[1])
+
+
+def relaxation(factor: float = 1.0) -> TimeTest:
+    at = np.append(0.0, TIME)
+    g, tau = TRUTH.ratios, TRUTH.relaxation_times
+    answer = factor * TRUTH.shear_modulus * (1 - (g * (1 - np.exp(-at[:, None] / tau))).sum(axis=1))
+    return TimeTest("relaxation", at, np.ones(len(at)), answer, at > 0, source="relaxation.csv")
+
+
+def test_errors_of_the_prediction_cover_the_truth():
+    """Relaxation without noise of its own, predicted from 20 sweeps with 2 %: 95 % of the points lie within."""
+    covered = []
+    for seed in range(20):
+        s = sweep(0.02, seed)
+        found = prediction.predict(viscoelastic.closed_form(s, 2), s.resolved, relaxation())
+        assert found.inside.sum() == np.sum((TIME >= 0.01) & (TIME <= 20.0))
+        covered.append(found.covered)
+    # The points of a sweep go together: 20 sweeps count, not 500 points.
+    assert 0.8 < np.mean(covered) <= 1.0
+    assert found.relative_errors[found.inside].mean() < 0.02
+
+
+def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
+    s = sweep(0.0, 0)
+    fit = viscoelastic.closed_form(s, 2)
+    found = prediction.predict(fit, s.resolved, relaxation(1.3))
+    assert np.isclose(found.factor, 1.3, rtol=1e-6) and "1.3 times the prediction" in prediction.sentence(found)
+    c, a = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(TRUTH, OMEGA), OMEGA, 1000.0)
+    waves = prediction.predict(fit, s.resolved, Dispersion(OMEGA, c, a, 1000.0))
+    assert np.allclose(waves.predicted, np.concatenate([c, a]), rtol=1e-6) and waves.inside.all()
+    outside = prediction.predict(fit, s.resolved, Dispersion(OMEGA + 1e4, c, None, 1000.0))
+    assert "outside the band" in prediction.sentence(outside)
+
+
+def test_polystyrene_relaxes_and_creeps_alike_and_softer_than_it_swings(capsys, tmp_path):
+    """Of one material from one laboratory: two tests in time agree with each other, not with the sweep."""
+    folder = SHARED / "data" / "rheology" / "pyrheo"
+    if not folder.is_dir():
+        pytest.skip("measured data are not here")
+    tests = [str(folder / f"{kind}_ps190_data.csv") for kind in ("stressrelaxation", "creep")]
+    data = str(folder / "oscillation_ps190_data.csv")
+    arguments = ["--method", "closed-form", "--model", "spectrum", "--predict", *tests, "--out", str(tmp_path)]
+    assert main([data, *arguments]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "predicted within" in line]
+    softer, longer = (float(line.split(" times the prediction")[0].split()[-1]) for line in told)
+    # 0.715 times the stress, 1.32 times the strain.
+    assert 0.65 < softer < 0.8 and abs(softer * longer - 1) < 0.1
