@@ -49,8 +49,22 @@ def test_the_inertia_is_found_and_the_points_below_it_left_out(sample, phase, tm
     assert f"{lost.sum()} of 20 points" in kept.notes[1]
 
 
+def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):
+    """Neither torque nor size: I omega^2 / K = G' - G'' / tan(phase)."""
+    s = export(tmp_path / "p.txt", sample=False)
+    only = s._replace(raw={"phase": s.raw["phase"]})
+    for given in (s, only):
+        kept = without_inertia(given)
+        lost = np.abs(G) < 0.03 * INERTIA * OMEGA**2 / K
+        assert np.allclose(kept.angular_frequency, OMEGA[~lost]) and "raw phase shows" in kept.notes[0]
+        assert np.allclose(kept.inertia, INERTIA * OMEGA[~lost] ** 2 / K, rtol=1e-6)
+    # A phase that is that of the sample says that nothing was subtracted.
+    plain = only._replace(raw={"phase": np.angle(G)})
+    assert without_inertia(plain) is plain
+
+
 def test_what_is_not_told_changes_nothing(tmp_path):
-    s = export(tmp_path / "a.txt", sample=False)
+    s = export(tmp_path / "a.txt", sample=False, phase=False)
     assert without_inertia(s) is s  # neither the torque of the sample nor its size
     light = export(tmp_path / "b.txt", inertia=1e-12)
     assert without_inertia(light).grey is None and len(without_inertia(light).storage) == 20

@@ -43,14 +43,6 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="TEST",
         help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
-    command.add_argument(
-        "--predict",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="TEST",
-        help="tests of the same material that are not fitted: how well the fit predicts them",
-    )
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
@@ -78,6 +70,20 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--scheme", choices=("exponential", "backward_euler", "chapter"), default="exponential", help="Prony recursion"
     )
     command.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
+    _add_outputs(command)
+    return command
+
+
+def _add_outputs(command: argparse.ArgumentParser) -> None:
+    """Options of what a fit says and writes beside its numbers."""
+    command.add_argument(
+        "--predict",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="TEST",
+        help="tests that are not fitted: how well the fit predicts them",
+    )
     command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
     command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
     command.add_argument(
@@ -87,7 +93,6 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
     )
-    return command
 
 
 def _modes(text: str) -> int | str:

@@ -80,24 +80,25 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
     """The points whose modulus exceeds what is not known of the instrument's inertia; the others become `grey`.
 
-    Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m].
+    Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m]; or the raw phase.
     """
     if not sweep.raw:
         return sweep
     geometry = np.pi * radius**4 / (2 * height) if radius and height else None
     G = sweep.storage + 1j * sweep.loss
-    found = raw_torque.share(sweep.angular_frequency, G, sweep.raw, geometry)
+    omega = sweep.angular_frequency
+    found = raw_torque.share(omega, G, sweep.raw, geometry) or raw_torque.share_by_phase(omega, G, sweep.raw)
     if found is None:
         return sweep
     sweep = sweep._replace(inertia=found.modulus)
     unknown = raw_torque.UNCERTAINTY * found.modulus
     lost = unknown > np.abs(G)
     k = int(np.argmax(found.modulus / np.abs(G)))
-    note = (
-        f"the raw torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2; at "
-        f"{sweep.angular_frequency[k] / (2 * np.pi):.3g} Hz it carries {found.modulus[k] / np.abs(G[k]):.3g} times the "
-        "torque of the sample"
-    )
+    shows = "phase shows the inertia of the instrument"
+    if np.isfinite(found.inertia):
+        shows = f"torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2"
+    times = found.modulus[k] / np.abs(G[k])
+    note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it carries {times:.3g} times the torque of the sample"
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))
     if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:

@@ -34,7 +34,7 @@ UNITS = {
 class Share(NamedTuple):
     """The inertia of the instrument in a sweep."""
 
-    inertia: float  # I [N m s^2]
+    inertia: float  # I [N m s^2]; NaN where K is not known
     modulus: np.ndarray  # (n,) I omega^2 / K [Pa]
 
 
@@ -85,9 +85,31 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         inertias = (K * G.real - stiffness * np.cos(raw["phase"])) / omega**2
     else:  # past the resonance, where the raw torque leads: the other root belongs to lower frequencies
         inertias = (K * G.real + np.sqrt(np.maximum(stiffness**2 - (K * G.imag) ** 2, 0))) / omega**2
-    # Where inertia leads it is known best; elsewhere it is a small difference of large numbers.
-    led = np.argsort(omega)[-max(3, len(omega) // 6) :]
-    inertia, apart = float(np.median(inertias[led])), np.ptp(inertias[led])
-    if not (inertia > 0 and apart < 0.1 * inertia and inertia * omega[-1] ** 2 > K * np.abs(G[-1])):
+    inertia = _agreed(omega, inertias)
+    if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
         return None
     return Share(inertia, inertia * omega**2 / K)
+
+
+def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> Share | None:
+    """The same by the raw phase alone, which needs no torque and no size: I omega^2 / K = G' - G'' / tan(phase).
+
+    None where there is no phase, where the phases do not agree on one inertia, or where it leads nowhere.
+    """
+    if "phase" not in raw:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_square = _agreed(omega, (G.real - G.imag / np.tan(raw["phase"])) / omega**2)
+    if not per_square * omega[-1] ** 2 > np.abs(G[-1]):
+        return None
+    return Share(np.nan, per_square * omega**2)
+
+
+def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
+    """What the highest frequencies say of an inertia, if they agree within a tenth; else NaN.
+
+    Where inertia leads it is known best; elsewhere it is a small difference of large numbers.
+    """
+    led = np.argsort(omega)[-max(3, len(omega) // 6) :]
+    value, apart = float(np.median(values[led])), np.ptp(values[led])
+    return value if value > 0 and apart < 0.1 * value else np.nan

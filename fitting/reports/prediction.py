@@ -72,7 +72,9 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
         place = np.tile(1 / omega, len(measured) // len(omega))
     inside = (place >= low * (1 - 1e-9)) & (place <= high * (1 + 1e-9))
     errors = np.where(errors < 1e30, errors, np.inf)
-    return Prediction(name_of(test), test.source, np.asarray(answers(jnp.asarray(vector))), measured, errors, scales, inside)
+    return Prediction(
+        name_of(test), test.source, np.asarray(answers(jnp.asarray(vector))), measured, errors, scales, inside
+    )
 
 
 def _scatter(residuals: np.ndarray) -> float:
