@@ -111,6 +111,7 @@ def test_loads_that_follow_are_refused():
         lj.simulate(directly(lj.Scene(mesh=MESH, law=LAW, fixed=HELD, traction=(load,))))
 
 
+@pytest.mark.slow
 def test_a_number_that_changes_costs_no_compilation():
     lj.simulate(POROUS)
     before = run._run._cache_size()

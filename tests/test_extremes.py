@@ -220,6 +220,7 @@ def test_a_hopeless_step_is_told():
     assert code in (status.STEP_CUT, status.INDEFINITE, status.NOT_FINITE)
 
 
+@pytest.mark.slow
 def test_more_than_float32_can_give_is_told_with_the_best_it_has():
     """A tolerance below the digits of small displacements: stalled, as near to float64 as positions are rounded."""
     mesh = lj.shapes.box((0.06, 0.01, 0.01), (6, 2, 2))

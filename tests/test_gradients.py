@@ -137,7 +137,7 @@ def _sum(result):
     return jnp.sum(result.positions[-1] ** 2)
 
 
-#: What runs always, several kinds in one program, and some numbers of each; the slow test takes all of them.
+#: Several kinds in one program, and some numbers of each; the slow test takes all of them.
 TOGETHER = {
     "follower": ("law.mu", "displaced.0.by", "traction.0.pressure", "mesh.points"),
     "dynamic viscous chapter": ("body.density", "start", "viscosity.ratios", "porosity.bulk", "traction.0.value"),
@@ -145,9 +145,9 @@ TOGETHER = {
 }
 
 
-#: The one with the most equations runs always.
+#: The one with the most equations runs with the core.
 MARKS = {
-    "newmark isochoric porous": pytest.mark.core,
+    "newmark isochoric porous": (pytest.mark.core, pytest.mark.slow),
     "dynamic viscous chapter": pytest.mark.slow,
     "follower": pytest.mark.slow,
 }

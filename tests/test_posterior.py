@@ -126,6 +126,7 @@ def calibration(modes: int, count: int, noise: float, monkeypatch) -> np.ndarray
     return scipy.stats.chisquare(bins, axis=1).pvalue
 
 
+@pytest.mark.slow
 def test_ranks_of_the_truth_are_uniform(monkeypatch):
     assert calibration(1, 40, 0.1, monkeypatch).min() > 1e-3
 
@@ -135,6 +136,7 @@ def test_ranks_of_the_truth_are_uniform_of_two_modes(monkeypatch):
     assert calibration(2, 400, 0.05, monkeypatch).min() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_prior_without_its_slopes_is_found_out(monkeypatch):
     """The mistake that the calibration is there to see: a flat density of logits and gaps."""
     right = posterior.Modes.log_prior

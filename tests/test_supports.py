@@ -57,6 +57,7 @@ def test_springs_along_the_normal_carry_the_whole_pull():
     assert np.allclose(slope, -30.0 / 5e4**2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_springs_along_the_surface_carry_shear():
     """A stiff cube pushed sideways: the springs of its sole give way by p/k, those of its weightless top do not act."""
     mesh = box()
@@ -82,13 +83,14 @@ def test_springs_on_nodes():
 TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # a rotation along no axis
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
         {"linear_solver": "cg"},
-        pytest.param({"linear_solver": "direct"}, marks=pytest.mark.slow),
-        pytest.param({"robust": "projected"}, marks=pytest.mark.slow),
-        pytest.param({"kind": "dynamic", "dt": 0.02, "steps": 3, "integrator": "newmark"}, marks=pytest.mark.slow),
+        {"linear_solver": "direct"},
+        {"robust": "projected"},
+        {"kind": "dynamic", "dt": 0.02, "steps": 3, "integrator": "newmark"},
     ],
     ids=["cg", "direct", "robust", "newmark"],
 )
