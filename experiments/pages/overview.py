@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import bodies, elements, rigs
+from experiments.pages import bodies, elements, reduced, rigs
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
 from experiments.pages.stability import Returned, returned
@@ -455,6 +455,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         "",
     ),
     "stability_rigs": ("error of tension, indentation and creep against run time: mesh, elements", rigs.came_out, ""),
+    "reduced": (
+        "a reduced model of the viscous liver: error, stated error and time a step",
+        reduced.came_out,
+        "weighs its model against reduced bases and names no error",
+    ),
     "stability_cost": ("what does robustness at hand cost where it is not needed?", _cost, ""),
     "laws_table": ("every law: error of its terms beside time and compile time", _laws, ""),
     "curves_fit": (

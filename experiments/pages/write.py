@@ -11,6 +11,7 @@ from experiments.pages import (
     identification,
     overview,
     porosity,
+    reduced,
     stability,
     tables,
     verification,
@@ -29,7 +30,8 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     | porosity.PARTS
     | identification.PARTS
     | stability.PARTS
-    | bodies.PARTS,
+    | bodies.PARTS
+    | reduced.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
 }
 
