@@ -59,6 +59,18 @@ def test_prescribed_motion_and_histories_are_those_of_the_full_model():
     assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.004
 
 
+def test_a_body_that_is_only_moved_converges():
+    # No load: at the solution the forces of the points cancel, and their sum is no size to compare with.
+    scene = replace(_bar((2, 1, 1)), body=None)
+    end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
+    scene = replace(scene, displaced=(lj.Displaced(nodes=end, by=jnp.array([0.003, 0.0, 0.002])),))
+    model = with_all_points(scene, _every_motion(scene))
+    found = lj.simulate_reduced(model, scene)
+    assert not np.any(found.status) and np.all(found.iterations < 25)
+    x = lj.reduced_positions(model, scene, found)
+    assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.003
+
+
 @pytest.fixture(scope="module")
 def trained() -> tuple:
     """A viscous bar in motion, its reduced model of few rows, and numbers between and beyond them."""

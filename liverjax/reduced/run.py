@@ -71,6 +71,7 @@ class _Equations(NamedTuple):
     motion: ReducedMotion | None
     dt: Any
     newmark: bool | None
+    spread: jax.Array | None  # sizes of the slopes (n, 9, S) [1/m] where a part of the body is moved
 
 
 def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
@@ -93,6 +94,9 @@ def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax
     P = jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in e.acting.stress(as_matrix(F)) for entry in row])
     internal = jnp.tensordot(e.model.slopes, e.model.weights[None] * P, axes=2)
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load)
+    if e.spread is not None:
+        # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
+        size = size + jnp.linalg.norm(jnp.tensordot(e.spread, e.model.weights[None] * jnp.abs(P), axes=2))
     if e.mass is not None:
         inertia = e.mass @ _kinematics(e, q).acceleration
         r, size = r + inertia, size + jnp.linalg.norm(inertia)
@@ -277,6 +281,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     """(coordinates, memory, motion), what is given in a step -> those after it, and what the result has."""
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
+    spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:
@@ -284,7 +289,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
         acting = solid.freeze(memory, step)
         newmark = solve.integrator == "newmark"
         load, gradient = given
-        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None)
+        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread)
         found = _newton(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
         F = as_matrix(_deformation(e, found.q))
