@@ -1,0 +1,91 @@
+"""Every physics of the registry alone: its equations are in the program of a scene that has it, and in no other."""
+
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.physics import registry
+from liverjax.scenes.scene_file import scene_from
+
+pytestmark = pytest.mark.quick_to_compile
+
+TOP = {"where": {"z_min": 0.1}}
+SOFT = {"name": "neo_hookean", "mu": 1e4}
+PLAIN = {
+    "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [1, 1, 1]},
+    "law": {"name": "neo_hookean", "mu": 770.0, "bulk": 2200.0},
+    "fixed": [{"where": {"z_max": 0.0}}],
+}
+PLANE = {"shape": "plane", "position": [0, 0, 0.11], "axis": [0, 0, -1], "by": [0, 0, -0.02]}
+LINE = [[0.02, 0.03, 0.01], [0.06, 0.05, 0.09]]
+#: A table of each; a physics that is new in the registry needs one here.
+TABLES: dict[str, dict[str, Any]] = {
+    "ElasticSupport": {"support": [TOP | {"normal": 1e4}]},
+    "SlidingSupport": {"support": [TOP | {"sliding": True}]},
+    "Membrane": {"membrane": [TOP | {"thickness": 1e-4, "law": SOFT}]},
+    "Ligament": {"ligament": [TOP | {"to": [0.05, 0.05, 0.2], "stiffness": 1.0, "pre_tension": 0.0}]},
+    "Vessel": {"vessel": [{"line": LINE, "radius": 2e-3, "law": SOFT}]},
+    "Obstacle": {"obstacle": [PLANE]},
+    "RoughObstacle": {"obstacle": [PLANE | {"friction": 0.3}]},
+}
+
+
+def scene_of(order: int, table: dict[str, Any]) -> lj.Scene:
+    return scene_from(PLAIN | {"mesh": PLAIN["mesh"] | {"order": order}} | table)
+
+
+def traced(scene: lj.Scene) -> Any:
+    """The program of a scene."""
+    jax.clear_caches()  # what two scenes share would show the place where the first one traced it
+    return jax.make_jaxpr(lj.simulate)(scene)
+
+
+def files(jaxpr: Any) -> Iterator[str]:
+    """Source files behind the equations of a program, with those of the programs inside it."""
+    for equation in jaxpr.eqns:
+        yield from (frame.file_name for frame in equation.source_info.traceback.frames)
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=_inner):
+            if _inner(value):
+                yield from files(getattr(value, "jaxpr", value))
+
+
+def _inner(value: Any) -> bool:
+    return hasattr(getattr(value, "jaxpr", value), "eqns")
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_only_scenes_that_have_it_hold_its_equations(order):
+    scene = scene_of(order, {})
+    every = replace(scene, physics=tuple(p for t in TABLES.values() for p in scene_of(order, t).physics))
+    assert [type(p) for p in every.physics] == list(registry.NAMED)
+    without, with_all = (set(files(traced(s).jaxpr)) for s in (scene, every))
+    own = {inspect.getfile(kind) for kind in registry.NAMED}
+    assert not own & without
+    assert own <= with_all
+
+
+@pytest.mark.parametrize("kind", registry.NAMED, ids=lambda kind: kind.__name__)
+def test_a_table_adds_its_physics_and_nothing_else(kind):
+    """Two scenes of one structure, static numbers and shapes have one program."""
+    plain, scene = scene_of(1, {}), scene_of(1, TABLES[kind.__name__])
+    assert [type(p) for p in scene.physics] == [kind]
+    assert shapes_of(replace(scene, physics=())) == shapes_of(plain) != shapes_of(scene)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("kind", registry.NAMED, ids=lambda kind: kind.__name__)
+def test_the_program_without_it_is_the_same_to_the_letter(kind, order):
+    plain, scene = scene_of(order, {}), scene_of(order, TABLES[kind.__name__])
+    program = str(traced(plain))
+    assert str(traced(replace(scene, physics=()))) == program != str(traced(scene))
+
+
+def shapes_of(scene: lj.Scene) -> tuple[Any, list[Any]]:
+    leaves, structure = jax.tree.flatten(scene)
+    return structure, [jax.typeof(leaf) for leaf in leaves]
