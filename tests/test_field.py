@@ -324,7 +324,7 @@ def test_a_sphere_is_found_where_it_is():
             fixed=(lj.Fixed(nodes=below),),
         )
 
-    width = inclusion._EDGE * float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
+    width = inclusion.edge_width(mesh)
     centre = jnp.array([0.035, 0.03, 0.03])
     mu = 800.0 * jnp.exp(np.log(3.0) * inclusion.factor(mesh, centre, 0.016, width))
     loads = ([5.0, 0.0, 0.0], [0.0, 5.0, -3.0])

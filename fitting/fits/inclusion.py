@@ -2,7 +2,7 @@
 
 Few parameters instead of a map: a smooth field spreads what is sharp, so its peak is no measure of an inclusion's
 modulus; a map says where to begin. The edge is as soft as the mesh is coarse, which keeps the sphere's place
-differentiable. Radius and modulus trade off: the elements should be small beside the sphere.
+differentiable. Radius and modulus trade off: the elements should be small beside the sphere, or quadratic.
 """
 
 from typing import Any
@@ -14,17 +14,27 @@ import numpy as np
 from fitting.fits.field import Field, start_of
 from fitting.fits.scene_numbers import Problem, fit
 from fitting.methods.estimate import Estimate
+from liverjax.mesh.basis import basis
+from liverjax.mesh.tetrahedra import TetMesh
 
-#: Width of the edge over the elements' mean size.
+#: Width of the edge over the mean distance of two points.
 _EDGE = 0.25
 NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
 
 
-def factor(mesh: Any, centre: jax.Array, radius: Any, width: Any) -> jax.Array:
-    """How much of each element (E,) is inside: 1 within, 0 without, smooth between."""
-    middle = jnp.mean(mesh.points[mesh.tetrahedra], axis=1)
-    distance = jnp.sqrt(jnp.sum((middle - centre[None]) ** 2, axis=1) + 1e-3 * width**2)
-    return jax.nn.sigmoid((radius - distance) / width)
+def edge_width(mesh: TetMesh) -> float:
+    """Width of the edge [m]: a quarter of the distance of two points at which the elements are integrated."""
+    size = float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
+    return _EDGE * size / mesh.order
+
+
+def factor(mesh: TetMesh, centre: jax.Array, radius: Any, width: Any) -> jax.Array:
+    """How much of each element (E,) is inside: 1 within, 0 without, smooth between; a mean over its points."""
+    corners = mesh.points[mesh.tetrahedra]
+    L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L
+    points = jnp.einsum("kq,eki->qei", L, corners)
+    distance = jnp.sqrt(jnp.sum((points - centre[None, None]) ** 2, axis=-1) + 1e-3 * width**2)
+    return jnp.mean(jax.nn.sigmoid((radius - distance) / width), axis=0)
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
@@ -56,7 +66,7 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
         options: of `fitting.fits.scene_numbers.fit`.
     """
     base, mesh = start_of(problem, name), problem.scenes[0].mesh
-    width = _EDGE * float(np.cbrt(6 * np.sqrt(2) * np.mean(np.asarray(mesh.volumes))))
+    width = edge_width(mesh)
     size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
     scale = jnp.array([size] * 3 + [1.0] * 3)
 
