@@ -52,7 +52,9 @@ def test_tension_relaxes_as_the_law_says(verified):
     """Held at a small strain, the force falls to 1 - g (1 - q exp(...)): after many relaxation times to 1 - g."""
     strains = np.full(40, 1e-4)
     force, codes = glued.read(glued.tension(R, H, 0.25, strains, COARSE), LAW, PRONY)
-    elastic = glued.read(glued.tension(R, H, 0.25, strains[:1], COARSE), LAW, None)[0][0]
+    # Without viscosity the volumes would have another form: nothing relaxes within 1e-12 of the time instead.
+    lasting = lj.Prony(ratios=PRONY.ratios, relaxation_times=jnp.array([1e12]))
+    elastic = glued.read(glued.tension(R, H, 0.25, strains[:1], COARSE), LAW, lasting)[0][0]
     assert not np.any(codes)
     off = abs(float(force[-1] / elastic) - 0.6)
     verified("relaxed over elastic force of a cylinder", "1 - sum of ratios", off, 1e-6)
@@ -166,11 +168,13 @@ def test_indentation_tends_to_that_of_a_half_space(verified):
     forces = []
     for part in (0.05, 0.025):
         a = part * R
-        rig = glued.indentation(R, R, a, 1.0, np.array([1e-3, -1e-3]) * a)
+        # Both ways: what is not linear cancels. So small a part of R has few digits of it.
+        rig = glued.indentation(R, R, a, 1.0, np.array([1e-2, -1e-2]) * a)
+        rig = replace(rig, scene=replace(rig.scene, solve=replace(rig.scene.solve, tolerance=1e-6)))
         readings, codes = glued.read(rig, LAW, None)
         assert not np.any(codes)
         exact = 4 * 800 * a * np.log(3 - 4 * nu) / (1 - 2 * nu)
-        forces.append(float(readings[1] - readings[0]) / 2 / (1e-3 * a) / exact)
+        forces.append(float(readings[1] - readings[0]) / 2 / (1e-2 * a) / exact)
     off = abs(2 * forces[1] - forces[0] - 1)
     verified("glued punch, extrapolated to a half-space", "Mossakovskii 1954", off, 0.01)
     # What is left is (a / R)^2, below 0.0025 times its factor, and the mesh's half a percent.
