@@ -64,6 +64,13 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--density", type=float, metavar="KG_M3", help="of the sample: simulate its inertia (default: none)"
     )
+    command.add_argument(
+        "--precompression",
+        type=float,
+        default=0.0,
+        metavar="E",
+        help="part of its height by which the sample was compressed before, e.g. 0.05 (default 0); --height is the gap",
+    )
     command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
     command.add_argument("--steps", type=int, default=50, help="time steps a cycle of the simulation (default 50)")
     command.add_argument(
@@ -191,6 +198,7 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form":
         raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
+    _check_precompression(options)
     if len(options.sweep) > 1:
         _check_samples(options)
     if options.others:
@@ -205,6 +213,25 @@ def _check(options: argparse.Namespace) -> None:
     if options.samples and options.model == "spectrum":
         raise InputError("--samples is of models of a few numbers; leave it out for --model spectrum")
     laws.find(options.law)
+
+
+def _check_precompression(options: argparse.Namespace) -> None:
+    """Refuse a compression that no sample has, and what a fit of a compressed sample does not have."""
+    if options.precompression == 0:
+        return
+    from fitting.rigs import compression
+
+    compression.check_strain(options.precompression)
+    for name, asked in (
+        (f"--model {options.model}", options.model != "prony"),
+        ("--with", bool(options.others)),
+        ("--density", options.density is not None),
+        ("--profile", options.profile),
+        ("--samples", options.samples is not None),
+        (f"{len(options.sweep)} samples", len(options.sweep) > 1),
+    ):
+        if asked:
+            raise InputError(f"--precompression fits Prony modes to one sample without inertia: leave out {name}")
 
 
 def _check_samples(options: argparse.Namespace) -> None:
@@ -256,27 +283,33 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     """The closed form, and after it the fit through the simulation if asked for; the sweep that they fit."""
     from fitting.fits import edges, instrument, viscoelastic
     from fitting.methods import generalised_maxwell
+    from fitting.rigs import compression
 
     if options.modes != "auto":
         viscoelastic.check_modes(sweep, options.modes)
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    closed, corrected = instrument.without_error_of_inertia(_closed(options, sweep, dense), sweep)
+    closed, simulation = _closed(options, sweep, dense), _simulation(options)
+    if options.precompression:
+        factors = compression.shares(laws.typical(options.law), options.precompression)
+        closed = instrument.of_compressed_sample(closed, sweep, factors)
+    closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
     fits = [edges.honest(closed, corrected, dense)]
     if options.method != "closed-form":
-        fits.append(_simulated(options, corrected, fits[0]))
+        fits.append(_simulated(options, corrected, fits[0], simulation))
+    for fit in fits if options.precompression else ():
+        fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     if options.gap_error:
-        fits = [instrument.with_gap_error(fit, options.gap_error / _simulation(options).height) for fit in fits]
+        fits = [instrument.with_gap_error(fit, options.gap_error / simulation.height) for fit in fits]
     return fits, corrected
 
 
-def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit") -> "Fit":
+def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simulation: "Simulation") -> "Fit":
     """The fit through the torsion simulation."""
     from fitting.fits import viscoelastic
 
-    simulation = _simulation(options)
     bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
     with bar:
         return viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)
@@ -292,6 +325,7 @@ def _simulation(options: argparse.Namespace) -> "Simulation":
         scheme=options.scheme,
         steps=options.steps,
         density=options.density,
+        precompression=options.precompression,
     )
 
 

@@ -1,4 +1,4 @@
-"""What the instrument adds to a fit: errors that all points share, each a number of its own with a prior.
+"""What the instrument adds to a fit: errors that all points share, each a number of its own with a prior; its grip.
 
 The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K where I is off by delta. Fitted without a
 prior, such a term takes up whatever the model misses. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
@@ -14,8 +14,11 @@ from fitting.fits.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
+from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import Sweep, some
+from fitting.rigs import compression
+from liverjax import laws
 
 #: Rounds of fit and correction.
 ROUNDS = 4
@@ -138,6 +141,47 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
         own = _wider(own, np.where(moduli, relative * own.values, 0.0))
     details = fit.details | {"gap_error": relative}
     return fit._replace(uncertainty=_wider(fit.uncertainty, relative * first), parameters=own, details=details)
+
+
+def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
+    """The fit in closed form with the numbers of the sample at rest, where the sweep is of a compressed one.
+
+    Storage and loss of the fit stay those that the instrument shows, and so do its residuals.
+
+    Args:
+        fit: Prony modes of the moduli as they were measured.
+        sweep: these moduli.
+        factors: what the compression makes of them.
+    """
+    seen = fit.kind.maxwell
+    kind = fit.kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
+    spread = uncertainty.estimate(fit.solution, sweep.storage_sd is not None, kind.maxwell)
+    model = Maxwell(spread.values[0], spread.values[1 : fit.modes + 1], spread.values[fit.modes + 1 :])
+    old, new = (uncertainty.cautions(sweep, of, fit.solution, kind.name) for of in (fit.uncertainty, spread))
+    warnings = (*(w for w in fit.warnings if w not in old), *new)
+    return fit._replace(model=model, kind=kind, uncertainty=spread, warnings=warnings)
+
+
+def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[str, Any]:
+    """The part `precompression` of fit.json, of `of_compressed_sample` or of the simulation after it."""
+    law, strain = laws.typical(simulation.law), simulation.precompression
+    G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
+    factors = compression.shares(law, strain)
+    force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
+    G0, rest = float(fit.model.shear_modulus), float(fit.model.equilibrium_modulus)
+    return {
+        "strain": strain,
+        "height_at_rest_m": simulation.height / (1 - strain),
+        "plates": "glued" if glued else "smooth",
+        "law": simulation.law,
+        "bulk_over_shear_modulus": float(np.asarray(law.bulk_modulus())) / G,
+        "smooth_factor_of_relaxing_moduli": factors.relaxing,
+        "smooth_factor_of_equilibrium_modulus": factors.equilibrium,
+        "axial_force_N": force * rest / G,
+        "axial_force_standard_error_N": force * uncertainty.equilibrium_error(fit.uncertainty) / G,
+        "axial_force_mesh_bias_N": fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G,
+        "axial_force_at_once_N": force * G0 / G,
+    }
 
 
 def _wider(estimate: Estimate, direction: np.ndarray) -> Estimate:

@@ -15,7 +15,7 @@ from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import Solution, bfgs, from_starts, levenberg_marquardt_host
 from fitting.readers.rheometer import Sweep
-from fitting.rigs import torsion
+from fitting.rigs import compression, torsion
 from liverjax import laws
 from liverjax.core import status
 from liverjax.core.compiled import compiled
@@ -292,6 +292,7 @@ class Simulation(NamedTuple):
     cell_size: float | None = None
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
     density: float | None = None  # of the sample [kg/m^3]; None: moduli that the instrument corrected for inertia
+    precompression: float = 0.0  # part of the height at rest by which the plates compress the sample (`compression`)
 
 
 #: Strain at the rim up to which the derivatives of the linear rig serve: they are off by less than the strain.
@@ -347,22 +348,41 @@ def with_jacobian(
 
         J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
         return r, J, m
-    _, law, omega, _, _, scales = data
+    rig, law, omega, _, _, scales = data
 
     def linear(u):
-        G = torsion.linear_moduli(*law_and_prony(kind.maxwell(u), law, simulation), omega, simulation.steps)
+        G = _linear_moduli(rig, kind.maxwell(u), law, omega, simulation)
         return _and_prior(jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales, u, kind)
 
     r, m = simulated_residuals(u, data, simulation, kind)
     return r, jax.jacfwd(linear)(u), m
 
 
+def _linear_moduli(
+    rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
+) -> jax.Array:
+    """Complex moduli [Pa] (n,) that the simulation approaches as the strain goes to zero."""
+    scaled, prony = law_and_prony(model, law, simulation)
+    if simulation.precompression:
+        scale = model.shear_modulus / law.shear_modulus()
+        return scale * torsion.held_moduli(torsion.held(rig, law), rig, prony, omega, simulation.steps)
+    return torsion.linear_moduli(scaled, prony, omega, simulation.steps)
+
+
 def rig_of(simulation: Simulation) -> torsion.Rig:
     """The sample of a simulation; its mesh is coarse where the bias of the mesh is known exactly."""
-    cell = simulation.cell_size
+    cell, height = simulation.cell_size, simulation.height
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
-        cell = torsion.linear_cell_for(simulation.radius, simulation.height)
-    return torsion.make_rig(simulation.radius, simulation.height, cell, density=simulation.density)
+        cell = torsion.linear_cell_for(simulation.radius, height)
+    if not simulation.precompression:
+        return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
+    if simulation.part != "all" or simulation.density is not None:
+        raise InputError(
+            f"a precompression of {simulation.precompression:g} is of a sample without inertia whose whole stress "
+            f"relaxes: leave out density and part {simulation.part!r}"
+        )
+    rest = torsion.make_rig(simulation.radius, height / (1 - simulation.precompression), cell)
+    return compression.compressed(rest, laws.typical(simulation.law), simulation.precompression)
 
 
 def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
@@ -436,6 +456,8 @@ def through_torsion(
     worst = int(np.max(m.statistics.status))
     found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
+    if rig.held is not None:
+        details["force_of_law_N"] = float(torsion.axial_force(rig, law))
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = Simulated("torsion", found, storage, loss, advice)
     fit = _fit(sweep, at, kind, (running, compiling), details)
@@ -450,12 +472,16 @@ def through_torsion(
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     """What mesh and time steps of the simulation move the parameters, to first order (`mesh_bias`).
 
-    At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time.
+    At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time. Those of
+    a compressed sample without a mesh are extrapolated from a finer mesh.
     """
     law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
-    meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
-    exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
+    if simulation.precompression:
+        meshless, exact = _of_finer_mesh(fit, scaled, prony, omega, simulation)
+    else:
+        meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
+        exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
     natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
     found = fit.solution._replace(u=jnp.asarray(fit.solution.u))
 
@@ -465,6 +491,28 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     return fit.uncertainty._replace(
         mesh_bias=moved(meshless - (fit.storage + 1j * fit.loss)), time_step_bias=moved(exact - meshless)
     )
+
+
+#: Length of a cell of the finer mesh over that of the mesh, for the extrapolation.
+FINER = 0.62
+
+
+def _of_finer_mesh(
+    fit: Fit, law: laws.Law, prony: Prony, omega: jax.Array, simulation: Simulation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Complex moduli (n,) of a compressed sample: of the recursion without a mesh, and there in continuous time.
+
+    The error of the mesh is taken to be of second order.
+    """
+    cell = simulation.cell_size or torsion.linear_cell_for(simulation.radius, simulation.height)
+    rig = rig_of(simulation._replace(cell_size=FINER * cell))
+    of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
+    fine, exact = (np.asarray(moduli(of, rig, prony, omega, steps)) for steps in (simulation.steps, None))
+    found = fit.storage + 1j * fit.loss
+    meshless = found + (fine - found) / (1 - FINER**2)
+    force = float(torsion.axial_force(rig, laws.typical(simulation.law)))
+    fit.details["force_of_law_mesh_bias_N"] = (fit.details["force_of_law_N"] - force) / (1 - FINER**2)
+    return meshless, meshless + exact - fine
 
 
 def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
@@ -481,6 +529,7 @@ def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law,
         "steps_per_cycle": simulation.steps,
         "scheme": simulation.scheme,
         "part": simulation.part,
+        "precompression_strain": simulation.precompression,
         "rim_strain": simulation.strain,
         "newton_iterations": int(np.max(m.statistics.iterations)),
         "newton_residual": float(np.max(m.statistics.residual)),
@@ -502,6 +551,8 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors = simulated.uncertainty.standard_errors
     cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
+    if simulated.details.get("precompression_strain"):
+        cause, remedy = "the plates, which hold the sides of the sample, move", "which plates yours are decides it"
     if simulated.details.get("density_kg_m3") is not None:  # which the closed form knows nothing of
         cause, remedy = "the sample's inertia and the discretisation move", "raise --steps to see which it is"
     out = []

@@ -38,6 +38,15 @@ def moduli(model: Maxwell, omega: Array) -> tuple[Array, Array]:
     return shear_modulus * storage, shear_modulus * loss
 
 
+def weighed(model: Maxwell, relaxing: float, equilibrium: float) -> Maxwell:
+    """The model with the moduli of its modes, and its equilibrium modulus, each multiplied by a number."""
+    xp = arrays_of(*model)
+    G0 = xp.asarray(model.shear_modulus)
+    each = relaxing * G0[..., None] * model.ratios
+    whole = equilibrium * G0 * (1 - xp.sum(model.ratios, axis=-1)) + xp.sum(each, axis=-1)
+    return Maxwell(whole, each / whole[..., None], model.relaxation_times)
+
+
 def natural(u: Array) -> Maxwell:
     """Model of unconstrained parameters u (2N + 1,).
 

@@ -12,7 +12,7 @@ from fitting.fits import edges, models
 from fitting.fits.posterior import Posterior
 from fitting.fits.viscoelastic import Fit, largest_shift
 from fitting.methods.estimate import Estimate
-from fitting.methods.generalised_maxwell import moduli
+from fitting.methods.generalised_maxwell import Maxwell, moduli, weighed
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
 from fitting.reports import posterior_report
@@ -190,7 +190,7 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
-    lines = [np.asarray(v) for v in moduli(closed.model, 2 * np.pi * fine)]
+    lines = [np.asarray(v) for v in moduli(_as_measured(closed), 2 * np.pi * fine)]
     rows = (
         ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
         ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
@@ -219,6 +219,15 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
         rest.text(1.05 * f[-1], 0.02, "instrument", fontsize=7, **place)
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
+
+
+def _as_measured(closed: Fit) -> Maxwell:
+    """Modes of the moduli that the instrument shows, where a compression makes them others than the sample's."""
+    found = closed.details.get("precompression")
+    if found is None:
+        return closed.model
+    factors = found["smooth_factor_of_relaxing_moduli"], found["smooth_factor_of_equilibrium_modulus"]
+    return weighed(closed.model, *factors)
 
 
 def _legend_above(axes: Any, columns: int) -> None:
@@ -331,7 +340,23 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
     width = max(len(r) for r in columns[0]) + 3
     rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
     decided = [MARK] if any(edges.moved(fit) for fit in fits) else []
-    return "\n".join([*rows, *decided, *_agreement(fits), *models.comparison(fits[0])])
+    return "\n".join([*rows, *decided, *_compression(fits), *_agreement(fits), *models.comparison(fits[0])])
+
+
+def _compression(fits: list[Fit]) -> list[str]:
+    """What was taken for a compressed sample, and the axial force that checks it."""
+    found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
+    if not found:
+        return []
+    forces = ", ".join(
+        f"{f['axial_force_N']:.3g} ± {f['axial_force_standard_error_N']:.1g} N ({f['plates']} plates)" for f in found
+    )
+    one = found[0]
+    return [
+        f"numbers are of the sample before it was compressed by {100 * one['strain']:.3g} % from "
+        f"{one['height_at_rest_m']:.4g} m (law {one['law']}, K / G {one['bulk_over_shear_modulus']:.3g})",
+        f"axial force after relaxation, to be compared with the instrument's: {forces}",
+    ]
 
 
 def _agreement(fits: list[Fit]) -> list[str]:

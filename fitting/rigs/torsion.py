@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import param, replace, static, struct
 from liverjax.elements import mjed
 from liverjax.laws import Law, isochoric_part, volumetric_part
 from liverjax.mesh import shapes
@@ -30,7 +30,8 @@ from liverjax.physics.rigid_plate import RigidPlate
 from liverjax.physics.viscosity import Prony, Viscoelasticity
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.solvers import newton
-from liverjax.tensors.matrices import deformation_gradient
+from liverjax.tensors.material_axes import symmetric
+from liverjax.tensors.matrices import deformation_gradient, matmul
 
 #: Chapter, section 5.3; its section 5.2 prints 41 mm for 4 mm +- 1 mm (at 41 mm inertia resonates inside the band).
 RADIUS, HEIGHT = 0.010, 0.004
@@ -46,6 +47,7 @@ class Rig:
     density: Any = param("kg/m^3", "None: no inertia, and no velocity is carried", default=None)
     bottom: int = static(about="number of nodes on the gripped plate")
     top: int = static(about="number of nodes on the turning plate")
+    held: Any = param("m", "positions (V, 3) of the compressed sample; None: it is not (`compression`)", default=None)
     free_height: bool = static(default=False, about="the top plate may also move along the axis under no axial force")
 
 
@@ -147,7 +149,7 @@ def rig_from_mesh(
 
 
 def _positions(rig: Rig, u: jax.Array, lift: Any, angle: Any) -> jax.Array:
-    X = rig.mesh.points
+    X = rig.mesh.points if rig.held is None else rig.held
     n = X.shape[0] - rig.top
     c, s = jnp.cos(angle), jnp.sin(angle)
     x, y, z = X[n:].T
@@ -221,26 +223,74 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
 
 
 class _Linearised(NamedTuple):
-    """The rig at rest, before any frequency is known."""
+    """The rig as it is held, before any frequency is known."""
 
-    inverse: jax.Array  # of the elastic stiffness (n, n)
-    isochoric: jax.Array | None  # the part of the stiffness that relaxes and the part that does not, where they differ
-    volumetric: jax.Array | None
+    inverse: jax.Array  # of the stiffness (n, n) against a motion too quick to relax
+    relaxing: jax.Array | None  # the part of the stiffness that relaxes and the part that stands, where they differ
+    standing: jax.Array | None
+    bias: jax.Array | None = None  # of the mesh, where the sample is compressed: `geometry_factor` of its rest
 
 
 def _linearise(rig: Rig, law: Law, prony: Prony | None) -> _Linearised:
+    if rig.held is not None:
+        relaxing, standing, bias = held(rig, law)
+        standing = standing * (1.0 if prony is None else 1 - jnp.sum(jnp.asarray(prony.ratios)))
+        return _Linearised(jnp.linalg.inv(relaxing + standing), relaxing, standing, bias)
     if prony is None or prony.part == "all":
         return _Linearised(jnp.linalg.inv(_rest_stiffness(rig, law)), None, None)
     isochoric, volumetric = (_rest_stiffness(rig, part(law)) for part in (isochoric_part, volumetric_part))
     return _Linearised(jnp.linalg.inv(isochoric + volumetric), isochoric, volumetric)
 
 
+def _rest_height(rig: Rig) -> jax.Array:
+    """Height of the sample before it is compressed [m]."""
+    z = rig.mesh.points[:, 2]
+    return jnp.max(z) - jnp.min(z)
+
+
+def _coordinates(rig: Rig) -> int:
+    """Number of coordinates."""
+    return 3 * (rig.mesh.number_of_nodes - rig.top - rig.bottom) + 1 + rig.free_height
+
+
+def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
+    """Stiffness (n, n) [N/m] of a compressed sample: that of changing stress, and that of the stress which stands.
+
+    Of a stress S that has stood for long, a motion changes the direction alone; the second part is that of the
+    unrelaxed S.
+    """
+    mesh = rig.mesh
+    rest = jnp.zeros(_coordinates(rig), mesh.points.dtype)
+    elastic = Prony(ratios=jnp.zeros(0), relaxation_times=jnp.zeros(0))
+
+    def gradient(q):
+        return deformation_gradient(mesh, _positions(rig, *_unpack(rig, q)))
+
+    def stress(q):
+        return viscosity.relaxing_stress(elastic, law, gradient(q))
+
+    def forces(q, S):
+        x = _positions(rig, *_unpack(rig, q))
+        f = mjed.nodal_force(mesh, matmul(gradient(q), symmetric(tuple(S))))
+        return _pack(rig, *_generalised(rig, x, f))
+
+    S = stress(rest)
+    standing = jax.jacfwd(forces)(rest, S)
+    return jax.jacfwd(lambda q: forces(q, stress(q)))(rest) - standing, standing
+
+
+def axial_force(rig: Rig, law: Law) -> jax.Array:
+    """Force [N] with which a compressed sample, before it relaxes, pushes the plates apart."""
+    x = _positions(rig, *_unpack(rig, jnp.zeros(_coordinates(rig), rig.mesh.points.dtype)))
+    return -_generalised(rig, x, mjed.internal_force(rig.mesh, law, x))[1]
+
+
 def _steady(rest: _Linearised, modulus: Any) -> _Response:
     """Response on the steady cycle where the relaxing stress is `modulus` times the elastic one (complex)."""
-    if rest.isochoric is None:
+    if rest.relaxing is None:
         elastic = _response(rest.inverse[:, -1])
         return _Response(elastic.shape, elastic.stiffness * modulus)
-    K = modulus * rest.isochoric + rest.volumetric
+    K = modulus * rest.relaxing + rest.standing
     return _response(jnp.linalg.solve(K, jnp.zeros(K.shape[0], K.dtype).at[-1].set(1.0)))
 
 
@@ -322,6 +372,9 @@ class _Cycle(NamedTuple):
     steady: _Response
     arc: Any  # complex amplitude of the last coordinate [m]
     inverse: jax.Array  # of the elastic stiffness of what is solved for
+    twist: Any = (
+        0.0  # force [N] with which a compressed mesh, never quite symmetric, turns of itself: no part of a test
+    )
 
     def at(self, omega: Any, t: Any) -> jax.Array:
         """Coordinates at time t [s]."""
@@ -336,7 +389,8 @@ def _oscillate(o: _Oscillation, rest: _Linearised) -> tuple[Run, jax.Array]:
     # A sin(w t) = Re(-i A e^(i w t)); the complex arc of the linearised discrete problem.
     arc = -1j * o.amplitude * (1 / (steady.stiffness * rig.radius) if o.by_torque else rig.radius)
     inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
-    cycle = _Cycle(steady, arc, inverse)
+    twist = 0.0 if rig.held is None else jax.lax.stop_gradient(_twist(o))
+    cycle = _Cycle(steady, arc, inverse, twist)
     q, memories = _initial(o, steady.shape, arc)
     times = o.dt * jnp.arange(1, drive.steps * drive.cycles + 1)
     _, (angle, torque, lift, statistics) = jax.lax.scan(partial(_time_step, o, cycle), (q, memories), times)
@@ -349,7 +403,15 @@ def _oscillate(o: _Oscillation, rest: _Linearised) -> tuple[Run, jax.Array]:
         jnp.append(lift_0, lift),
         statistics,
     )
-    return run, steady.stiffness / (modulus * _exact_stiffness(rig, o.law))
+    bias = steady.stiffness / (modulus * _exact_stiffness(rig, o.law)) if rest.bias is None else rest.bias + 0j
+    return run, bias
+
+
+def _twist(o: _Oscillation) -> jax.Array:
+    """Torque of the held sample over the radius [N], relaxed."""
+    standing = 1.0 if o.prony is None else 1 - jnp.sum(jnp.asarray(o.prony.ratios))
+    x = o.positions(jnp.zeros(_coordinates(o.rig), o.rig.mesh.points.dtype))
+    return standing * _generalised(o.rig, x, mjed.internal_force(o.rig.mesh, o.law, x))[2]
 
 
 def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
@@ -364,7 +426,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
         x = o.positions(q)
         f = mjed.nodal_force(mesh, solid.stress(deformation_gradient(mesh, x)))
         f = sum((a.force(mesh, x, 1.0) for a in nodal), f)
-        return _pack(rig, *_generalised(rig, x, f))
+        return _pack(rig, *_generalised(rig, x, f)).at[-1].add(-cycle.twist)
 
     load = jnp.zeros_like(q_old)
     if o.by_torque:
@@ -404,18 +466,22 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Any) -> tuple[jax.Array, tu
     rig, prony, on_cycle, mesh = o.rig, o.prony, o.drive.start == "cycle", o.rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
+
+    def S(q):
+        return viscosity.relaxing_stress(prony, o.law, deformation_gradient(mesh, o.positions(q)))
+
+    if prony is not None and rig.held is not None:  # it has been held until nothing relaxes any more
+        stands = S(jnp.zeros_like(q))
+        history = viscosity.relaxed_history(prony, stands)
     if prony is not None and on_cycle:
-
-        def S(q):
-            return viscosity.relaxing_stress(prony, o.law, deformation_gradient(mesh, o.positions(q)))
-
         _, slope = jax.linearize(S, jnp.zeros_like(q))
         S_shape = slope(jnp.real(shape)) * arc
         if jnp.iscomplexobj(shape):  # a real shape needs the slope once: it is a fifth of the program
             S_shape += slope(jnp.imag(shape)) * 1j * arc
         ratios = viscosity.complex_ratios(prony, o.omega, o.dt)
         gamma = jnp.real(ratios[:, None, None] * S_shape[None])
-        history = viscosity.History(gamma, None if prony.scheme == "backward_euler" else jnp.real(S_shape))
+        moving = viscosity.History(gamma, None if prony.scheme == "backward_euler" else jnp.real(S_shape))
+        history = jax.tree.map(jnp.add, history, moving)
     if rig.density is None:
         return q, (history,)
     _, field = jax.linearize(o.positions, jnp.zeros_like(q))
@@ -493,6 +559,35 @@ def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -
     """
     ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
     return law.shear_modulus() * (1 - jnp.sum(ratios, axis=0))
+
+
+class Held(NamedTuple):
+    """A compressed sample of a law, before any relaxation is known."""
+
+    relaxing: jax.Array  # (n, n) [N/m]: `about_held`
+    standing: jax.Array
+    bias: jax.Array  # of its mesh at rest: `geometry_factor`
+
+
+def held(rig: Rig, law: Law) -> Held:
+    """What `held_moduli` needs of a rig of `compression.compressed`."""
+    return Held(*about_held(rig, law), geometry_factor(replace(rig, held=None, height=_rest_height(rig)), law))
+
+
+def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
+    """`linear_moduli` of a compressed sample of the law of `of`: complex moduli [Pa] (n,) of its mesh.
+
+    Args:
+        of, rig: the sample.
+        prony: how it relaxes.
+        omega: angular frequencies (n,) [rad/s].
+        steps: time steps a cycle; None: those of continuous time.
+    """
+    ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
+    stands = 1 - jnp.sum(jnp.asarray(prony.ratios))
+    parts = _Linearised(of.relaxing, of.relaxing, stands * of.standing)
+    stiffness = jax.lax.map(lambda modulus: _steady(parts, modulus).stiffness, 1 - jnp.sum(ratios, axis=0))
+    return 2 * rig.height / (jnp.pi * rig.radius**2) * stiffness / of.bias
 
 
 def strain_sweep(

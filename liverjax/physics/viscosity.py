@@ -139,6 +139,13 @@ def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: Any = fl
     return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))
 
 
+def relaxed_history(prony: Prony, stress: jax.Array) -> History:
+    """Memory of a body that has been held under `stress` (6, …) [Pa] until nothing relaxes any more."""
+    g = jnp.asarray(prony.ratios)
+    gamma = g.reshape(-1, *(1,) * stress.ndim) * stress[None]
+    return History(gamma, None if prony.scheme == "backward_euler" else stress)
+
+
 def recall(prony: Prony, history: History, dt: Any) -> Recall:
     """The constant part of the next step's stress, from the memory at its beginning."""
     a, b, c = coefficients(prony, dt)

@@ -1,0 +1,136 @@
+"""A sample that the plates compress before they turn it (`--precompression`).
+
+The sample has the plates' radius at rest and is not trimmed. It is held until its stress has relaxed. Moduli are those
+that the instrument shows: by the plates' radius and by the gap at which the test is made.
+
+Where the plates let the sample slide sideways it stays a cylinder, of stretches a along the radius and l along the
+axis and of the axial stress s. By an isotropic law a shear between both has the modulus l^2 s / (l^2 - a^2), of which
+the stress that stands makes s (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The torque has the
+radius to the fourth power, and so the instrument shows
+
+    G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
+
+with s of the law before it relaxes. So what relaxes and the equilibrium modulus have a factor each.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import brentq
+
+import liverjax as lj
+from fitting.rigs.torsion import Rig
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.laws import Law
+
+#: Largest part of the height that a sample may be compressed by.
+LARGEST = 0.5
+#: Strain of one load step.
+_STEP = 0.05
+
+
+class Shares(NamedTuple):
+    """What a compressed cylinder that may slide sideways shows, over what it has at rest [1]."""
+
+    relaxing: float  # of what relaxes
+    equilibrium: float  # of the equilibrium modulus
+
+
+def check_strain(strain: float) -> None:
+    """`InputError` for a strain that no sample has."""
+    if not 0 <= strain <= LARGEST:
+        meant = f"{strain / 100:g}" if LARGEST < strain <= 100 * LARGEST else "0.05"
+        raise InputError(
+            f"--precompression {strain:g} is the part of the height by which the plates compress the sample, from 0 to "
+            f"{LARGEST:g}: give e.g. --precompression {meant}"
+        )
+
+
+def shares(law: Law, strain: float) -> Shares:
+    """Shares of a law compressed by `strain`, its plates smooth (module's formula).
+
+    Raises:
+        InputError: a law that is not isotropic, or that pulls when it is compressed.
+    """
+    if strain == 0:
+        return Shares(1.0, 1.0)
+    a, axial = side_stretch(law, strain), 1 - strain
+    s = float(_cauchy(law, a, axial)[2])
+    G = float(np.asarray(law.shear_modulus()))
+    if not (s < 0 and np.isfinite(s)):
+        raise InputError(
+            f"law {type(law).__name__} does not resist a compression by {strain:g}: give a smaller --precompression or "
+            "another --law"
+        )
+    relaxing = a**6 * s / (axial**2 - a**2) / G
+    return Shares(relaxing, relaxing + a**4 * s / G)
+
+
+def side_stretch(law: Law, strain: float) -> float:
+    """Stretch along the radius of a cylinder that is compressed by `strain` between smooth plates."""
+    _refuse_directions(law)
+    axial = 1 - strain
+    return float(brentq(lambda a: _cauchy(law, a, axial)[0], 0.9, 1.1 / np.sqrt(axial), xtol=1e-14))
+
+
+def smooth_force(law: Law, strain: float, radius: float) -> float:
+    """Force [N] with which a sample of this radius at rest [m] pushes smooth plates apart before it relaxes."""
+    if strain == 0:
+        return 0.0
+    a = side_stretch(law, strain)
+    return -np.pi * (a * radius) ** 2 * float(_cauchy(law, a, 1 - strain)[2])
+
+
+def _cauchy(law: Law, side: float, axial: float) -> np.ndarray:
+    """Principal Cauchy stresses (3,) [Pa]."""
+    F = np.array([side, side, axial])
+    return np.diagonal(np.asarray(law.first_piola(jnp.diag(F)))) * F / np.prod(F)
+
+
+def _refuse_directions(law: Law) -> None:
+    turned = [np.asarray(law.first_piola(jnp.diag(jnp.roll(jnp.array([1.1, 0.9, 1.05]), k)))) for k in range(3)]
+    principal = [np.roll(np.diagonal(P), -k) for k, P in enumerate(turned)]
+    if not np.allclose(principal, principal[0], rtol=1e-8):
+        raise InputError(
+            f"--precompression needs a law without a direction, and {type(law).__name__} has one: choose another --law"
+        )
+
+
+def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
+    """The rig with its sample compressed by `strain`, as it is held before it turns.
+
+    Args:
+        rig: of the sample at rest; its height becomes that of the gap.
+        law: of the sample.
+        strain: part of the height at rest.
+        smooth: let the sample slide sideways on the plates while it is compressed, so that it stays a cylinder; else
+            it is glued and bulges.
+
+    Raises:
+        InputError: the sample cannot be compressed so far.
+    """
+    if strain == 0:
+        return rig
+    X = rig.mesh.points
+    gap = rig.height * (1 - strain)
+    if smooth:
+        low, a = jnp.min(X[:, 2]), side_stretch(law, strain)
+        held = X * jnp.array([[a, a, 1 - strain]]) + jnp.array([[0.0, 0.0, 1.0]]) * low * strain
+        return replace(rig, held=held, height=gap)
+    n = rig.mesh.number_of_nodes
+    scene = lj.Scene(
+        mesh=rig.mesh,
+        law=law,
+        fixed=(lj.Fixed(nodes=jnp.arange(rig.bottom)),),
+        displaced=(lj.Displaced(nodes=jnp.arange(n - rig.top, n), by=jnp.array([0.0, 0.0, -strain * rig.height])),),
+        solve=lj.Solve(steps=max(1, int(np.ceil(strain / _STEP))), tolerance=1e-11),
+    )
+    result = lj.simulate(scene)
+    if np.any(np.asarray(result.status) != 0):
+        raise InputError(
+            f"--precompression {strain:g}: the simulated sample could not be compressed so far; give less, or "
+            "--method closed-form, whose plates are smooth"
+        )
+    return replace(rig, held=result.positions[-1], height=gap)

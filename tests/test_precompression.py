@@ -1,0 +1,182 @@
+"""A sample that the plates compress before they turn it: closed form, simulation, the fit, and what is refused."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting import __main__ as command
+from fitting.fits.viscoelastic import Simulation, rig_of
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell, weighed
+from fitting.rigs import compression, torsion
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.elements import mjed
+
+pytestmark = pytest.mark.quick_to_compile
+
+STRAIN = 0.1
+REST = Maxwell(np.float64(1000.0), np.array([0.3, 0.2]), np.array([1.0, 0.1]))
+
+
+@pytest.fixture(scope="module")
+def law():
+    return lj.laws.typical("neo_hookean")
+
+
+@pytest.mark.parametrize("strain", [0.05, 0.3])
+def test_factors_of_an_incompressible_law_are_those_of_rivlin(strain):
+    """Rivlin 1949: an incompressible Mooney-Rivlin cylinder of stretch l has a torque of 2 (W1 + W2 / l) theta / l.
+
+    What relaxes and what stands of it: the part of the stress that stands turns with the sample.
+    """
+    G, part, stretch = 1000.0, 0.3, 1 - strain
+    law = lj.laws.MooneyRivlin(c10=0.5 * G * (1 - part), c01=0.5 * G * part, bulk=1e6 * G)
+    both = (1 - part) + part / stretch
+    found = compression.shares(law, strain)
+    # The compressibility that is left is G / K = 1e-6, times factors of order one.
+    assert found.equilibrium == pytest.approx(both, rel=2e-5)
+    assert found.relaxing == pytest.approx(both / stretch**3, rel=2e-5)
+
+
+def test_a_law_s_small_compression_changes_nothing(law):
+    """The factors tend to one, by as much as the strain."""
+    far, near = (compression.shares(law, strain) for strain in (1e-3, 1e-4))
+    for a, b in zip(far, near, strict=True):
+        assert (a - 1) / (b - 1) == pytest.approx(10, rel=0.02)
+
+
+def test_weights_are_taken_back(law):
+    factors = compression.shares(law, STRAIN)
+    back = weighed(weighed(REST, *factors), *(1 / f for f in factors))
+    for a, b in zip(back, REST, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
+
+
+def test_smooth_plates_converge_to_the_closed_form(law):
+    """A mesh of a cylinder that stayed one, too slow and too fast to relax: second order to the closed form."""
+    shares, sizes, errors = compression.shares(law, STRAIN), [], []
+    exact = np.array([0.5 * shares.equilibrium, 0.5 * shares.equilibrium + 0.5 * shares.relaxing])
+    prony = lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([1.0]))
+    for cell in (0.0028, 0.0017):
+        rig = compression.compressed(torsion.make_rig(0.01, 0.004 / 0.9, cell), law, STRAIN, smooth=True)
+        G = torsion.held_moduli(jax.jit(torsion.held)(rig, law), rig, prony, jnp.array([1e-6, 1e6]), None)
+        errors.append(np.abs(G.real / float(law.shear_modulus()) / exact - 1))
+        sizes.append(rig.mesh.number_of_nodes ** (-1 / 3))
+    assert np.all(errors[1] < 0.02)
+    assert np.all(errors[0] / errors[1] > 0.6 * (sizes[0] / sizes[1]) ** 2)
+
+
+def test_glued_torque_is_that_of_a_sample_compressed_and_then_turned(law):
+    """Elastic: against nodes of the plate moved by hand in `lj.simulate`, torque from the nodal forces."""
+    rig = rig_of(Simulation(precompression=STRAIN))
+    small = 1e-4
+    n = rig.mesh.number_of_nodes
+    X = rig.mesh.points[n - rig.top :]
+    turned = jnp.stack([X[:, 0] - small * X[:, 1], X[:, 1] + small * X[:, 0], rig.held[n - rig.top :, 2]], 1)
+    torques = []
+    for to in (turned, rig.held[n - rig.top :]):
+        scene = lj.Scene(
+            mesh=rig.mesh,
+            law=law,
+            fixed=(lj.Fixed(nodes=jnp.arange(rig.bottom)),),
+            displaced=(lj.Displaced(nodes=jnp.arange(n - rig.top, n), by=to - X),),
+            solve=lj.Solve(steps=4, tolerance=1e-12),
+        )
+        result = lj.simulate(scene)
+        assert int(result.status[-1]) == 0
+        x = result.positions[-1]
+        f = mjed.internal_force(rig.mesh, law, x)[n - rig.top :]
+        torques.append(float(jnp.sum(x[n - rig.top :, 0] * f[:, 1] - x[n - rig.top :, 1] * f[:, 0])))
+    relaxing, standing = torsion.about_held(rig, law)
+    by_hand = (torques[0] - torques[1]) / small
+    stiffness = 1 / jnp.linalg.inv(relaxing + standing)[-1, -1] * rig.radius**2
+    assert by_hand == pytest.approx(float(stiffness), rel=1e-3)  # what is left is the twist's square and its product
+
+
+def test_simulated_moduli_are_those_of_the_linear_rig(law):
+    """The run in time about the held state, where what is left is of the order of the strain."""
+    rig = rig_of(Simulation(precompression=STRAIN, cell_size=0.004))
+    prony = lj.Prony(ratios=jnp.asarray(REST.ratios), relaxation_times=jnp.asarray(REST.relaxation_times))
+    omega, drive = jnp.array([1.0, 10.0]), torsion.Drive(steps=20)
+    torque = torsion.torque_for_strain(rig, law.shear_modulus(), 1e-4)
+    ran = torsion.moduli(rig, law, prony, omega, torque, drive)
+    linear = torsion.held_moduli(torsion.held(rig, law), rig, prony, omega, drive.steps)
+    np.testing.assert_allclose(ran.storage + 1j * ran.loss, linear, rtol=1e-3)
+    assert np.all(np.asarray(ran.statistics.status) == 0) and np.all(np.asarray(ran.defect) < 1e-3)
+
+
+def sweep_file(tmp_path, moduli, hertz):
+    path = tmp_path / "sweep.csv"
+    rows = [f"{f:.8g},{a:.10g},{b:.10g}" for f, a, b in zip(hertz, *moduli, strict=True)]
+    path.write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def test_the_closed_form_tells_the_material_from_its_compression(tmp_path, law, capsys):
+    hertz = np.geomspace(0.02, 20, 25)
+    seen = weighed(REST, *compression.shares(law, STRAIN))
+    path = sweep_file(tmp_path, generalised_maxwell.moduli(seen, 2 * np.pi * hertz), hertz)
+    ask = [str(path), "--precompression", "0.1", "--method", "closed-form", "--modes", "2", "--out", str(tmp_path)]
+    assert command.main(ask) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert content["shear_modulus"] == pytest.approx(REST.shear_modulus, rel=1e-5)
+    np.testing.assert_allclose(content["ratios"], REST.ratios, rtol=1e-5)
+    assert content["mean_relative_error"] < 1e-6
+    told = content["details"]["precompression"]
+    force = compression.smooth_force(law, 0.1, 0.01) / float(law.shear_modulus())  # of a modulus of 1 Pa
+    assert told["axial_force_N"] == pytest.approx(force * 500, rel=1e-4)
+    assert told["plates"] == "smooth" and told["height_at_rest_m"] == pytest.approx(0.004 / 0.9)
+    assert "axial force" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_simulation_tells_the_material_from_a_glued_and_compressed_sample(tmp_path, law):
+    """Data of a finer mesh and of continuous time; what is left is the mesh's share, and the fit states it."""
+    hertz = np.geomspace(0.02, 20, 13)
+    rig = rig_of(Simulation(precompression=STRAIN, cell_size=0.0016))
+    prony = lj.Prony(ratios=jnp.asarray(REST.ratios), relaxation_times=jnp.asarray(REST.relaxation_times))
+    G = np.asarray(torsion.held_moduli(jax.jit(torsion.held)(rig, law), rig, prony, 2 * np.pi * hertz, None))
+    path = sweep_file(tmp_path, (G.real, G.imag), hertz)
+    scale = float(law.shear_modulus())
+    assert command.main([str(path), "--precompression", "0.1", "--modes", "2", "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "fit.json").read_text())
+    off = content["shear_modulus"] / scale - 1
+    stated = content["mesh_bias"]["shear_modulus"] / scale
+    assert abs(content["closed_form"]["shear_modulus"] / scale - 1) > 3 * abs(off)
+    assert abs(off) < 0.03 and abs(off - stated) < 0.5 * abs(stated)
+    np.testing.assert_allclose(content["relaxation_times"], REST.relaxation_times, rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (["--precompression", "5"], "give e.g. --precompression 0.05"),
+        (["--precompression", "-0.1"], "from 0 to 0.5"),
+        (["--precompression", "0.1", "--density", "1000"], "leave out --density"),
+        (["--precompression", "0.1", "--model", "fractional"], "leave out --model fractional"),
+        (["--precompression", "0.1", "--profile"], "leave out --profile"),
+        (["--precompression", "0.1", "--law", "costa"], "without a direction"),
+    ],
+)
+def test_what_is_refused_is_refused_in_a_sentence(tmp_path, options, words, capsys):
+    hertz = np.geomspace(0.02, 20, 25)
+    path = sweep_file(tmp_path, generalised_maxwell.moduli(REST, 2 * np.pi * hertz), hertz)
+    assert command.main([str(path), *options, "--out", str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert words in told and told.count("\n") == 1
+
+
+def test_a_part_that_does_not_relax_is_refused():
+    with pytest.raises(InputError, match="whose whole stress relaxes"):
+        rig_of(Simulation(precompression=STRAIN, part="isochoric"))
+
+
+def test_no_compression_is_no_change(law):
+    rig = torsion.make_rig(cell_size=0.004)
+    assert compression.compressed(rig, law, 0.0) is rig
+    assert replace(rig, height=1.0).held is None
