@@ -99,6 +99,15 @@ def harmonic(
     return _answer(scene, (factors, omegas), motion, about, mass)
 
 
+def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "consistent") -> Operator:
+    """The dynamic stiffness of `harmonic` by element, for programs that build their own equations of it.
+
+    Args:
+        scene, about, mass: as of `harmonic`.
+    """
+    return _operator(_small(scene, mass), about, mass)
+
+
 def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
     still = replace(scene, viscosity=None, displaced=tuple(replace(d, by=jnp.zeros(3)) for d in scene.displaced))
     none = jnp.zeros(())

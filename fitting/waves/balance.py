@@ -1,0 +1,139 @@
+"""How far measured waves are from balance of forces, and the modulus that this tells.
+
+At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M there,
+K of the shear stress alone. B p are the forces of a pressure p (linear in the elements, continuous), which is whatever
+it must be: no bulk modulus is needed. What is measured is d = u + noise, at all nodes. With a pressure of a large
+variance g sd^2 before the data, the likeliest motion that obeys this is
+
+    u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2:
+
+nothing is asked of the motion at the body's surface, which is measured with noise as everything else is. By the
+modulus, chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2
+(variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on u, not on d, noise does
+not pull the modulus down, as it does in the direct inversion of second derivatives.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+import liverjax as lj
+from fitting.waves.voxels import VoxelBody
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.waves.harmonic import element_operator
+
+
+class Matrices(NamedTuple):
+    """Parts of the dynamic stiffness of every element with n nodes, and where they stand."""
+
+    shear: np.ndarray  # (n, 3, n, 3, E) of a shear modulus of 1 Pa [N/m/Pa]
+    mass: np.ndarray  # (n, n, E) of one component [kg]
+    unknowns: np.ndarray  # (n, 3, E) number of each in 3 V, x, y, z of a node together
+    rows: np.ndarray  # (n, 3, E) number among the inner unknowns, -1 where there is none
+    pattern: scipy.sparse.csr_array  # of C
+    places: np.ndarray  # of the entries of all elements with an inner row, in pattern.data
+    entries: np.ndarray  # these, among all entries
+    pressure: scipy.sparse.csr_array  # B B^H (I, I) [m^4]
+    balances: int  # real equations that chi^2 sums over
+
+#: Part of S that the pressures have over the part of the shear stress: what is left of them is its inverse.
+FREE = 1e4
+
+
+class Balanced(NamedTuple):
+    """The likeliest motion at a modulus."""
+
+    chi2: float
+    motion: np.ndarray  # u (3 V,) complex [m]
+    multipliers: np.ndarray  # q (I,)
+    solve: Any  # b (I,) or (I, k) -> (C C^H)^-1 b
+
+
+def matrices(body: VoxelBody, density: float) -> Matrices:
+    """The parts of a body of this density [kg/m^3]."""
+    scene = lj.Scene(
+        mesh=body.mesh,
+        law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
+        viscosity=lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([1.0]), part="isochoric"),
+        body=lj.Body(density=density),
+    )
+    A = jax.tree.map(np.asarray, element_operator(scene))
+    unknowns = 3 * A.nodes[:, None] + np.arange(3)[None, :, None]
+    inner = np.flatnonzero(np.repeat(body.inner, 3))
+    number = np.full(3 * len(body.inner), -1)
+    number[inner] = np.arange(len(inner))
+    rows = number[unknowns]
+    lines, columns = np.broadcast_arrays(rows[:, :, None, None], unknowns[None, None])
+    entries = np.flatnonzero(lines.ravel() >= 0)
+    key = lines.ravel()[entries] * len(number) + columns.ravel()[entries]
+    known, places = np.unique(key, return_inverse=True)
+    counts = np.bincount(known // len(number), minlength=len(inner))
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    shape = (len(inner), len(number))
+    pattern = scipy.sparse.csr_array((np.zeros(len(known), complex), known % len(number), ends), shape=shape)
+    B = _pressures(body, rows, len(inner))
+    balances = 2 * (len(inner) - B.shape[1])
+    return Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, (B @ B.T).tocsr(), balances)
+
+
+def _pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
+    """B (I, P): integrals of each corner's linear function times the divergence of each inner node's function."""
+    D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
+    gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of the linear functions
+    second = (1 + np.eye(4)) / 20  # integrals of their products, over the volume
+    parts = [np.einsum("v,ec->vce", 4 * second[i] - 0.25, gradients[:, i]) for i in range(4)]
+    for i, j in PAIRS:
+        both = np.einsum("v,ec->vce", second[i], gradients[:, j]) + np.einsum("v,ec->vce", second[j], gradients[:, i])
+        parts.append(4 * both)
+    values = np.stack(parts) * np.asarray(body.linear.volumes)  # (n, 4, 3, E)
+    line = np.broadcast_to(rows[:, None], values.shape)
+    corner = np.broadcast_to(np.asarray(body.linear.tetrahedra).T[None, :, None], values.shape)
+    inside = line >= 0
+    shape = (inner, body.linear.number_of_nodes)
+    B = scipy.sparse.coo_array((values[inside], (line[inside], corner[inside])), shape=shape).tocsc()
+    return B[:, np.flatnonzero(np.diff(B.indptr))].tocsr()
+
+
+def rows_of_balance(m: Matrices, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
+    """C (I, 3 V) of complex moduli of the elements (E,) [Pa] at an angular frequency [rad/s]."""
+    mass = m.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
+    real = G.real * m.shear - omega**2 * mass
+    C = m.pattern.copy()
+    for part, factor in ((real, 1.0), (G.imag * m.shear, 1j)):
+        C.data += factor * np.bincount(m.places, part.reshape(-1)[m.entries], minlength=len(C.data))
+    return C
+
+
+def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float) -> Balanced:
+    """The likeliest motion.
+
+    Args:
+        m: `matrices`.
+        G: complex moduli of the elements (E,) [Pa].
+        omega: angular frequency [rad/s].
+        d: measured motion (3 V,) complex [m], x, y, z of a node together.
+        sd: standard deviation of real and imaginary part of one component [m].
+    """
+    C = rows_of_balance(m, G, omega)
+    CH = C.conj().T.tocsr()
+    # Hermitian and positive: no pivots are needed, and an order for symmetric matrices keeps the factor small.
+    S = C @ CH
+    S = S + FREE * abs(S.diagonal()).mean() / m.pressure.diagonal().mean() * m.pressure
+    options = {"SymmetricMode": True}
+    factor = scipy.sparse.linalg.splu(S.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    r = C @ d
+    q = factor.solve(r)
+    return Balanced(float(np.real(np.vdot(r, q))) / sd**2, d - CH @ q, q, factor.solve)
+
+
+def by_modulus(m: Matrices, u: np.ndarray) -> scipy.sparse.csc_array:
+    """C' u: derivative of C u by the modulus of every element, (I, E)."""
+    forces = np.einsum("arbse,bse->are", m.shear, u[m.unknowns], optimize=True)
+    inside = m.rows >= 0
+    element = np.broadcast_to(np.arange(m.rows.shape[-1]), m.rows.shape)
+    shape = (m.pattern.shape[0], m.rows.shape[-1])
+    return scipy.sparse.coo_array((forces[inside], (m.rows[inside], element[inside])), shape=shape).tocsc()

@@ -1,0 +1,111 @@
+"""Complex moduli of the regions of an organ from its waves, one by one frequency, with their uncertainty."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.waves import balance
+from fitting.waves.balance import Balanced, Matrices
+
+#: Moduli [Pa] at which a search begins, and the loss over storage there.
+STARTS, LOSS = np.geomspace(500.0, 64000.0, 8), 0.3
+#: Iterations, and the change of a modulus over its standard error at which they end.
+ITERATIONS, ENOUGH = 20, 0.02
+
+
+class Waves(NamedTuple):
+    """Measured motion at the nodes of a body."""
+
+    omega: np.ndarray  # (F,) [rad/s]
+    motion: np.ndarray  # (F, 3 V) complex [m], x, y, z of a node together
+    sd: np.ndarray  # (F,) [m], of real and of imaginary part of one component
+
+
+class Regions(NamedTuple):
+    """Moduli of R regions at F frequencies."""
+
+    modulus: np.ndarray  # (F, R) complex [Pa]
+    covariance: np.ndarray  # (F, R, R) complex [Pa^2]: of real parts and of imaginary parts each, both the same
+    chi2: np.ndarray  # (F,)
+    components: int  # of one frequency
+    iterations: np.ndarray  # (F,)
+    converged: np.ndarray  # (F,) bool
+
+    @property
+    def noise_factor(self) -> np.ndarray:
+        """How much larger the residuals are than the noise (F,), at least 1; errors are enlarged by it."""
+        return np.maximum(1.0, np.sqrt(self.chi2 / self.components))
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """Of storage and of loss (F, R) [Pa]."""
+        variance = np.real(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return self.noise_factor[:, None] * np.sqrt(variance)
+
+
+def first_modulus(m: Matrices, waves: Waves) -> complex:
+    """The modulus [Pa] of `STARTS` that leaves the least out of balance at the lowest frequency."""
+    ones = np.ones(m.rows.shape[-1])
+
+    def out_of_balance(G):
+        at = waves.omega[0], waves.motion[0], waves.sd[0]
+        return balance.balanced(m, G * ones, *at).chi2
+
+    return min(STARTS * (1 + LOSS * 1j), key=out_of_balance)
+
+
+def fit(
+    m: Matrices,
+    waves: Waves,
+    region: np.ndarray,
+    start: np.ndarray,
+    progress: Callable[[int, float], None] = lambda iteration, cost: None,
+) -> Regions:
+    """Moduli by Gauss-Newton, every frequency by itself.
+
+    Args:
+        m: `balance.matrices`.
+        waves: what was measured.
+        region: number of the region of each element (E,), from 0.
+        start: complex modulus of each region (R,) [Pa], of the lowest frequency.
+        progress: told of every iteration: its number, and chi^2 over the number of components.
+    """
+    found, G = [], np.asarray(start, complex)
+    for f in range(len(waves.omega)):
+        found.append(_one_frequency(m, waves, f, region, G, progress))
+        G = found[-1][0]
+    G, covariance, chi2, iterations, converged = (np.array(each) for each in zip(*found, strict=True))
+    return Regions(G, covariance, chi2, m.balances, iterations, converged)
+
+
+def _one_frequency(m, waves, f, region, G, progress):
+    """Modulus (R,), covariance (R, R), chi^2, iterations, and whether they ended by themselves."""
+    one_hot = np.eye(len(G))[region]  # (E, R)
+    at = waves.omega[f], waves.motion[f], waves.sd[f]
+    here, converged, k = balance.balanced(m, one_hot @ G, *at), False, 0
+    for k in range(1, ITERATIONS + 1):
+        step, H = _step(m, here, one_hot, waves.sd[f])
+        part = min(1.0, 0.5 / max(np.max(np.abs(step / G)), 1e-300))  # a modulus changes by half of itself at most
+        for _ in range(8):
+            new = balance.balanced(m, one_hot @ (G + part * step), *at)
+            if new.chi2 <= here.chi2 * (1 + 1e-10):
+                break
+            part *= 0.5
+        else:
+            break
+        G, here = G + part * step, new
+        progress(k, here.chi2 / m.balances)
+        if np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))) or part < 1e-2:
+            converged = part == 1.0
+            break
+    H = _step(m, here, one_hot, waves.sd[f])[1]
+    return G, np.linalg.inv(H), here.chi2, k, converged
+
+
+def _step(m: Matrices, here: Balanced, one_hot: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
+    """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2."""
+    J = balance.by_modulus(m, here.motion) @ one_hot
+    H = J.conj().T @ here.solve(J) / sd**2
+    g = J.conj().T @ here.multipliers / sd**2
+    return -np.linalg.solve(H, g), H

@@ -1,0 +1,118 @@
+"""A body of quadratic elements whose nodes are voxels, so that what is measured there is what nodes do."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.promotion import quadratic
+from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
+
+
+class VoxelBody(NamedTuple):
+    """Bricks of 3 x 3 x 3 voxels, each cut into six quadratic elements; neighbours share their outer voxels."""
+
+    linear: TetMesh  # of the corners
+    mesh: TetMesh  # quadratic; the nodes of `linear` come first
+    voxel: np.ndarray  # (V, 3) index of each node's voxel
+    inner: np.ndarray  # (V,) bool: nodes with elements all around, where forces must balance
+
+
+def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None = None) -> VoxelBody:
+    """The bricks whose 27 voxels are all in the mask.
+
+    Args:
+        mask: (nx, ny, nz) bool.
+        spacing: of the voxels (3,) [m].
+        origin: centre of the first voxel (3,) [m]; None: 0.
+
+    Raises:
+        InputError: a mask that has no room for a brick, or for a node within bricks.
+    """
+    first = _corner(mask)
+    cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
+    if min(cells) < 1:
+        raise InputError(
+            f"the mask reaches over {' x '.join(map(str, np.array(mask.shape) - first))} voxels: waves need at least "
+            "5 along every axis; measure more slices"
+        )
+    kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
+    inner = _inside(kept)
+    if not inner.any():
+        raise InputError("the mask has no voxel that lies two voxels deep on every side: give a larger mask")
+    used, tets = np.unique(_sixths(np.argwhere(kept), kept.shape), return_inverse=True)
+    at = 2 * np.stack(np.unravel_index(used, tuple(n + 1 for n in kept.shape)), axis=1)
+    start = np.zeros(3) if origin is None else np.asarray(origin)
+    linear = tet_mesh((at + first) * spacing + start, tets.reshape(-1, 4))
+    mesh = quadratic(linear)
+    place = np.rint((np.asarray(mesh.points) - start) / spacing).astype(int)
+    return VoxelBody(linear, mesh, place, inner[tuple((place - first).T)])
+
+
+def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
+    """Corners (6 n, 4) of the elements of bricks (n, 3); every second brick is a mirror image along each axis.
+
+    So no diagonal is in all bricks alike, and waves of all directions are about as fast.
+    """
+    out = []
+    for order in itertools.permutations(range(3)):
+        path = np.vstack([np.zeros(3, int), np.cumsum(np.eye(3, dtype=int)[list(order)], axis=0)])
+        odd = brick[:, None] % 2
+        nodes = brick[:, None] + np.where(odd, 1 - path, path)
+        mirrored = (np.linalg.det(np.eye(3)[list(order)]) < 0) ^ (odd.sum(axis=(1, 2)) % 2 == 1)
+        nodes[mirrored] = nodes[mirrored][:, [0, 2, 1, 3]]
+        out.append(np.ravel_multi_index(tuple(np.moveaxis(nodes, -1, 0)), tuple(n + 1 for n in cells)))
+    return np.stack(out, axis=1).reshape(-1, 4)
+
+
+def _corner(mask: np.ndarray) -> np.ndarray:
+    """First voxel (3,) of the smallest box around the mask."""
+    if not mask.any():
+        raise InputError("the mask holds no voxel: give one that is true within the organ")
+    return np.array([np.flatnonzero(mask.any(axis=tuple(b for b in range(3) if b != a)))[0] for a in range(3)])
+
+
+def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
+    """Bricks (cells) of which every voxel is in the mask."""
+    kept = np.ones(cells, bool)
+    for offset in np.ndindex(3, 3, 3):
+        kept &= mask[_every_second(offset, cells)]
+    return kept
+
+
+def _inside(kept: np.ndarray) -> np.ndarray:
+    """Voxels (2 cells + 1) all of whose bricks are kept, and that are not at the end of the grid."""
+    inside = np.ones(tuple(2 * n + 1 for n in kept.shape), bool)
+    for offset in np.ndindex(3, 3, 3):
+        inside[_every_second(offset, kept.shape)] &= kept
+    for a in range(3):
+        ends = [slice(None)] * 3
+        ends[a] = [0, -1]
+        inside[tuple(ends)] = False
+    return inside
+
+
+def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slice, ...]:
+    return tuple(slice(o, o + 2 * n - 1, 2) for o, n in zip(offset, cells, strict=True))
+
+
+def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
+    """Values (V,) of a field that is linear in the elements, from those of their corners."""
+    from liverjax.mesh.adjacency import PAIRS
+
+    values = np.empty(body.mesh.number_of_nodes, corners.dtype)
+    values[: len(corners)] = corners
+    nodes = [np.asarray(n) for n in body.mesh.element_nodes]
+    for middle, (i, j) in zip(nodes[4:], PAIRS, strict=True):
+        values[middle] = 0.5 * (values[nodes[i]] + values[nodes[j]])
+    return values
+
+
+def elements_of(body: VoxelBody, labels: np.ndarray) -> np.ndarray:
+    """The label (E,) that most nodes of each element have, of labels (nx, ny, nz)."""
+    own = labels[tuple(body.voxel.T)]
+    known, index = np.unique(own, return_inverse=True)
+    nodes = np.stack([np.asarray(n) for n in body.mesh.element_nodes])
+    votes = np.stack([np.sum(index[nodes] == k, axis=0) for k in range(len(known))])
+    return known[np.argmax(votes, axis=0)]
