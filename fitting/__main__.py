@@ -1,4 +1,4 @@
-"""``python -m fitting SWEEP.csv …``, ``… relaxation | creep | indentation FILE``, ``… curves …``, ``… field …``."""
+"""``python -m fitting SWEEP.csv …``, ``… relaxation | creep | indentation FILE``, ``… curves | field | waves …``."""
 
 import importlib
 import sys
@@ -10,7 +10,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m fitting") ->
     """Entry point; returns the exit code: 0 done, 1 not converged, 2 unusable input."""
     arguments = sys.argv[1:] if arguments is None else arguments
     name = "sweep"
-    if arguments[:1] in (["curves"], ["field"], ["relaxation"], ["creep"], ["indentation"]):
+    if arguments[:1] in (["curves"], ["field"], ["relaxation"], ["creep"], ["indentation"], ["waves"]):
         name, arguments = arguments[0], arguments[1:]
         prog = f"{prog} {name}"
     command = importlib.import_module(f"fitting.commands.{name}")  # the others stay unloaded, for a quick start

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 
 from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
@@ -105,7 +106,8 @@ def _one_frequency(m, waves, f, region, G, progress):
 
 def _step(m: Matrices, here: Balanced, one_hot: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
     """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2."""
-    J = balance.by_modulus(m, here.motion) @ one_hot
-    H = J.conj().T @ here.solve(J) / sd**2
+    J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(one_hot)).tocsc()
+    X = here.whitened(J)
+    H = X.conj().T @ X / sd**2
     g = J.conj().T @ here.multipliers / sd**2
     return -np.linalg.solve(H, g), H

@@ -1,0 +1,124 @@
+"""``python -m fitting waves DATA --frequencies HZ …``: complex moduli of an organ from waves on voxels."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fitting.commands.exit_codes import EXIT_CODES
+from fitting.commands.progress import cost_bar
+from fitting.waves.shear_waves import DENSITY
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
+
+if TYPE_CHECKING:
+    from fitting.waves.elastography import Organ
+
+FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5")
+#: Memory of one factor beyond which a coarser grid is asked for [GB].
+MOST_MEMORY = 4.0
+
+
+def parser(prog: str) -> argparse.ArgumentParser:
+    """Options of the command, which --help calls `prog`."""
+    command = argparse.ArgumentParser(
+        prog=prog,
+        description="Find storage and loss modulus of an organ from harmonic waves on voxels (elastography): of the "
+        "whole, of regions, and as a map, each with standard deviations; the usual direct inversion beside them.",
+        epilog=EXIT_CODES,
+    )
+    command.add_argument(
+        "data", type=Path, metavar="DATA", help="complex displacements: .npz, .h5, .csv, .nii, .nii.gz"
+    )
+    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="where the file does not hold them")
+    command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, where the file has none")
+    command.add_argument("--labels", type=Path, metavar="FILE", help="number of the region of each voxel")
+    command.add_argument("--unit", help="of the displacements: m, mm or um (default m)")
+    command.add_argument(
+        "--spacing", type=float, nargs=3, metavar="M", help="of the voxels [m], where the file has none"
+    )
+    command.add_argument("--noise", type=float, metavar="M", help="standard deviation of one component (default: data)")
+    command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
+    command.add_argument("--stride", type=int, metavar="N", help="take means of N x N x N voxels (default: as needed)")
+    command.add_argument("--no-map", action="store_true", help="only the whole and the regions")
+    command.add_argument("--length", type=float, metavar="M", help="over which the map varies [m] (default 2 bricks)")
+    command.add_argument(
+        "--samples", type=int, default=20, metavar="N", help="maps drawn from the posterior (default 20)"
+    )
+    command.add_argument("--resume", action="store_true", help="go on from the last step written to --out")
+    command.add_argument("--out", type=Path, default=Path("waves"), metavar="DIR", help="folder (default waves)")
+    return command
+
+
+def run(options: argparse.Namespace) -> int:
+    """Find moduli; 1 if a fit did not converge."""
+    _check(options)
+    from fitting.reports import waves_report
+    from fitting.waves import direct_inversion, elastography, wave_field
+
+    field = wave_field.read(
+        options.data, options.frequencies, options.mask, options.labels, options.unit, options.spacing
+    )
+    if options.noise is not None:
+        field = field._replace(noise=np.full(len(field.frequencies), options.noise))
+    for note in field.notes:
+        print(f"note: {note}", file=sys.stderr)
+    writable(options.out, FILES)
+    organ = _organ(options, field)
+    bar, told = cost_bar("steps")
+    with bar:
+        found = elastography.regions_of(organ, told)
+        drawn = None
+        if not options.no_map:
+            length = options.length or float(4 * np.mean(organ.field.spacing))
+            file = options.out / "progress.h5"
+            drawn = elastography.map_of(organ, found, length, file, options.resume, options.samples, told)
+    usual = direct_inversion.invert(organ.field, options.density)
+    content = waves_report.write(options.out, organ, found, drawn, usual)
+    print(waves_report.table(content))
+    for sentence in content["warnings"]:
+        print(f"warning: {sentence}", file=sys.stderr)
+    files = [name for name in FILES[:-1] if (options.out / name).exists()]
+    print(f"written: {options.out}/{', '.join(files)}")
+    return 0 if np.all(found.whole.converged) and (found.parts is None or np.all(found.parts.converged)) else 1
+
+
+def _organ(options: argparse.Namespace, field) -> "Organ":
+    """The body of the voxels, coarse enough for the memory."""
+    from fitting.waves import elastography, wave_field
+
+    stride = options.stride or 1
+    while True:
+        coarse = wave_field.coarsened(field, stride)
+        body = elastography.body_of(coarse)
+        needed = elastography.gigabytes(body)
+        if needed < MOST_MEMORY:
+            break
+        if options.stride:
+            raise InputError(
+                f"--stride {stride} needs {needed:.1f} GB for each of {len(field.frequencies)} frequencies: give "
+                f"--stride {stride + 1}, or a smaller --mask"
+            )
+        stride += 1
+    if stride > 1:
+        print(f"note: means of {stride} x {stride} x {stride} voxels are taken", file=sys.stderr)
+    return elastography.organ_of(coarse, body, options.density)
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse numbers that no measurement has."""
+    for name in ("length", "noise"):
+        value = getattr(options, name)
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"--{name} {value:g} must be above 0: give a length in metres, e.g. 0.004")
+    if not 100 <= options.density <= 25000:
+        raise InputError(f"--density {options.density:g} cannot be an organ's in kg/m^3: give e.g. --density 1060")
+    if options.stride is not None and options.stride < 1:
+        raise InputError(f"--stride {options.stride} is the number of voxels in a mean: give 1 or more")
+    if options.samples < 0:
+        raise InputError(f"--samples {options.samples} cannot be a number of maps: give 0 or more")
+    for hertz in options.frequencies or ():
+        if not (np.isfinite(hertz) and 0 < hertz <= 1e5):
+            raise InputError(f"--frequencies {hertz:g} must be above 0 Hz: give e.g. --frequencies 60")

@@ -1,0 +1,222 @@
+"""What a fit to waves leaves behind: waves.json, waves.h5, waves.vtu and waves.png."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+
+from fitting.reports.sweep_report import numbers
+from fitting.waves import voxels
+from fitting.waves.elastography import Found, Organ
+from fitting.waves.regions import Regions
+from fitting.waves.shear_waves import velocity_and_attenuation
+from fitting.waves.stiffness_map import WaveMap
+from liverjax.core.plotting import pyplot, save
+from liverjax.core.versions import versions
+
+#: chi^2 over the number of equations beyond which something is missing.
+TOO_FAR = 1.5
+#: Standard deviations beyond which a voxel of the map is told from the organ's mean.
+TOLD = 3.0
+
+
+def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: np.ndarray) -> dict[str, Any]:
+    """Write all files into the folder `out`; returns the content of waves.json.
+
+    Args:
+        out: folder.
+        organ, found, drawn: what was fitted; no map: None.
+        usual: direct inversion (F, nx, ny, nz) [Pa].
+    """
+    content = {
+        "data": organ.field.source,
+        "notes": list(organ.field.notes),
+        "frequencies_Hz": organ.field.frequencies.tolist(),
+        "noise_m": organ.field.noise.tolist(),
+        "density_kg_m3": organ.density,
+        "spacing_m": organ.field.spacing.tolist(),
+        "voxels": int(organ.body.mesh.number_of_nodes),
+        "elements": int(organ.body.mesh.number_of_elements),
+        "whole": _of_regions(organ, found.whole, found.mesh_bias)[0],
+        "regions": _named(organ, found),
+        "direct_inversion": _direct(organ, found, usual),
+        "map": None if drawn is None else _of_map(drawn),
+        "warnings": _warnings(organ, found, drawn),
+        "versions": versions(),
+    }
+    content = numbers(content)
+    (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    _store(out / "waves.h5", organ, drawn, usual)
+    if drawn is not None:
+        _for_paraview(out / "waves.vtu", organ, drawn)
+        save(_picture(organ, drawn, usual), out / "waves.png")
+    return content
+
+
+def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[dict[str, Any]]:
+    """One dictionary a region, lists over the frequencies."""
+    omega, rows = organ.waves.omega, []
+    for r in range(found.modulus.shape[1]):
+        G, e = found.modulus[:, r], found.standard_errors[:, r]
+        c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
+        rows.append(
+            {
+                "storage_Pa": G.real.tolist(),
+                "loss_Pa": G.imag.tolist(),
+                "standard_error_Pa": e.tolist(),
+                "mesh_bias_storage_Pa": (G * bias).real.tolist(),
+                "mesh_bias_loss_Pa": (G * bias).imag.tolist(),
+                "phase_velocity_m_s": c.tolist(),
+                "attenuation_1_m": alpha.tolist(),
+                "voxels_a_wave": (2 * np.pi * c / omega / organ.field.spacing.max()).tolist(),
+                "chi2_per_component": (found.chi2 / found.components).tolist(),
+                "noise_factor": found.noise_factor.tolist(),
+                "iterations": found.iterations.tolist(),
+                "converged": found.converged.tolist(),
+            }
+        )
+    return rows
+
+
+def _named(organ: Organ, found: Found) -> dict[str, Any] | None:
+    if found.parts is None or found.labels is None:
+        return None
+    rows = _of_regions(organ, found.parts, found.mesh_bias)
+    return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
+
+
+def _direct(organ: Organ, found: Found, usual: np.ndarray) -> dict[str, Any]:
+    """Medians of the direct inversion over the whole and over the regions; null where no voxel has one."""
+    labels = organ.field.labels
+    places = {"whole": organ.field.mask}
+    if found.labels is not None and labels is not None:
+        places |= {str(k): organ.field.mask & (labels == k) for k in found.labels}
+    out = {}
+    for name, place in places.items():
+        known = [G[place & np.isfinite(G)] for G in usual]
+        out[name] = {
+            "storage_Pa": [float(np.median(g.real)) if g.size else None for g in known],
+            "loss_Pa": [float(np.median(g.imag)) if g.size else None for g in known],
+        }
+    return out
+
+
+def _of_map(drawn: WaveMap) -> dict[str, Any]:
+    return {
+        "prior_deviation": drawn.deviation,
+        "correlation_length_m": drawn.length,
+        "chi2_per_component": drawn.chi2 / drawn.components,
+        "discrepancy_reached": drawn.reached,
+        "part_of_variance_left": float(np.mean((drawn.sd / drawn.prior_sd) ** 2)),
+        "told_from_the_mean": float(np.mean(np.abs(drawn.exponent.real) > TOLD * drawn.sd)),
+        "history": drawn.history,
+        "run_time_s": drawn.seconds,
+    }
+
+
+def _warnings(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
+    told, each = [], found.whole if found.parts is None else found.parts
+    for f, hertz in enumerate(organ.field.frequencies):
+        if not np.isfinite(organ.field.noise[f]):
+            continue
+        ratio = each.chi2[f] / each.components
+        if ratio > TOO_FAR:
+            told.append(
+                f"{hertz:g} Hz: chi2 is {ratio:.3g} an equation with uniform {'regions' if found.parts else 'moduli'}: "
+                "the organ is less uniform, or the noise larger; the standard errors are enlarged by its root"
+            )
+        bias, error = np.abs(found.mesh_bias[f]), each.standard_errors[f] / np.abs(each.modulus[f])
+        if bias > error.min():
+            told.append(
+                f"{hertz:g} Hz: the voxels themselves move the moduli by {100 * bias:.2g} % "
+                f"(standard error {100 * error.min():.2g} %): subtract mesh_bias, or measure smaller voxels"
+            )
+    if drawn is not None and not drawn.reached and drawn.chi2 > TOO_FAR * drawn.components:
+        told.append(
+            f"chi2 of the map stays at {drawn.chi2 / drawn.components:.3g} an equation: edges sharper than the map, or "
+            "a body that moves otherwise than a viscous solid"
+        )
+    return told
+
+
+def table(content: dict[str, Any]) -> str:
+    """Moduli of the whole and of the regions at every frequency, with the direct inversion beside them."""
+    rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>7s}   direct [Pa]"]
+    for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
+        direct = content["direct_inversion"][name]
+        for f, hertz in enumerate(content["frequencies_Hz"]):
+            e = own["standard_error_Pa"][f]
+            usual = [direct[part][f] for part in ("storage_Pa", "loss_Pa")]
+            pair = "none" if usual[0] is None else f"{usual[0]:.4g} + {usual[1]:.3g}i"
+            cells = [f"{own[part][f]:.5g} ± {e:.2g}" for part in ("storage_Pa", "loss_Pa")]
+            rows.append(
+                f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
+                f"{own['chi2_per_component'][f]:7.2f}   {pair}"
+            )
+    if content["map"]:
+        m = content["map"]
+        rows.append(
+            f"map: chi2 {m['chi2_per_component']:.3g} an equation, {100 * m['part_of_variance_left']:.2g} % of the prior's variance left, "
+            f"{100 * m['told_from_the_mean']:.2g} % of the nodes told from the mean, {m['run_time_s']:.3g} s"
+        )
+    return "\n".join(rows)
+
+
+def _on_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
+    """Values at the voxels (nx, ny, nz), NaN outside, from those of the corners (P,)."""
+    out = np.full(organ.field.mask.shape, np.nan, corners.dtype)
+    out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
+    return out
+
+
+def _store(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
+    with h5py.File(path, "w") as file:
+        for name in ("frequencies", "spacing", "origin", "mask"):
+            file[name] = getattr(organ.field, name)
+        file["direct_inversion"] = usual
+        if drawn is None:
+            return
+        whole = np.stack([_on_voxels(organ, G) for G in drawn.modulus])
+        sd = _on_voxels(organ, drawn.sd)
+        file["modulus"], file["sd_of_logarithm"] = whole, sd
+        file["sd"] = np.abs(whole) * sd
+        file["draws_of_exponent"] = np.stack([_on_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
+        file["modulus"].attrs["unit"] = file["sd"].attrs["unit"] = "Pa"
+
+
+def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
+    data = {"sd_of_logarithm": drawn.sd}
+    for hertz, G in zip(organ.field.frequencies, drawn.modulus, strict=True):
+        data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
+    mesh = organ.body.linear
+    meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
+
+
+def _picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
+    """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
+    f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
+    k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
+    G, sd = _on_voxels(organ, drawn.modulus[f]), _on_voxels(organ, drawn.sd)
+    panels = (
+        ("storage modulus [kPa]", G.real / 1e3, "viridis"),
+        ("loss modulus [kPa]", G.imag / 1e3, "viridis"),
+        ("sd of ln|G| and of the loss angle", sd, "magma"),
+        ("direct inversion, storage [kPa]", usual[f].real / 1e3, "viridis"),
+    )
+    size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)
+    across = [a for a in range(3) if a != axis]
+    fig, axes = pyplot().subplots(1, 4, figsize=(13, 4.2), layout="constrained")
+    top = np.nanmax(panels[0][1])
+    for ax, (title, values, colours) in zip(axes, panels, strict=True):
+        limits = {"vmin": 0.0, "vmax": top} if "storage" in title else {"vmin": 0.0}
+        shown = np.take(values, k, axis).T
+        picture = ax.imshow(
+            shown, origin="lower", cmap=colours, extent=(0, size[across[0]], 0, size[across[1]]), **limits
+        )
+        ax.set(title=title, xlabel=f"{'xyz'[across[0]]} [mm]", ylabel=f"{'xyz'[across[1]]} [mm]")
+        ax.title.set_fontsize(9)
+        fig.colorbar(picture, ax=ax, shrink=0.8)
+    return fig

@@ -1,0 +1,71 @@
+"""The usual direct inversion of waves (algebraic Helmholtz), as the baseline beside the balance of forces.
+
+The curl q of the displacement obeys G laplace(q) = - density omega^2 q where G is uniform, since it holds no pressure.
+By least squares over the three components and a window of voxels
+
+    G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
+
+(Oliphant et al. 2001, Magn. Reson. Med. 45, 299). Noise of laplace(q) is squared below the line, so noise pulls the
+modulus down; and a window over an edge mixes both sides. Both are known faults of the method, and left as they are.
+"""
+
+import numpy as np
+from scipy import ndimage
+
+from fitting.waves.wave_field import WaveField
+
+#: Standard deviation of the Gaussian that smooths displacements before they are differentiated [voxels].
+SMOOTHING = 1.0
+#: Voxels along an axis of the window of least squares.
+WINDOW = 3
+
+
+def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
+    """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside and where the mask's edge comes into the derivatives.
+
+    Args:
+        field: three components are needed; NaN everywhere without.
+        density: [kg/m^3].
+        smoothing: [voxels] standard deviation of the Gaussian.
+        window: [voxels] an odd number.
+    """
+    omega = 2 * np.pi * field.frequencies
+    ratios = [_one(field, U, smoothing, window) for U in field.displacement]
+    return -density * omega[:, None, None, None] ** 2 * np.stack(ratios)
+
+
+def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
+    inside = field.mask & np.all(np.isfinite(U), axis=-1)
+    # Two derivatives, then one more: each looks one voxel further.
+    whole = ndimage.binary_erosion(inside, np.ones((3, 3, 3)), iterations=2)
+    u = [_smooth(U[..., c], inside, smoothing) for c in range(3)]
+    d = [np.gradient(c, *field.spacing) if min(c.shape) > 1 else [np.full_like(c, np.nan)] * 3 for c in u]
+    curl = (d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1])
+    above = below = 0.0
+    for q in curl:
+        L = sum(_second(q, a, h) for a, h in enumerate(field.spacing))
+        above = above + np.conj(L) * q
+        below = below + np.abs(L) ** 2
+    size = np.ones((window,) * 3)
+    blank = np.where(whole, 1.0, 0.0)
+    above, below = (ndimage.convolve(np.where(whole, a, 0.0), size, mode="constant") for a in (above, below))
+    near = ndimage.convolve(blank, size, mode="constant")
+    return np.where(whole & (near > 0) & (below > 0), above / np.where(below > 0, below, 1.0), np.nan)
+
+
+def _smooth(u: np.ndarray, inside: np.ndarray, width: float) -> np.ndarray:
+    """Mean of the voxels inside, weighted by a Gaussian."""
+    if width == 0:
+        return np.where(inside, u, 0.0)
+    weight = ndimage.gaussian_filter(inside.astype(float), width)
+    known = np.where(inside, u, 0.0)
+    sums = ndimage.gaussian_filter(known.real, width) + 1j * ndimage.gaussian_filter(known.imag, width)
+    return sums / np.maximum(weight, 1e-12)
+
+
+def _second(q: np.ndarray, axis: int, h: float) -> np.ndarray:
+    """Second difference along an axis, 0 at its ends."""
+    out = np.zeros_like(q)
+    rows, to = np.moveaxis(q, axis, 0), np.moveaxis(out, axis, 0)
+    to[1:-1] = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / h**2
+    return out

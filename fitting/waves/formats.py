@@ -1,0 +1,154 @@
+"""Files of waves on voxels: .npz, .npy, HDF5, CSV and NIfTI, each as named arrays.
+
+Names are displacement (complex; or real and imag, or phases: instants of a period), frequencies [Hz], spacing [m],
+origin [m], mask, labels and unit.
+"""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+NAMES = ("displacement", "real", "imag", "phases", "frequencies", "spacing", "origin", "mask", "labels", "unit")
+HDF5 = (".h5", ".hdf5", ".mat")
+
+
+def arrays(path: Path) -> dict[str, Any]:
+    """The named arrays of a file.
+
+    Raises:
+        InputError: no such file, or one that cannot be read.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file of waves: give .npz, .npy, .h5, .csv, .nii or .nii.gz")
+    ending = "".join(path.suffixes[-2:]).lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    readers = {".npz": _numpy, ".npy": _numpy, ".csv": _table, ".txt": _table, ".nii": _nifti, ".nii.gz": _nifti}
+    readers |= dict.fromkeys(HDF5, _hdf5)
+    if ending not in readers:
+        raise InputError(f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .csv, .nii or .nii.gz")
+    try:
+        return readers[ending](path)
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: cannot be read as {ending} ({reason}): write it again") from None
+    except Exception as error:  # a damaged archive has many names: zip, zlib, header errors of NIfTI
+        raise InputError(f"{path}: is damaged ({type(error).__name__}): write it again") from None
+
+
+def single(path: Path, name: str) -> np.ndarray:
+    """One array (nx, ny, nz): that of this name, or the only one of the file."""
+    found = arrays(path)
+    if name in found:
+        return np.asarray(found[name])
+    own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
+    if len(own) != 1:
+        raise InputError(f"{path}: holds no {name}: name the array {name}")
+    a = np.asarray(own[0])
+    return a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
+
+
+def _numpy(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) if path.suffix.lower() == ".npz" else _as_one(path) as file:
+        found = {name: file[name] for name in file}
+    return found | ({"unit": str(found["unit"])} if "unit" in found else {})
+
+
+class _as_one(dict):
+    """The array of a .npy file as a file of one name."""
+
+    def __init__(self, path: Path):
+        super().__init__(displacement=np.load(path, allow_pickle=False))
+
+    def __enter__(self) -> "_as_one":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def _hdf5(path: Path) -> dict[str, Any]:
+    import h5py
+
+    with h5py.File(path) as file:
+        found: dict[str, Any] = {name: file[name][()] for name in NAMES if name in file}
+        found |= {name: file.attrs[name] for name in NAMES if name in file.attrs}
+    for name, value in found.items():
+        a = np.asarray(value)
+        if a.dtype.names and set(a.dtype.names) >= {"real", "imag"}:  # complex numbers of MATLAB
+            found[name] = a["real"] + 1j * a["imag"]
+    unit = found.get("unit")
+    return found | ({} if unit is None else {"unit": unit.decode() if isinstance(unit, bytes) else str(unit)})
+
+
+#: Columns of a table, all of them but the frequency needed.
+COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_im_z")
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """x, y, z [m], real and imaginary parts, with or without frequency [Hz] and label, on a regular grid."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        lines = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
+    head = [cell.strip().lower() for cell in lines[0]] if lines else []
+    missing = [name for name in COLUMNS if name not in head]
+    if missing:
+        raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, of several, frequency")
+    rows = np.full((len(lines) - 1, len(head)), np.nan)
+    for k, row in enumerate(lines[1:]):
+        try:
+            rows[k, : len(row)] = [float(cell) if cell.strip() else np.nan for cell in row[: len(head)]]
+        except ValueError:
+            raise InputError(
+                f"{path}: row {k + 2}: {','.join(row)[:40]!r} has a cell that is no number: mend it"
+            ) from None
+    column = dict(zip(head, rows.T, strict=True))
+    at, spacing, origin, shape = _grid(path, np.stack([column[a] for a in "xyz"], axis=1))
+    hertz, of = (None, np.zeros(len(rows), int))
+    if "frequency" in column:
+        hertz, of = np.unique(column["frequency"], return_inverse=True)
+    U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
+    for c, axis in enumerate("xyz"):
+        U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
+    found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
+    if "label" in column:
+        found["labels"] = np.zeros(shape, int)
+        found["labels"][tuple(at.T)] = np.nan_to_num(column["label"]).astype(int)
+    return found
+
+
+def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Places (n, 3) of points on a regular grid, its spacing, origin and shape."""
+    if not np.all(np.isfinite(X)) or not len(X):
+        raise InputError(f"{path}: has rows without x, y, z, or none at all: give every voxel its place in metres")
+    spacing = np.empty(3)
+    for a in range(3):
+        steps = np.diff(np.unique(np.round(X[:, a], 9)))
+        if not len(steps):
+            raise InputError(f"{path}: all voxels have the same {'xyz'[a]}: waves need a volume, not a slice")
+        spacing[a] = steps.min()
+    origin = X.min(axis=0)
+    at = np.rint((X - origin) / spacing).astype(int)
+    off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
+    if off.max() > 0.05:
+        raise InputError(f"{path}: {'xyz'[int(off.argmax())]} is not on a regular grid: give voxels with even steps")
+    return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
+
+
+def _nifti(path: Path) -> dict[str, Any]:
+    """Complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3); real data are a mask or labels. Voxel sizes are in mm."""
+    try:
+        import nibabel
+    except ImportError:
+        raise InputError(f"{path}: NIfTI needs nibabel: pip install 'liverjax[nifti]', or give .npz") from None
+    image: Any = nibabel.load(path)
+    data = np.asarray(image.dataobj)
+    size = np.asarray(image.header.get_zooms()[:3], float) * 1e-3
+    if not np.iscomplexobj(data):
+        return {"labels": data, "spacing": size}
+    if data.ndim == 5:
+        data = np.moveaxis(data, 3, 0)
+    return {"displacement": data, "spacing": size}

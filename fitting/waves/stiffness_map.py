@@ -1,0 +1,255 @@
+"""A map of the complex modulus from measured waves: a smooth field, with its uncertainty.
+
+At frequency f the modulus of an element is g_f exp(c), g_f that of the whole organ and c = ln(size) + i (loss angle)
+the mean of a complex nodal field (P,), one field for all frequencies. Its real and its imaginary part have the prior of
+`fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number of
+equations (discrepancy principle; Morozov 1966), or no longer falls. The minimum of chi^2/2 + |z|^2/2 over the whitened
+z is sought by Gauss-Newton. The uncertainty is that of the Hessian I + J^H J.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from fitting.methods import prior as smooth
+from fitting.waves import balance
+from fitting.waves.balance import Balanced, Matrices
+from fitting.waves.regions import Waves
+from fitting.waves.voxels import VoxelBody
+from liverjax.core.errors import InputError
+from liverjax.core.files import whole
+
+#: Standard deviations of c to try, from a nearly uniform organ to a free one.
+DEVIATIONS = (0.1, 0.2, 0.4, 0.8)
+#: A larger one must lower chi^2 by this part, or it is no better.
+WORTH = 0.01
+#: Steps of Gauss-Newton for each, and the part of the cost below which one is the last.
+STEPS, LAST = 8, 1e-3
+
+
+class WaveMap(NamedTuple):
+    """What was found."""
+
+    exponent: np.ndarray  # c (P,) complex at the corners
+    sd: np.ndarray  # (P,) of its real and of its imaginary part
+    prior_sd: np.ndarray  # (P,)
+    draws: np.ndarray  # (D, P) complex: samples of the posterior
+    modulus: np.ndarray  # (F, P) complex [Pa]
+    deviation: float  # the prior's, chosen
+    length: float  # [m]
+    chi2: float
+    components: int
+    reached: bool
+    history: list[dict[str, float]]
+    seconds: float
+
+
+class Course(NamedTuple):
+    """What a search needs, all of it fixed."""
+
+    m: Matrices
+    waves: Waves
+    whole: np.ndarray  # (F,) complex
+    mean: scipy.sparse.csr_array  # (E, P): the corners' mean
+    p: smooth.Prior
+    length: float  # [m]
+
+    def at(self, c: np.ndarray) -> list[Balanced]:
+        """The likeliest motions at the nodal field c (P,)."""
+        factor = np.exp(self.mean @ c)
+        w = self.waves
+        return [
+            balance.balanced(self.m, g * factor, *each)
+            for g, each in zip(self.whole, zip(w.omega, w.motion, w.sd, strict=True), strict=True)
+        ]
+
+    def jacobians(self, c: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
+        """Derivatives (I, P) of what is out of balance by c, over the noise."""
+        factor = np.exp(self.mean @ c)
+        return [
+            (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(g * factor) @ self.mean).tocsc() / sd
+            for g, b, sd in zip(self.whole, here, self.waves.sd, strict=True)
+        ]
+
+    def field(self, z: np.ndarray) -> np.ndarray:
+        """Nodal field of deviation 1 of complex z, (P,) or (P, k)."""
+        return smooth.field_at_nodes(self.p, z.real) + 1j * smooth.field_at_nodes(self.p, z.imag)
+
+    def whitened(self, g: np.ndarray) -> np.ndarray:
+        """The transpose of `field`, (P,) or (P, k)."""
+        return smooth.to_whitened(self.p, g.real) + 1j * smooth.to_whitened(self.p, g.imag)
+
+
+class _Point(NamedTuple):
+    z: np.ndarray
+    k: int  # number of the deviation
+    here: list[Balanced]
+    chi2: float
+    cost: float
+
+
+def course_of(body: VoxelBody, m: Matrices, waves: Waves, whole: np.ndarray, length: float) -> Course:
+    """The problem of a map.
+
+    Args:
+        body, m: the elements and their matrices.
+        waves: what was measured.
+        whole: modulus of the whole organ at each frequency (F,) complex [Pa].
+        length: correlation length of the prior [m].
+    """
+    mean, p = _mean_of_corners(body), smooth.prior(body.linear, length)
+    return Course(m, waves, np.asarray(whole, complex), mean, p, length)
+
+
+def estimate(
+    course: Course,
+    file: Path | None = None,
+    resume: bool = False,
+    draws: int = 20,
+    progress: Callable[[int, float], None] = lambda weight, chi2: None,
+) -> WaveMap:
+    """The map that explains the waves.
+
+    Args:
+        course: `course_of`.
+        file: HDF5 file to which the point of every step is written; None: nowhere.
+        resume: begin from that file if it is there.
+        draws: samples of the posterior.
+        progress: told of every step: number of the deviation, chi^2 over the number of equations.
+
+    Raises:
+        InputError: `file` belongs to another fit.
+    """
+    begin = time.perf_counter()
+    point, history = _begin(course, file if resume else None)
+    point = _deviations_in_turn(course, point, history, file, progress)
+    deviation = DEVIATIONS[point.k]
+    c = deviation * course.field(point.z)
+    before, after, departures = _spread(course, c, point, draws)
+    components = course.m.balances * len(course.waves.omega)
+    return WaveMap(
+        exponent=c,
+        sd=after,
+        prior_sd=before,
+        draws=c + departures,
+        modulus=course.whole[:, None] * np.exp(c),
+        deviation=deviation,
+        length=course.length,
+        chi2=point.chi2,
+        components=components,
+        reached=point.chi2 <= components,
+        history=history,
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
+    tets = np.asarray(body.linear.tetrahedra)
+    rows = np.repeat(np.arange(len(tets)), 4)
+    shape = (len(tets), body.linear.number_of_nodes)
+    return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
+
+
+def _evaluated(course: Course, z: np.ndarray, k: int) -> _Point:
+    here = course.at(DEVIATIONS[k] * course.field(z))
+    chi2 = sum(b.chi2 for b in here)
+    return _Point(z, k, here, chi2, 0.5 * chi2 + 0.5 * float(np.vdot(z, z).real))
+
+
+def _deviations_in_turn(course, point, history, file, progress) -> _Point:
+    """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
+    components = course.m.balances * len(course.waves.omega)
+    while True:
+        begin, steps = time.perf_counter(), 0
+        while steps < STEPS:
+            steps += 1
+            new = _stepped(course, point)
+            fell = point.cost - new.cost
+            point = new
+            progress(point.k, point.chi2 / components)
+            _write(file, course, point, history)
+            if fell < LAST * point.cost:
+                break
+        history.append(
+            {
+                "deviation": DEVIATIONS[point.k],
+                "chi2_per_component": point.chi2 / components,
+                "steps": float(steps),
+                "seconds": time.perf_counter() - begin,
+            }
+        )
+        last = [row["chi2_per_component"] for row in history[-2:]]
+        idle = len(last) == 2 and last[1] > (1 - WORTH) * last[0]
+        if point.chi2 <= components or idle or point.k + 1 == len(DEVIATIONS):
+            return point
+        point = _evaluated(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
+
+
+def _hessian(course: Course, c: np.ndarray, point: _Point) -> np.ndarray:
+    """I + J^H J in whitened z, complex (P, P)."""
+    deviation = DEVIATIONS[point.k]
+    H = np.zeros((len(c), len(c)), complex)
+    for J, b in zip(course.jacobians(c, point.here), point.here, strict=True):
+        X = b.whitened(J)
+        H += X.conj().T @ X
+    # T^T H T, with T the real matrix of `field`, from both sides.
+    half = course.whitened(H)
+    return np.eye(len(c)) + deviation**2 * course.whitened(half.conj().T).conj().T
+
+
+def _stepped(course: Course, point: _Point) -> _Point:
+    """A step of Gauss-Newton that lowers the cost, or the point itself."""
+    deviation = DEVIATIONS[point.k]
+    c = deviation * course.field(point.z)
+    each = zip(course.jacobians(c, point.here), point.here, course.waves.sd, strict=True)
+    slope = deviation * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
+    step = -scipy.linalg.solve(_hessian(course, c, point), slope + point.z, assume_a="pos")
+    for part in (1.0, 0.5, 0.25, 0.1):
+        new = _evaluated(course, point.z + part * step, point.k)
+        if new.cost < point.cost:
+            return new
+    return point
+
+
+def _spread(course: Course, c: np.ndarray, point: _Point, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Standard deviations (P,) before and after the data, and departures (D, P) of samples of the posterior."""
+    deviation, n = DEVIATIONS[point.k], len(c)
+    L = np.linalg.cholesky(_hessian(course, c, point))
+    roots = course.field(np.linalg.inv(L).conj().T)  # R R^H is the covariance
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(n, draws)) + 1j * rng.normal(size=(n, draws))
+    before = course.field(np.eye(n) + 0j)
+    return (
+        deviation * np.sqrt(np.sum(np.abs(before) ** 2, axis=1)),
+        deviation * np.sqrt(np.sum(np.abs(roots) ** 2, axis=1)),
+        deviation * (roots @ normal).T,
+    )
+
+
+def _write(file: Path | None, course: Course, point: _Point, history: list[dict[str, float]]) -> None:
+    """The point reached, whole or not at all."""
+    if file is None:
+        return
+    with whole(file) as new, h5py.File(new, "w") as f:
+        f["z"], f["k"], f["whole"] = point.z, point.k, course.whole
+        f["history"] = np.array([list(row.values()) for row in history]).reshape(-1, 4)
+        f.attrs["balances"], f.attrs["size"] = course.m.balances, float(np.linalg.norm(course.waves.motion))
+
+
+def _begin(course: Course, file: Path | None) -> tuple[_Point, list[dict[str, Any]]]:
+    """A uniform organ, or the point of an earlier run."""
+    if file is None or not file.is_file():
+        return _evaluated(course, np.zeros(len(course.p.root_mass), complex), 0), []
+    with h5py.File(file) as f:
+        same = f.attrs["balances"] == course.m.balances and len(f["z"]) == len(course.p.root_mass)
+        if not (same and np.isclose(f.attrs["size"], np.linalg.norm(course.waves.motion))):
+            raise InputError(f"{file} is of another fit: leave out --resume or name another --out")
+        names = ("deviation", "chi2_per_component", "steps", "seconds")
+        history = [dict(zip(names, map(float, row), strict=True)) for row in f["history"][:]]
+        return _evaluated(course, f["z"][:], int(f["k"][()])), history

@@ -1,0 +1,208 @@
+"""Complex displacements of a harmonic motion on voxels, from files."""
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fitting.waves import formats
+from liverjax.core.errors import InputError
+
+#: Units of displacements and their factors to metres.
+UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
+
+
+class WaveField(NamedTuple):
+    """Complex displacements on the voxels of a box: u(t) is the real part of U exp(i omega t)."""
+
+    frequencies: np.ndarray  # (F,) [Hz], ascending
+    displacement: np.ndarray  # (F, nx, ny, nz, 3) complex [m]; NaN where it is not measured
+    spacing: np.ndarray  # (3,) [m]
+    origin: np.ndarray  # (3,) [m], centre of the first voxel
+    mask: np.ndarray  # (nx, ny, nz) bool: voxels of the organ
+    labels: np.ndarray | None  # (nx, ny, nz) whole numbers of regions; None: none are given
+    noise: np.ndarray  # (F,) [m] standard deviation of real and of imaginary part of one component
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def read(
+    path: str | os.PathLike,
+    frequencies: list[float] | None = None,
+    mask: str | os.PathLike | None = None,
+    labels: str | os.PathLike | None = None,
+    unit: str | None = None,
+    spacing: list[float] | None = None,
+) -> WaveField:
+    """Read .npz, .npy, HDF5, CSV or NIfTI (`formats`).
+
+    Args:
+        path: of the displacements.
+        frequencies: [Hz], where the file does not hold them.
+        mask, labels: files of whole numbers on the same voxels, where the file does not hold them.
+        unit: of the displacements, one of `UNITS`; default: that of the file, or m.
+        spacing: of the voxels (3,) [m], where the file does not hold it.
+
+    Raises:
+        InputError: one sentence naming file, field, value and remedy.
+    """
+    name, found = str(path), formats.arrays(Path(path))
+    more = {"mask": mask, "labels": labels}
+    found |= {key: formats.single(Path(file), key) for key, file in more.items() if file is not None}
+    U, notes = _motion(name, found)
+    U = U * _factor(name, unit or found.get("unit") or "m")
+    hertz = _frequencies(name, frequencies, found.get("frequencies"), len(U))
+    step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
+    origin = np.zeros(3) if found.get("origin") is None else np.asarray(found["origin"], float).ravel()
+    shape = U.shape[1:4]
+    measured = np.isfinite(U).any(axis=(0, 4))
+    chosen = _on_voxels(name, "mask", found.get("mask"), shape)
+    inside = measured if chosen is None else measured & (chosen != 0)
+    if not inside.any():
+        raise InputError(f"{name}: no voxel of the mask has a displacement: give the mask of these voxels")
+    regions = _on_voxels(name, "labels", found.get("labels"), shape)
+    order = np.argsort(hertz)
+    field = WaveField(hertz[order], U[order], step, origin, inside, regions, np.zeros(len(U)), name, tuple(notes))
+    return field._replace(noise=noise_of(field))
+
+
+def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
+    """Complex displacements (F, nx, ny, nz, 3) in the file's unit, and notes."""
+    if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, evenly apart
+        u = _numbers(name, "phases", found["phases"])
+        if u.ndim not in (5, 6) or u.shape[-5] < 3:
+            raise InputError(f"{name}: phases has shape {u.shape}: give (F, T, nx, ny, nz, 3) with 3 instants or more")
+        U = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5]
+    elif found.get("displacement") is not None:
+        U = _numbers(name, "displacement", found["displacement"])
+    elif found.get("real") is not None and found.get("imag") is not None:
+        parts = [_numbers(name, key, found[key]) for key in ("real", "imag")]
+        if parts[0].shape != parts[1].shape:
+            raise InputError(f"{name}: real has shape {parts[0].shape} and imag {parts[1].shape}: give equal ones")
+        U = parts[0] + 1j * parts[1]
+    else:
+        known = ", ".join(sorted(found)) or "nothing"
+        raise InputError(f"{name}: holds {known}: name the waves displacement (complex), or real and imag, or phases")
+    if U.ndim == 4:
+        U = U[None]
+    if U.ndim != 5 or U.shape[-1] not in (1, 3):
+        raise InputError(
+            f"{name}: displacement has shape {U.shape}: give (F, nx, ny, nz, 3), frequencies first, components last"
+        )
+    if not np.iscomplexobj(U) or not np.any(np.isfinite(U) & (U.imag != 0)):
+        raise InputError(
+            f"{name}: displacement has no imaginary part: give complex amplitudes, or phases over a period"
+        )
+    U = U.astype(complex)
+    if not np.any(np.isfinite(U) & (U != 0)):
+        raise InputError(f"{name}: displacement is zero or not a number everywhere: look at the file")
+    if U.shape[-1] == 3:
+        return U, []
+    blank = np.full(U.shape, np.nan + 0j)
+    return np.concatenate([U, blank, blank], axis=-1), ["one component is measured: the other two are unknown"]
+
+
+def _numbers(name: str, field: str, values: Any) -> np.ndarray:
+    a = np.asarray(values)
+    if a.dtype.kind not in "fciu":
+        raise InputError(f"{name}: {field} holds {a.dtype}, not numbers: store complex numbers")
+    return a
+
+
+def _factor(name: str, unit: str) -> float:
+    if unit not in UNITS:
+        raise InputError(f"{name}: unit {unit!r} is not known: use {', '.join(UNITS)}")
+    return UNITS[unit]
+
+
+def _frequencies(name: str, asked: list[float] | None, held: Any, number: int) -> np.ndarray:
+    if asked is None and held is None:
+        raise InputError(f"{name}: holds no frequencies: give --frequencies with {number} in Hz, e.g. --frequencies 60")
+    hertz = np.asarray(held if asked is None else asked, float).ravel()
+    if len(hertz) != number:
+        raise InputError(f"{name}: {len(hertz)} frequencies for {number} fields of displacements: give {number}")
+    if not np.all(np.isfinite(hertz) & (hertz > 0)):
+        raise InputError(f"{name}: frequencies {hertz.tolist()} must be above 0 Hz: mend them")
+    if len(np.unique(hertz)) < number:
+        raise InputError(f"{name}: frequencies {hertz.tolist()} are not all different: give each field its own")
+    return hertz
+
+
+def _lengths(name: str, field: str, given: Any, option: str) -> np.ndarray:
+    if given is None:
+        raise InputError(
+            f"{name}: holds no {field}: give {option} with three lengths in metres, e.g. 0.002 0.002 0.002"
+        )
+    values = np.asarray(given, float).ravel()
+    values = np.repeat(values, 3) if len(values) == 1 else values
+    if len(values) != 3 or not np.all(np.isfinite(values) & (values > 0)):
+        raise InputError(f"{name}: {field} {values.tolist()} must be three lengths above 0 m: mend them")
+    if np.any(values > 0.1):
+        raise InputError(f"{name}: {field} {values.tolist()} m is larger than an organ's voxel: give metres, not mm")
+    return values
+
+
+def _on_voxels(name: str, field: str, values: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    if values is None:
+        return None
+    a = np.asarray(values)
+    if a.shape != shape:
+        raise InputError(f"{name}: {field} has shape {a.shape} and the voxels {shape}: give it on the same voxels")
+    if a.dtype.kind not in "biuf" or not np.all(np.isfinite(a)) or np.any(a != np.rint(a)):
+        raise InputError(f"{name}: {field} must hold whole numbers: mend it")
+    return a.astype(int)
+
+
+#: Weights of the fourth difference, whose sum of squares is 70.
+_FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
+
+
+def noise_of(field: WaveField) -> np.ndarray:
+    """Standard deviation (F,) [m] of real and imaginary part of one component, from the data themselves.
+
+    Fourth differences along the axis that has the longest rows in the mask: they hardly see a smooth wave, and their
+    median is blind to few bad voxels. Too large by (k h)^4 of the wave: by 1 % of the motion at 20 voxels a wave. NaN
+    where no five voxels stand in a row.
+    """
+    out = np.full(len(field.frequencies), np.nan)
+    for f, U in enumerate(field.displacement):
+        U = np.where(field.mask[..., None], U, np.nan)
+        best = np.nan
+        for a in range(3):
+            if U.shape[a] < 5:
+                continue
+            rows = np.moveaxis(U, a, 0)
+            n = len(rows) - 4
+            d = sum(w * rows[k : k + n] for k, w in enumerate(_FOURTH))
+            d = d[np.isfinite(d)]
+            if d.size >= 30:
+                parts = np.abs(np.concatenate([d.real, d.imag]))
+                own = np.median(parts) / 0.6745 / np.sqrt(np.sum(_FOURTH**2))
+                best = own if np.isnan(best) else min(best, own)  # the axis that sees the least of the wave
+        out[f] = best
+    return out
+
+
+def coarsened(field: WaveField, stride: int) -> WaveField:
+    """Means of stride^3 voxels that are all in the mask; they stay a wave of the same length in a uniform organ."""
+    if stride == 1:
+        return field
+    n = np.array(field.mask.shape) // stride
+    if n.min() < 1:
+        raise InputError(f"a stride of {stride} leaves no voxel of {field.mask.shape}: give a smaller --stride")
+    cut = tuple(slice(0, k * stride) for k in n)
+    blocks = (n[0], stride, n[1], stride, n[2], stride)
+    mask = field.mask[cut].reshape(blocks).all(axis=(1, 3, 5))
+    U = np.where(
+        mask[None, ..., None], field.displacement[(slice(None), *cut)].reshape(-1, *blocks, 3).mean((2, 4, 6)), np.nan
+    )
+    labels = None if field.labels is None else field.labels[tuple(slice(stride // 2, k * stride, stride) for k in n)]
+    return field._replace(
+        displacement=U,
+        mask=mask,
+        labels=labels,
+        spacing=field.spacing * stride,
+        origin=field.origin + 0.5 * (stride - 1) * field.spacing,
+        noise=field.noise / stride**1.5,
+    )
