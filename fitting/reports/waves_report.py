@@ -159,7 +159,8 @@ def table(content: dict[str, Any]) -> str:
     if content["map"]:
         m = content["map"]
         rows.append(
-            f"map: chi2 {m['chi2_per_component']:.3g} an equation, {100 * m['part_of_variance_left']:.2g} % of the prior's variance left, "
+            f"map: chi2 {m['chi2_per_component']:.3g} an equation, "
+            f"{100 * m['part_of_variance_left']:.2g} % of the prior's variance left, "
             f"{100 * m['told_from_the_mean']:.2g} % of the nodes told from the mean, {m['run_time_s']:.3g} s"
         )
     return "\n".join(rows)

@@ -37,12 +37,13 @@ class Matrices(NamedTuple):
     pattern: scipy.sparse.csr_array  # of C
     places: np.ndarray  # of the entries of all elements with an inner row, in pattern.data
     entries: np.ndarray  # these, among all entries
-    pressure: scipy.sparse.csr_array  # B B^H (I, I) [m^4]
+    pressure: np.ndarray  # g B B^H (bandwidth + 1, I), by diagonals
     balances: int  # real equations that chi^2 sums over
 
 
-#: Part of S that the pressures have over the part of the shear stress: what is left of them is its inverse.
-FREE = 1e4
+#: Part of S that the pressures have over the part of the shear stress of `TYPICAL` [Pa]: what is left of them is its
+#: inverse. It is the same for every modulus, so that chi^2 of two moduli can be compared.
+FREE, TYPICAL = 1e4, 3000.0
 
 
 def _columns_of(band: np.ndarray, a: int, b: int) -> np.ndarray:
@@ -100,7 +101,11 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
     pattern = scipy.sparse.csr_array((np.zeros(len(known), complex), known % len(number), ends), shape=shape)
     B = _pressures(body, rows, len(inner))
     balances = 2 * (len(inner) - B.shape[1])
-    return Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, (B @ B.T).tocsr(), balances)
+    m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, np.zeros((1, 1)), balances)
+    shear = rows_of_balance(m, np.full(rows.shape[-1], TYPICAL + 0j), 0.0)
+    BB = _by_diagonals(B @ B.T)
+    part = np.sum(np.abs(shear.data) ** 2) / shear.shape[0]  # mean of the diagonal of C C^H
+    return m._replace(pressure=FREE * part / BB[0].mean() * BB)
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
@@ -152,21 +157,25 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
     C = rows_of_balance(m, G, omega)
     CH = C.conj().T.tocsr()
     # Hermitian and positive: no pivots are needed, and an order for symmetric matrices keeps the factor small.
-    S = C @ CH
-    factor = _factor(S + FREE * abs(S.diagonal()).mean() / m.pressure.diagonal().mean() * m.pressure)
+    S, B = _by_diagonals(C @ CH), m.pressure
+    if len(S) < len(B):
+        S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
+    S[: len(B)] += B
+    # Banded: faster here than sparse factors, whose fill is the band's.
+    factor = scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
     return Balanced(float(np.real(np.vdot(r, q))) / sd**2, d - CH @ q, q, factor)
 
 
-def _factor(S: scipy.sparse.csr_array) -> np.ndarray:
-    """Cholesky factor of a banded Hermitian matrix; faster here than sparse factors, whose fill is the band's."""
+def _by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
+    """The lower triangle of a Hermitian matrix as LAPACK has it, (bandwidth + 1, n)."""
     at = S.tocoo()
     below = at.row >= at.col
     row, column = at.row[below], at.col[below]
-    band = np.zeros((int((row - column).max()) + 1, S.shape[0]), complex)
+    band = np.zeros((int((row - column).max()) + 1, S.shape[0]), at.data.dtype, order="F")
     band[row - column, column] = at.data[below]
-    return scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
+    return band
 
 
 def gigabytes(body: VoxelBody) -> float:

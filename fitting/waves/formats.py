@@ -53,22 +53,11 @@ def single(path: Path, name: str) -> np.ndarray:
 
 
 def _numpy(path: Path) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) if path.suffix.lower() == ".npz" else _as_one(path) as file:
+    if path.suffix.lower() == ".npy":
+        return {"displacement": np.load(path, allow_pickle=False)}
+    with np.load(path, allow_pickle=False) as file:
         found = {name: file[name] for name in file}
     return found | ({"unit": str(found["unit"])} if "unit" in found else {})
-
-
-class _as_one(dict):
-    """The array of a .npy file as a file of one name."""
-
-    def __init__(self, path: Path):
-        super().__init__(displacement=np.load(path, allow_pickle=False))
-
-    def __enter__(self) -> "_as_one":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 def _hdf5(path: Path) -> dict[str, Any]:

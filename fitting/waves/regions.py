@@ -10,9 +10,9 @@ from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
 
 #: Moduli [Pa] at which a search begins, and the loss over storage there.
-STARTS, LOSS = np.geomspace(500.0, 64000.0, 8), 0.3
-#: Iterations, and the change of a modulus over its standard error at which they end.
-ITERATIONS, ENOUGH = 20, 0.02
+STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
+#: Iterations, and the step of a modulus over its standard error that is not worth to be made.
+ITERATIONS, ENOUGH = 20, 0.1
 
 
 class Waves(NamedTuple):
@@ -85,8 +85,8 @@ def _one_frequency(m, waves, f, region, G, progress):
     one_hot = np.eye(len(G))[region]  # (E, R)
     at = waves.omega[f], waves.motion[f], waves.sd[f]
     here, converged, k = balance.balanced(m, one_hot @ G, *at), False, 0
+    step, H = _step(m, here, one_hot, waves.sd[f])
     for k in range(1, ITERATIONS + 1):
-        step, H = _step(m, here, one_hot, waves.sd[f])
         part = min(1.0, 0.5 / max(np.max(np.abs(step / G)), 1e-300))  # a modulus changes by half of itself at most
         for _ in range(8):
             new = balance.balanced(m, one_hot @ (G + part * step), *at)
@@ -97,10 +97,10 @@ def _one_frequency(m, waves, f, region, G, progress):
             break
         G, here = G + part * step, new
         progress(k, here.chi2 / m.balances)
-        if np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))) or part < 1e-2:
-            converged = part == 1.0
+        step, H = _step(m, here, one_hot, waves.sd[f])
+        converged = bool(np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))))
+        if converged or part < 1e-2:
             break
-    H = _step(m, here, one_hot, waves.sd[f])[1]
     return G, np.linalg.inv(H), here.chi2, k, converged
 
 

@@ -26,11 +26,11 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 
 #: Standard deviations of c to try, from a nearly uniform organ to a free one.
-DEVIATIONS = (0.1, 0.2, 0.4, 0.8)
+DEVIATIONS = (0.2, 0.4, 0.8)
 #: A larger one must lower chi^2 by this part, or it is no better.
 WORTH = 0.01
 #: Steps of Gauss-Newton for each, and the part of the cost below which one is the last.
-STEPS, LAST = 8, 1e-3
+STEPS, LAST = 6, 3e-3
 
 
 class WaveMap(NamedTuple):
@@ -131,7 +131,7 @@ def estimate(
     point = _deviations_in_turn(course, point, history, file, progress)
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
-    before, after, departures = _spread(course, c, point, draws)
+    before, after, departures = _spread(course, point, draws)
     components = course.m.balances * len(course.waves.omega)
     return WaveMap(
         exponent=c,
@@ -167,9 +167,10 @@ def _deviations_in_turn(course, point, history, file, progress) -> _Point:
     components = course.m.balances * len(course.waves.omega)
     while True:
         begin, steps = time.perf_counter(), 0
+        H = _hessian(course, point)  # the other steps make do with the first one's
         while steps < STEPS:
             steps += 1
-            new = _stepped(course, point)
+            new = _stepped(course, point, H)
             fell = point.cost - new.cost
             point = new
             progress(point.k, point.chi2 / components)
@@ -191,9 +192,10 @@ def _deviations_in_turn(course, point, history, file, progress) -> _Point:
         point = _evaluated(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
 
 
-def _hessian(course: Course, c: np.ndarray, point: _Point) -> np.ndarray:
+def _hessian(course: Course, point: _Point) -> np.ndarray:
     """I + J^H J in whitened z, complex (P, P)."""
     deviation = DEVIATIONS[point.k]
+    c = deviation * course.field(point.z)
     H = np.zeros((len(c), len(c)), complex)
     for J, b in zip(course.jacobians(c, point.here), point.here, strict=True):
         X = b.whitened(J)
@@ -203,13 +205,13 @@ def _hessian(course: Course, c: np.ndarray, point: _Point) -> np.ndarray:
     return np.eye(len(c)) + deviation**2 * course.whitened(half.conj().T).conj().T
 
 
-def _stepped(course: Course, point: _Point) -> _Point:
+def _stepped(course: Course, point: _Point, H: np.ndarray) -> _Point:
     """A step of Gauss-Newton that lowers the cost, or the point itself."""
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
     each = zip(course.jacobians(c, point.here), point.here, course.waves.sd, strict=True)
     slope = deviation * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
-    step = -scipy.linalg.solve(_hessian(course, c, point), slope + point.z, assume_a="pos")
+    step = -scipy.linalg.solve(H, slope + point.z, assume_a="pos")
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _evaluated(course, point.z + part * step, point.k)
         if new.cost < point.cost:
@@ -217,10 +219,10 @@ def _stepped(course: Course, point: _Point) -> _Point:
     return point
 
 
-def _spread(course: Course, c: np.ndarray, point: _Point, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _spread(course: Course, point: _Point, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard deviations (P,) before and after the data, and departures (D, P) of samples of the posterior."""
-    deviation, n = DEVIATIONS[point.k], len(c)
-    L = np.linalg.cholesky(_hessian(course, c, point))
+    deviation, n = DEVIATIONS[point.k], len(point.z)
+    L = np.linalg.cholesky(_hessian(course, point))
     roots = course.field(np.linalg.inv(L).conj().T)  # R R^H is the covariance
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(n, draws)) + 1j * rng.normal(size=(n, draws))

@@ -90,13 +90,13 @@ def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
         raise InputError(
             f"{name}: displacement has shape {U.shape}: give (F, nx, ny, nz, 3), frequencies first, components last"
         )
+    if not np.any(np.isfinite(U) & (U != 0)):
+        raise InputError(f"{name}: displacement is zero or not a number everywhere: look at the file")
     if not np.iscomplexobj(U) or not np.any(np.isfinite(U) & (U.imag != 0)):
         raise InputError(
             f"{name}: displacement has no imaginary part: give complex amplitudes, or phases over a period"
         )
     U = U.astype(complex)
-    if not np.any(np.isfinite(U) & (U != 0)):
-        raise InputError(f"{name}: displacement is zero or not a number everywhere: look at the file")
     if U.shape[-1] == 3:
         return U, []
     blank = np.full(U.shape, np.nan + 0j)

@@ -1,0 +1,299 @@
+"""Elastography: waves on voxels from files, the balance of forces, regions, maps and the command."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from fitting import __main__ as command
+from fitting.waves import balance, direct_inversion, elastography, regions, voxels, wave_field
+from liverjax.core.errors import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+H, DENSITY = 2e-3, 1000.0
+HERTZ = np.array([60.0, 100.0])
+#: Direction, polarisation and amplitude [m] of plane shear waves.
+PLANE = (((0.6, 0, 0.8), (0.8, 0, -0.6), 1e-5), ((0, 1, 0), (0, 0, 1), 5e-6), ((-0.6, 0.8, 0), (0, 0, 1), 7e-6))
+
+
+def modulus(hertz):
+    """Of a Kelvin-Voigt solid [Pa]."""
+    return 3000 + 2j * np.pi * hertz * 1.0
+
+
+def plane_waves(shape, noise=0.0, seed=0, **more):
+    """Waves of the closed form on voxels."""
+    X = np.stack(np.meshgrid(*[np.arange(n) * H for n in shape], indexing="ij"), axis=-1)
+    k = 2 * np.pi * HERTZ * np.sqrt(DENSITY / modulus(HERTZ))
+    U = [sum(a * np.exp(-1j * one * (X @ np.array(n)))[..., None] * np.array(p) for n, p, a in PLANE) for one in k]
+    rng = np.random.default_rng(seed)
+    U = np.array(U) + noise * (rng.normal(size=(2, *shape, 3)) + 1j * rng.normal(size=(2, *shape, 3)))
+    given = {"labels": None, "noise": np.full(2, max(noise, 1e-12))} | more
+    return wave_field.WaveField(HERTZ, U, np.full(3, H), np.zeros(3), np.ones(shape, bool), **given)
+
+
+def organ(shape=(7, 7, 9), **more):
+    field = plane_waves(shape, **more)
+    return elastography.organ_of(field, elastography.body_of(field), DENSITY)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return organ(noise=3e-7)
+
+
+def test_every_voxel_is_a_node_and_the_volume_is_that_of_the_box():
+    body = voxels.voxel_body(np.ones((5, 7, 9), bool), np.array([1.0, 2.0, 3.0]), np.array([0.5, 0.0, 0.0]))
+    assert body.mesh.number_of_nodes == 5 * 7 * 9 and body.inner.sum() == 3 * 5 * 7
+    assert np.asarray(body.linear.volumes).min() > 0
+    assert np.asarray(body.linear.volumes).sum() == pytest.approx(4 * 12 * 24)
+    np.testing.assert_allclose(body.mesh.points, body.voxel * [1.0, 2.0, 3.0] + [0.5, 0, 0], atol=1e-12)
+    linear = body.linear.points @ np.array([1.0, -2.0, 0.5])
+    np.testing.assert_allclose(
+        voxels.on_all_nodes(body, np.asarray(linear)), body.mesh.points @ np.array([1.0, -2.0, 0.5]), atol=1e-12
+    )
+
+
+def test_a_hole_in_the_mask_takes_away_its_bricks_and_their_inner_nodes():
+    mask = np.ones((7, 7, 7), bool)
+    mask[0, 0, 0] = False
+    body = voxels.voxel_body(mask, np.ones(3))
+    assert np.asarray(body.linear.volumes).sum() == pytest.approx(6**3 - 8)
+    whole = voxels.voxel_body(np.ones((7, 7, 7), bool), np.ones(3))
+    assert whole.inner.sum() - body.inner.sum() == 2**3  # inner nodes of that brick: the four around it look in
+    labels = np.zeros((7, 7, 7), int)
+    labels[4:] = 5
+    of = voxels.elements_of(whole, labels)
+    x = np.asarray(whole.linear.points)[np.asarray(whole.linear.tetrahedra)].mean(axis=1)[:, 0]
+    assert np.all(of[x < 2] == 0) and np.all(of[x > 4] == 5)
+
+
+def test_the_block_solver_is_that_of_the_whole_matrix(small):
+    m = small.matrices
+    found = balance.balanced(
+        m, np.full(m.rows.shape[-1], 3000 + 400j), small.waves.omega[0], small.waves.motion[0], 1.0
+    )
+    band = found.factor
+    L = sum(np.diag(band[k, : band.shape[1] - k], -k) for k in range(len(band)))
+    J = balance.by_modulus(m, found.motion)[:, :7].tocsc()
+    np.testing.assert_allclose(found.whitened(J), np.linalg.solve(L, J.toarray()), rtol=1e-9, atol=1e-12)
+
+
+def test_the_likeliest_motion_obeys_the_balance_up_to_a_pressure(small):
+    """C u = - B p: what is left of the forces is a gradient, and nothing else."""
+    m, w = small.matrices, small.waves
+    G = np.full(m.rows.shape[-1], modulus(60.0))
+    found = balance.balanced(m, G, w.omega[0], w.motion[0], w.sd[0])
+    left = balance.rows_of_balance(m, G, w.omega[0]) @ found.motion
+    inner = balance._in_order(small.body)
+    rows = np.full(3 * len(small.body.inner), -1)
+    rows[inner] = np.arange(len(inner))
+    B = balance._pressures(small.body, rows[m.unknowns], len(inner)).toarray()
+    p = np.linalg.lstsq(B, left, rcond=None)[0]
+    assert np.linalg.norm(left - B @ p) < 1e-8 * np.linalg.norm(left)
+
+
+def test_the_gradient_by_the_modulus_is_the_difference(small):
+    """Re(q^H C' u) / sd^2 is the slope of chi^2 / 2; differences have their V: h^2 above, roundoff below."""
+    m, w = small.matrices, small.waves
+    one = np.ones(m.rows.shape[-1])
+
+    def half(G):
+        return 0.5 * balance.balanced(m, G * one, w.omega[1], w.motion[1], w.sd[1]).chi2
+
+    here = balance.balanced(m, 3400 * one, w.omega[1], w.motion[1], w.sd[1])
+    slope = float(np.real(np.vdot(here.multipliers, balance.by_modulus(m, here.motion) @ one)) / w.sd[1] ** 2)
+    errors = [abs((half(3400 + h) - half(3400 - h)) / (2 * h) / slope - 1) for h in (100.0, 10.0, 1.0)]
+    assert errors[0] / errors[1] > 50 and errors[2] < 1e-5
+
+
+def test_moduli_of_plane_waves_within_their_errors(small, verified):
+    """Closed form, 2 % of noise: storage and loss within three standard errors and the stated share of the voxels."""
+    found = elastography.regions_of(small)
+    G, e = found.whole.modulus[:, 0], found.whole.standard_errors[:, 0]
+    off = G * (1 - found.mesh_bias) - modulus(HERTZ)
+    assert np.all(found.whole.converged) and np.all(found.whole.chi2 / found.whole.components < 1.3)
+    share = np.abs(found.mesh_bias * G)  # a mean of directions; these waves have theirs
+    assert np.all(np.abs(off.real) < 3 * e + share) and np.all(np.abs(off.imag) < 3 * e + share)
+    verified("complex modulus from plane waves on voxels, 100 Hz", "closed form", abs(off[1] / G[1]), 0.01)
+
+
+def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
+    """Forty measurements with 5 % of noise: mean and scatter of (found - true) / error are 0 and 1."""
+    first = organ((7, 7, 7), noise=5e-7)
+    clean = plane_waves((7, 7, 7)).displacement[(slice(None), *first.body.voxel.T)].reshape(2, -1)
+    zero = np.zeros(first.body.mesh.number_of_elements, int)
+    exact = regions.fit(first.matrices, first.waves._replace(motion=clean), zero, np.array([modulus(100.0)]))
+    rng, pulls = np.random.default_rng(1), []
+    for _ in range(20):
+        noise = 5e-7 * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
+        found = regions.fit(first.matrices, first.waves._replace(motion=clean + noise), zero, exact.modulus[0])
+        d = (found.modulus - exact.modulus) / np.sqrt(np.real(found.covariance[:, 0]))
+        pulls += [*d.real.ravel(), *d.imag.ravel()]
+    pulls = np.array(pulls)  # 80 numbers: their mean scatters by 0.11, their deviation by 0.08
+    assert abs(pulls.mean()) < 0.4 and 0.75 < pulls.std() < 1.3
+
+
+def test_the_direct_inversion_has_the_error_of_its_stencil_and_noise_lowers_it():
+    """Second differences of a wave are smaller by (k h)^2 / 12 along each axis, curls as well, so G is larger."""
+    field = plane_waves((11, 11, 11))
+    axis = np.exp(-1j * 2 * np.pi * HERTZ * np.sqrt(DENSITY / modulus(HERTZ)) * H * np.arange(11)[:, None])  # (11, F)
+    U = np.zeros_like(field.displacement)
+    U[..., 0] = 1e-5 * axis.T[:, None, None, :]
+    field = field._replace(displacement=U)
+    G = direct_inversion.invert(field, DENSITY, smoothing=0.0)[:, 5, 5, 5]
+    kh = 2 * np.pi * HERTZ * np.sqrt(DENSITY / modulus(HERTZ)) * H
+    np.testing.assert_allclose(G / modulus(HERTZ), kh**2 / (2 - 2 * np.cos(kh)), rtol=1e-6)
+    rng = np.random.default_rng(0)
+    noisy = U + 3e-7 * (rng.normal(size=U.shape) + 1j * rng.normal(size=U.shape))
+    low = direct_inversion.invert(field._replace(displacement=noisy), DENSITY, smoothing=0.0)
+    assert np.nanmedian(low[0].real) < 0.7 * modulus(60.0).real
+
+
+def test_the_noise_of_the_data_is_found():
+    field = plane_waves((15, 15, 15), noise=4e-7)
+    np.testing.assert_allclose(wave_field.noise_of(field), 4e-7, rtol=0.1)
+
+
+def test_means_of_voxels_keep_the_modulus_and_lower_the_noise():
+    field = plane_waves((14, 14, 14), noise=1e-7)
+    half = wave_field.coarsened(field, 2)
+    assert half.mask.shape == (7, 7, 7) and half.spacing[0] == pytest.approx(2 * H)
+    np.testing.assert_allclose(half.noise, 1e-7 / np.sqrt(8))
+    np.testing.assert_allclose(half.origin, H / 2)
+    assert half.displacement[0, 1, 2, 3, 0] == pytest.approx(field.displacement[0, 2:4, 4:6, 6:8, 0].mean())
+
+
+def written(tmp_path, ending, field):
+    path = tmp_path / f"waves{ending}"
+    arrays = {"displacement": field.displacement, "spacing": field.spacing, "frequencies": field.frequencies}
+    if field.labels is not None:
+        arrays["labels"] = field.labels
+    if ending == ".npz":
+        np.savez(path, **arrays)
+    elif ending == ".h5":
+        with h5py.File(path, "w") as file:
+            for name, values in arrays.items():
+                file[name] = values
+    elif ending == ".csv":
+        rows = ["frequency,x,y,z,u_re_x,u_im_x,u_re_y,u_im_y,u_re_z,u_im_z"]
+        for f, hertz in enumerate(field.frequencies):
+            for at in np.ndindex(field.mask.shape):
+                u = field.displacement[(f, *at)]
+                cells = [hertz, *(np.array(at) * H), *np.stack([u.real, u.imag], 1).ravel()]
+                rows.append(",".join(f"{v:.12g}" for v in cells))
+        path.write_text("\n".join(rows) + "\n")
+    else:
+        nibabel = pytest.importorskip("nibabel")
+        image = nibabel.Nifti1Image(np.moveaxis(field.displacement, 0, 3).astype(np.complex64), np.diag([2, 2, 2, 1.0]))
+        nibabel.save(image, path)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5", ".csv", ".nii", ".nii.gz"])
+def test_a_file_of_any_format_is_read_as_it_was_written(tmp_path, ending):
+    field = plane_waves((5, 6, 7), noise=1e-7)
+    asked = list(HERTZ) if ".nii" in ending else None
+    found = wave_field.read(written(tmp_path, ending, field), asked)
+    np.testing.assert_allclose(found.frequencies, HERTZ)
+    np.testing.assert_allclose(found.spacing, H, rtol=1e-6)
+    scale = np.abs(field.displacement).max()
+    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-6 * scale)
+
+
+def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
+    field = plane_waves((5, 5, 5))
+    t = np.arange(8) / 8
+    phases = np.stack([np.real(field.displacement * np.exp(2j * np.pi * one)) for one in t], axis=1)
+    np.savez(tmp_path / "phases.npz", phases=1e6 * phases, spacing=H, unit="um")
+    found = wave_field.read(tmp_path / "phases.npz", list(HERTZ))
+    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"spacing": None}, "give --spacing"),
+        ({"spacing": [2.0, 2.0, 2.0]}, "give metres, not mm"),
+        ({"frequencies": None}, "give --frequencies with 2"),
+        ({"frequencies": [60.0]}, "1 frequencies for 2 fields"),
+        ({"frequencies": [60.0, 60.0]}, "not all different"),
+        ({"frequencies": [60.0, -1.0]}, "above 0 Hz"),
+        ({"displacement": np.ones((2, 5, 5, 5, 3))}, "no imaginary part"),
+        ({"displacement": np.ones((5, 5)) + 1j}, "frequencies first, components last"),
+        ({"displacement": np.full((2, 5, 5, 5, 3), 0j)}, "zero or not a number everywhere"),
+        ({"displacement": None}, "name the waves displacement"),
+        ({"mask": np.zeros((5, 5, 5), int)}, "no voxel of the mask"),
+        ({"mask": np.ones((4, 5, 5), int)}, "on the same voxels"),
+        ({"labels": np.full((5, 5, 5), 0.5)}, "whole numbers"),
+        ({"unit": "inch"}, "unit 'inch' is not known"),
+    ],
+)
+def test_a_file_that_cannot_be_used_gets_a_sentence(tmp_path, change, words):
+    field = plane_waves((5, 5, 5))
+    arrays = {"displacement": field.displacement, "spacing": field.spacing, "frequencies": HERTZ} | change
+    np.savez(tmp_path / "bad.npz", **{k: v for k, v in arrays.items() if v is not None})
+    with pytest.raises(InputError, match=words) as told:
+        wave_field.read(tmp_path / "bad.npz")
+    assert "bad.npz" in str(told.value) and "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("ending", [".npz", ".npy", ".h5", ".csv", ".nii.gz", ".xyz"])
+def test_a_damaged_or_unknown_file_gets_a_sentence(tmp_path, ending):
+    path = tmp_path / f"waves{ending}"
+    path.write_bytes(b"PK\x03\x04 this is no archive\n1,2,3\n")
+    with pytest.raises(InputError, match="waves") as told:
+        wave_field.read(path, [60.0], spacing=[H] * 3)
+    assert "\n" not in str(told.value)
+    with pytest.raises(InputError, match="no such file"):
+        wave_field.read(tmp_path / f"none{ending}")
+
+
+def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
+    labels = np.ones((7, 7, 9), int)
+    labels[..., 5:] = 4
+    path = written(tmp_path, ".npz", plane_waves((7, 7, 9), noise=1e-7, labels=labels))
+    ask = ["waves", str(path), "--density", "1000", "--out", str(tmp_path / "out"), "--samples", "3"]
+    assert command.main(ask) == 0
+    first = json.loads((tmp_path / "out" / "waves.json").read_text())
+    assert set(first["regions"]) == {"1", "4"} and first["direct_inversion"]["whole"]["storage_Pa"][0] is not None
+    for row in first["regions"].values():
+        for f, G in enumerate(modulus(HERTZ)):
+            e = row["standard_error_Pa"][f]
+            assert abs(row["storage_Pa"][f] - row["mesh_bias_storage_Pa"][f] - G.real) < 4 * e + 0.005 * abs(G)
+    with h5py.File(tmp_path / "out" / "waves.h5") as file:
+        G, sd = file["modulus"][:], file["sd"][:]
+        assert G.shape == (2, 7, 7, 9) and file["draws_of_exponent"].shape == (3, 7, 7, 9)
+        # Independent of each other they are not: a third beyond one deviation would be too many or too few by chance.
+        assert np.mean(np.abs(G[0].real - 3000) < 3 * sd[0]) > 0.97
+    assert command.main([*ask, "--resume"]) == 0
+    again = json.loads((tmp_path / "out" / "waves.json").read_text())
+    assert again["map"]["chi2_per_component"] <= 1.001 * first["map"]["chi2_per_component"]
+    assert "map: chi2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (["--density", "1"], "cannot be an organ's"),
+        (["--stride", "0"], "--stride 0"),
+        (["--noise", "-1"], "--noise -1 must be above 0"),
+        (["--frequencies", "0"], "must be above 0 Hz"),
+        (["--mask", "none.npz"], "no such file"),
+        (["--stride", "3"], "waves need at least 5"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_in_a_sentence(tmp_path, options, words, capsys):
+    path = written(tmp_path, ".npz", plane_waves((7, 7, 9)))
+    assert command.main(["waves", str(path), *options, "--out", str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert words in told and told.count("\n") == 1
+
+
+def test_one_component_is_not_enough_for_forces(tmp_path, capsys):
+    field = plane_waves((7, 7, 9))
+    np.savez(tmp_path / "one.npz", displacement=field.displacement[..., :1], spacing=H, frequencies=HERTZ)
+    assert command.main(["waves", str(tmp_path / "one.npz"), "--out", str(tmp_path)]) == 2
+    assert "three components" in capsys.readouterr().err
