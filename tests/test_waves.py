@@ -90,7 +90,7 @@ def test_the_likeliest_motion_obeys_the_balance_up_to_a_pressure(small):
     inner = balance._in_order(small.body)
     rows = np.full(3 * len(small.body.inner), -1)
     rows[inner] = np.arange(len(inner))
-    B = balance._pressures(small.body, rows[m.unknowns], len(inner)).toarray()
+    B = balance._forces_of_pressures(small.body, rows[m.unknowns], len(inner)).toarray()
     p = np.linalg.lstsq(B, left, rcond=None)[0]
     assert np.linalg.norm(left - B @ p) < 1e-8 * np.linalg.norm(left)
 
@@ -125,11 +125,15 @@ def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
     first = organ((7, 7, 7), noise=5e-7)
     clean = plane_waves((7, 7, 7)).displacement[(slice(None), *first.body.voxel.T)].reshape(2, -1)
     zero = np.zeros(first.body.mesh.number_of_elements, int)
-    exact = regions.fit(first.matrices, first.waves._replace(motion=clean), zero, np.array([modulus(100.0)]))
+    exact = regions.moduli_of_regions(
+        first.matrices, first.waves._replace(motion=clean), zero, np.array([modulus(100.0)])
+    )
     rng, pulls = np.random.default_rng(1), []
     for _ in range(20):
         noise = 5e-7 * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
-        found = regions.fit(first.matrices, first.waves._replace(motion=clean + noise), zero, exact.modulus[0])
+        found = regions.moduli_of_regions(
+            first.matrices, first.waves._replace(motion=clean + noise), zero, exact.modulus[0]
+        )
         d = (found.modulus - exact.modulus) / np.sqrt(np.real(found.covariance[:, 0]))
         pulls += [*d.real.ravel(), *d.imag.ravel()]
     pulls = np.array(pulls)  # 80 numbers: their mean scatters by 0.11, their deviation by 0.08
@@ -196,7 +200,7 @@ def written(tmp_path, ending, field):
 def test_a_file_of_any_format_is_read_as_it_was_written(tmp_path, ending):
     field = plane_waves((5, 6, 7), noise=1e-7)
     asked = list(HERTZ) if ".nii" in ending else None
-    found = wave_field.read(written(tmp_path, ending, field), asked)
+    found = wave_field.read_waves(written(tmp_path, ending, field), asked)
     np.testing.assert_allclose(found.frequencies, HERTZ)
     np.testing.assert_allclose(found.spacing, H, rtol=1e-6)
     scale = np.abs(field.displacement).max()
@@ -208,7 +212,7 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     t = np.arange(8) / 8
     phases = np.stack([np.real(field.displacement * np.exp(2j * np.pi * one)) for one in t], axis=1)
     np.savez(tmp_path / "phases.npz", phases=1e6 * phases, spacing=H, unit="um")
-    found = wave_field.read(tmp_path / "phases.npz", list(HERTZ))
+    found = wave_field.read_waves(tmp_path / "phases.npz", list(HERTZ))
     np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
 
 
@@ -236,7 +240,7 @@ def test_a_file_that_cannot_be_used_gets_a_sentence(tmp_path, change, words):
     arrays = {"displacement": field.displacement, "spacing": field.spacing, "frequencies": HERTZ} | change
     np.savez(tmp_path / "bad.npz", **{k: v for k, v in arrays.items() if v is not None})
     with pytest.raises(InputError, match=words) as told:
-        wave_field.read(tmp_path / "bad.npz")
+        wave_field.read_waves(tmp_path / "bad.npz")
     assert "bad.npz" in str(told.value) and "\n" not in str(told.value)
 
 
@@ -245,10 +249,10 @@ def test_a_damaged_or_unknown_file_gets_a_sentence(tmp_path, ending):
     path = tmp_path / f"waves{ending}"
     path.write_bytes(b"PK\x03\x04 this is no archive\n1,2,3\n")
     with pytest.raises(InputError, match="waves") as told:
-        wave_field.read(path, [60.0], spacing=[H] * 3)
+        wave_field.read_waves(path, [60.0], spacing=[H] * 3)
     assert "\n" not in str(told.value)
     with pytest.raises(InputError, match="no such file"):
-        wave_field.read(tmp_path / f"none{ending}")
+        wave_field.read_waves(tmp_path / f"none{ending}")
 
 
 def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):

@@ -54,11 +54,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Find moduli; 1 if a fit did not converge."""
-    _check(options)
+    _refuse(options)
     from fitting.reports import waves_report
-    from fitting.waves import direct_inversion, elastography, wave_field
+    from fitting.waves import direct_inversion, elastography, stiffness_map, wave_field
 
-    field = wave_field.read(
+    field = wave_field.read_waves(
         options.data, options.frequencies, options.mask, options.labels, options.unit, options.spacing
     )
     if options.noise is not None:
@@ -74,7 +74,8 @@ def run(options: argparse.Namespace) -> int:
         if not options.no_map:
             length = options.length or float(4 * np.mean(organ.field.spacing))
             file = options.out / "progress.h5"
-            drawn = elastography.map_of(organ, found, length, file, options.resume, options.samples, told)
+            problem = elastography.problem_of_map(organ, found, length)
+            drawn = stiffness_map.map_of(problem, file, options.resume, options.samples, told)
     usual = direct_inversion.invert(organ.field, options.density)
     content = waves_report.write(options.out, organ, found, drawn, usual)
     print(waves_report.table(content))
@@ -107,7 +108,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
     return elastography.organ_of(coarse, body, options.density)
 
 
-def _check(options: argparse.Namespace) -> None:
+def _refuse(options: argparse.Namespace) -> None:
     """Refuse numbers that no measurement has."""
     for name in ("length", "noise"):
         value = getattr(options, name)

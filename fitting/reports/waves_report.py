@@ -41,15 +41,15 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "voxels": int(organ.body.mesh.number_of_nodes),
         "elements": int(organ.body.mesh.number_of_elements),
         "whole": _of_regions(organ, found.whole, found.mesh_bias)[0],
-        "regions": _named(organ, found),
+        "regions": _by_label(organ, found),
         "direct_inversion": _direct(organ, found, usual),
         "map": None if drawn is None else _of_map(drawn),
-        "warnings": _warnings(organ, found, drawn),
+        "warnings": _cautions(organ, found, drawn),
         "versions": versions(),
     }
     content = numbers(content)
     (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    _store(out / "waves.h5", organ, drawn, usual)
+    _write_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
         _for_paraview(out / "waves.vtu", organ, drawn)
         save(_picture(organ, drawn, usual), out / "waves.png")
@@ -81,7 +81,7 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[dict[str
     return rows
 
 
-def _named(organ: Organ, found: Found) -> dict[str, Any] | None:
+def _by_label(organ: Organ, found: Found) -> dict[str, Any] | None:
     if found.parts is None or found.labels is None:
         return None
     rows = _of_regions(organ, found.parts, found.mesh_bias)
@@ -117,7 +117,7 @@ def _of_map(drawn: WaveMap) -> dict[str, Any]:
     }
 
 
-def _warnings(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
+def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     told, each = [], found.whole if found.parts is None else found.parts
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
@@ -166,25 +166,25 @@ def table(content: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def _on_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
+def _at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
     """Values at the voxels (nx, ny, nz), NaN outside, from those of the corners (P,)."""
     out = np.full(organ.field.mask.shape, np.nan, corners.dtype)
     out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
     return out
 
 
-def _store(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
+def _write_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.ndarray) -> None:
     with h5py.File(path, "w") as file:
         for name in ("frequencies", "spacing", "origin", "mask"):
             file[name] = getattr(organ.field, name)
         file["direct_inversion"] = usual
         if drawn is None:
             return
-        whole = np.stack([_on_voxels(organ, G) for G in drawn.modulus])
-        sd = _on_voxels(organ, drawn.sd)
+        whole = np.stack([_at_voxels(organ, G) for G in drawn.modulus])
+        sd = _at_voxels(organ, drawn.sd)
         file["modulus"], file["sd_of_logarithm"] = whole, sd
         file["sd"] = np.abs(whole) * sd
-        file["draws_of_exponent"] = np.stack([_on_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
+        file["draws_of_exponent"] = np.stack([_at_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
         file["modulus"].attrs["unit"] = file["sd"].attrs["unit"] = "Pa"
 
 
@@ -200,7 +200,7 @@ def _picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
     """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
-    G, sd = _on_voxels(organ, drawn.modulus[f]), _on_voxels(organ, drawn.sd)
+    G, sd = _at_voxels(organ, drawn.modulus[f]), _at_voxels(organ, drawn.sd)
     panels = (
         ("storage modulus [kPa]", G.real / 1e3, "viridis"),
         ("loss modulus [kPa]", G.imag / 1e3, "viridis"),

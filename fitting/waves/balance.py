@@ -99,7 +99,7 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
     ends = np.concatenate([[0], np.cumsum(counts)])
     shape = (len(inner), len(number))
     pattern = scipy.sparse.csr_array((np.zeros(len(known), complex), known % len(number), ends), shape=shape)
-    B = _pressures(body, rows, len(inner))
+    B = _forces_of_pressures(body, rows, len(inner))
     balances = 2 * (len(inner) - B.shape[1])
     m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, np.zeros((1, 1)), balances)
     shear = rows_of_balance(m, np.full(rows.shape[-1], TYPICAL + 0j), 0.0)
@@ -116,7 +116,7 @@ def _in_order(body: VoxelBody) -> np.ndarray:
     return (3 * nodes[np.lexsort(longest_last.T)][:, None] + np.arange(3)).ravel()
 
 
-def _pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
+def _forces_of_pressures(body: VoxelBody, rows: np.ndarray, inner: int) -> scipy.sparse.csr_array:
     """B (I, P): integrals of each corner's linear function times the divergence of each inner node's function."""
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3) of the linear functions

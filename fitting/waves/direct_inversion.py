@@ -41,7 +41,7 @@ def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.n
     u = [_smooth(U[..., c], inside, smoothing) for c in range(3)]
     d = [np.gradient(c, *field.spacing) if min(c.shape) > 1 else [np.full_like(c, np.nan)] * 3 for c in u]
     curl = (d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1])
-    above = below = 0.0
+    above, below = np.zeros(inside.shape, complex), np.zeros(inside.shape)
     for q in curl:
         L = sum(_second(q, a, h) for a, h in enumerate(field.spacing))
         above = above + np.conj(L) * q

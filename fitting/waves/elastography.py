@@ -1,20 +1,18 @@
-"""An organ and its waves: moduli of the whole, of its regions, and a map, from one measurement."""
+"""An organ and its waves: moduli of the whole and of its regions from one measurement, and what a map needs."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from fitting.waves import balance, regions, stiffness_map, voxels
 from fitting.waves.balance import Matrices, gigabytes
-from fitting.waves.regions import Regions, Waves
-from fitting.waves.stiffness_map import WaveMap
+from fitting.waves.regions import MeasuredWaves, Regions
 from fitting.waves.voxels import VoxelBody
 from fitting.waves.wave_field import WaveField
 from liverjax.core.errors import InputError
 
-__all__ = ["Found", "Organ", "body_of", "gigabytes", "map_of", "organ_of", "plane_wave_bias", "regions_of"]
+__all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_bias", "problem_of_map", "regions_of"]
 #: Directions and polarisations of plane waves, and how many of 26 neighbours lie that way.
 DIRECTIONS = (((0, 0, 1), (1, 0, 0), 6), ((1, 0, 1), (1, 0, -1), 12), ((1, 1, 1), (1, -1, 0), 8))
 
@@ -25,7 +23,7 @@ class Organ(NamedTuple):
     field: WaveField
     body: VoxelBody
     matrices: Matrices
-    waves: Waves
+    waves: MeasuredWaves
     density: float
 
 
@@ -56,7 +54,7 @@ def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
     """The organ of a field, with the equations of its body; density in kg/m^3."""
     motion = field.displacement[(slice(None), *body.voxel.T)]
     omega = 2 * np.pi * field.frequencies
-    waves = Waves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
+    waves = MeasuredWaves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
     return Organ(field, body, balance.matrices(body, density), waves, density)
 
 
@@ -64,27 +62,18 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     """Moduli of the whole organ, and of its regions where labels are given."""
     m, waves, elements = organ.matrices, organ.waves, organ.body.mesh.number_of_elements
     start = regions.first_modulus(m, waves)
-    whole = regions.fit(m, waves, np.zeros(elements, int), np.array([start]), progress)
+    whole = regions.moduli_of_regions(m, waves, np.zeros(elements, int), np.array([start]), progress)
     bias = np.array([plane_wave_bias(G, w, organ) for G, w in zip(whole.modulus[:, 0], waves.omega, strict=True)])
     if organ.field.labels is None:
         return Found(whole, None, None, bias)
     known, number = np.unique(voxels.elements_of(organ.body, organ.field.labels), return_inverse=True)
-    parts = regions.fit(m, waves, number, np.full(len(known), whole.modulus[0, 0]), progress)
+    parts = regions.moduli_of_regions(m, waves, number, np.full(len(known), whole.modulus[0, 0]), progress)
     return Found(whole, known, parts, bias)
 
 
-def map_of(
-    organ: Organ,
-    found: Found,
-    length: float,
-    file: Path | None = None,
-    resume: bool = False,
-    draws: int = 20,
-    progress: Callable[[int, float], None] = lambda k, cost: None,
-) -> WaveMap:
-    """The map about the moduli of the whole; arguments as of `stiffness_map.estimate`."""
-    course = stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
-    return stiffness_map.estimate(course, file, resume, draws, progress=progress)
+def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:
+    """What `stiffness_map.map_of` solves: a map about the moduli of the whole, of this correlation length [m]."""
+    return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 
 def plane_wave_bias(G: complex, omega: float, organ: Organ) -> complex:
@@ -96,7 +85,7 @@ def plane_wave_bias(G: complex, omega: float, organ: Organ) -> complex:
     for along, across, count in DIRECTIONS:
         n, a = (np.array(v) / np.linalg.norm(v) for v in (along, across))
         d = (np.exp(-1j * k * (X @ n))[:, None] * a).ravel()
-        waves = Waves(np.array([omega]), d[None], np.array([1e-3]))
-        own = regions.fit(m, waves, np.zeros(body.mesh.number_of_elements, int), np.array([G]))
+        waves = MeasuredWaves(np.array([omega]), d[None], np.array([1e-3]))
+        own = regions.moduli_of_regions(m, waves, np.zeros(body.mesh.number_of_elements, int), np.array([G]))
         total, weight = total + count * (own.modulus[0, 0] / G - 1), weight + count
     return total / weight

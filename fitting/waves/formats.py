@@ -25,7 +25,14 @@ def arrays(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: no such file of waves: give .npz, .npy, .h5, .csv, .nii or .nii.gz")
     ending = "".join(path.suffixes[-2:]).lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
-    readers = {".npz": _numpy, ".npy": _numpy, ".csv": _table, ".txt": _table, ".nii": _nifti, ".nii.gz": _nifti}
+    readers = {
+        ".npz": _numpy,
+        ".npy": _numpy,
+        ".csv": _voxel_table,
+        ".txt": _voxel_table,
+        ".nii": _nifti,
+        ".nii.gz": _nifti,
+    }
     readers |= dict.fromkeys(HDF5, _hdf5)
     if ending not in readers:
         raise InputError(f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .csv, .nii or .nii.gz")
@@ -78,7 +85,7 @@ def _hdf5(path: Path) -> dict[str, Any]:
 COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_im_z")
 
 
-def _table(path: Path) -> dict[str, Any]:
+def _voxel_table(path: Path) -> dict[str, Any]:
     """x, y, z [m], real and imaginary parts, with or without frequency [Hz] and label, on a regular grid."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         lines = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
@@ -103,10 +110,11 @@ def _table(path: Path) -> dict[str, Any]:
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
     found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
-    if "label" in column:
-        found["labels"] = np.zeros(shape, int)
-        found["labels"][tuple(at.T)] = np.nan_to_num(column["label"]).astype(int)
-    return found
+    if "label" not in column:
+        return found
+    labels = np.zeros(shape, int)
+    labels[tuple(at.T)] = np.nan_to_num(column["label"]).astype(int)
+    return found | {"labels": labels}
 
 
 def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, ...]]:

@@ -15,7 +15,7 @@ STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
 ITERATIONS, ENOUGH = 20, 0.1
 
 
-class Waves(NamedTuple):
+class MeasuredWaves(NamedTuple):
     """Measured motion at the nodes of a body."""
 
     omega: np.ndarray  # (F,) [rad/s]
@@ -45,7 +45,7 @@ class Regions(NamedTuple):
         return self.noise_factor[:, None] * np.sqrt(variance)
 
 
-def first_modulus(m: Matrices, waves: Waves) -> complex:
+def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
     """The modulus [Pa] of `STARTS` that leaves the least out of balance at the lowest frequency."""
     ones = np.ones(m.rows.shape[-1])
 
@@ -56,9 +56,9 @@ def first_modulus(m: Matrices, waves: Waves) -> complex:
     return min(STARTS * (1 + LOSS * 1j), key=out_of_balance)
 
 
-def fit(
+def moduli_of_regions(
     m: Matrices,
-    waves: Waves,
+    waves: MeasuredWaves,
     region: np.ndarray,
     start: np.ndarray,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
@@ -85,7 +85,7 @@ def _one_frequency(m, waves, f, region, G, progress):
     one_hot = np.eye(len(G))[region]  # (E, R)
     at = waves.omega[f], waves.motion[f], waves.sd[f]
     here, converged, k = balance.balanced(m, one_hot @ G, *at), False, 0
-    step, H = _step(m, here, one_hot, waves.sd[f])
+    step, H = _gauss_newton(m, here, one_hot, waves.sd[f])
     for k in range(1, ITERATIONS + 1):
         part = min(1.0, 0.5 / max(np.max(np.abs(step / G)), 1e-300))  # a modulus changes by half of itself at most
         for _ in range(8):
@@ -97,14 +97,14 @@ def _one_frequency(m, waves, f, region, G, progress):
             break
         G, here = G + part * step, new
         progress(k, here.chi2 / m.balances)
-        step, H = _step(m, here, one_hot, waves.sd[f])
+        step, H = _gauss_newton(m, here, one_hot, waves.sd[f])
         converged = bool(np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))))
         if converged or part < 1e-2:
             break
     return G, np.linalg.inv(H), here.chi2, k, converged
 
 
-def _step(m: Matrices, here: Balanced, one_hot: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_newton(m: Matrices, here: Balanced, one_hot: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
     """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2."""
     J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(one_hot)).tocsc()
     X = here.whitened(J)

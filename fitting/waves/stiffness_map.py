@@ -20,7 +20,7 @@ import scipy.sparse
 from fitting.methods import prior as smooth
 from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
-from fitting.waves.regions import Waves
+from fitting.waves.regions import MeasuredWaves
 from fitting.waves.voxels import VoxelBody
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
@@ -54,7 +54,7 @@ class Course(NamedTuple):
     """What a search needs, all of it fixed."""
 
     m: Matrices
-    waves: Waves
+    waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex
     mean: scipy.sparse.csr_array  # (E, P): the corners' mean
     p: smooth.Prior
@@ -86,7 +86,7 @@ class Course(NamedTuple):
         return smooth.to_whitened(self.p, g.real) + 1j * smooth.to_whitened(self.p, g.imag)
 
 
-class _Point(NamedTuple):
+class _Reached(NamedTuple):
     z: np.ndarray
     k: int  # number of the deviation
     here: list[Balanced]
@@ -94,7 +94,7 @@ class _Point(NamedTuple):
     cost: float
 
 
-def course_of(body: VoxelBody, m: Matrices, waves: Waves, whole: np.ndarray, length: float) -> Course:
+def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndarray, length: float) -> Course:
     """The problem of a map.
 
     Args:
@@ -107,7 +107,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: Waves, whole: np.ndarray, len
     return Course(m, waves, np.asarray(whole, complex), mean, p, length)
 
 
-def estimate(
+def map_of(
     course: Course,
     file: Path | None = None,
     resume: bool = False,
@@ -127,8 +127,8 @@ def estimate(
         InputError: `file` belongs to another fit.
     """
     begin = time.perf_counter()
-    point, history = _begin(course, file if resume else None)
-    point = _deviations_in_turn(course, point, history, file, progress)
+    point, history = _first_or_resumed(course, file if resume else None)
+    point = _each_deviation(course, point, history, file, progress)
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
     before, after, departures = _spread(course, point, draws)
@@ -156,13 +156,13 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
 
 
-def _evaluated(course: Course, z: np.ndarray, k: int) -> _Point:
+def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
     here = course.at(DEVIATIONS[k] * course.field(z))
     chi2 = sum(b.chi2 for b in here)
-    return _Point(z, k, here, chi2, 0.5 * chi2 + 0.5 * float(np.vdot(z, z).real))
+    return _Reached(z, k, here, chi2, 0.5 * chi2 + 0.5 * float(np.vdot(z, z).real))
 
 
-def _deviations_in_turn(course, point, history, file, progress) -> _Point:
+def _each_deviation(course, point, history, file, progress) -> _Reached:
     """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
     components = course.m.balances * len(course.waves.omega)
     while True:
@@ -189,10 +189,10 @@ def _deviations_in_turn(course, point, history, file, progress) -> _Point:
         idle = len(last) == 2 and last[1] > (1 - WORTH) * last[0]
         if point.chi2 <= components or idle or point.k + 1 == len(DEVIATIONS):
             return point
-        point = _evaluated(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
+        point = _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
 
 
-def _hessian(course: Course, point: _Point) -> np.ndarray:
+def _hessian(course: Course, point: _Reached) -> np.ndarray:
     """I + J^H J in whitened z, complex (P, P)."""
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
@@ -205,7 +205,7 @@ def _hessian(course: Course, point: _Point) -> np.ndarray:
     return np.eye(len(c)) + deviation**2 * course.whitened(half.conj().T).conj().T
 
 
-def _stepped(course: Course, point: _Point, H: np.ndarray) -> _Point:
+def _stepped(course: Course, point: _Reached, H: np.ndarray) -> _Reached:
     """A step of Gauss-Newton that lowers the cost, or the point itself."""
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
@@ -213,13 +213,13 @@ def _stepped(course: Course, point: _Point, H: np.ndarray) -> _Point:
     slope = deviation * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
     step = -scipy.linalg.solve(H, slope + point.z, assume_a="pos")
     for part in (1.0, 0.5, 0.25, 0.1):
-        new = _evaluated(course, point.z + part * step, point.k)
+        new = _reached(course, point.z + part * step, point.k)
         if new.cost < point.cost:
             return new
     return point
 
 
-def _spread(course: Course, point: _Point, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _spread(course: Course, point: _Reached, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard deviations (P,) before and after the data, and departures (D, P) of samples of the posterior."""
     deviation, n = DEVIATIONS[point.k], len(point.z)
     L = np.linalg.cholesky(_hessian(course, point))
@@ -234,7 +234,7 @@ def _spread(course: Course, point: _Point, draws: int) -> tuple[np.ndarray, np.n
     )
 
 
-def _write(file: Path | None, course: Course, point: _Point, history: list[dict[str, float]]) -> None:
+def _write(file: Path | None, course: Course, point: _Reached, history: list[dict[str, float]]) -> None:
     """The point reached, whole or not at all."""
     if file is None:
         return
@@ -244,14 +244,14 @@ def _write(file: Path | None, course: Course, point: _Point, history: list[dict[
         f.attrs["balances"], f.attrs["size"] = course.m.balances, float(np.linalg.norm(course.waves.motion))
 
 
-def _begin(course: Course, file: Path | None) -> tuple[_Point, list[dict[str, Any]]]:
+def _first_or_resumed(course: Course, file: Path | None) -> tuple[_Reached, list[dict[str, Any]]]:
     """A uniform organ, or the point of an earlier run."""
     if file is None or not file.is_file():
-        return _evaluated(course, np.zeros(len(course.p.root_mass), complex), 0), []
+        return _reached(course, np.zeros(len(course.p.root_mass), complex), 0), []
     with h5py.File(file) as f:
         same = f.attrs["balances"] == course.m.balances and len(f["z"]) == len(course.p.root_mass)
         if not (same and np.isclose(f.attrs["size"], np.linalg.norm(course.waves.motion))):
             raise InputError(f"{file} is of another fit: leave out --resume or name another --out")
         names = ("deviation", "chi2_per_component", "steps", "seconds")
         history = [dict(zip(names, map(float, row), strict=True)) for row in f["history"][:]]
-        return _evaluated(course, f["z"][:], int(f["k"][()])), history
+        return _reached(course, f["z"][:], int(f["k"][()])), history

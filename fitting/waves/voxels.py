@@ -38,7 +38,7 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
             "5 along every axis; measure more slices"
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
-    inner = _inside(kept)
+    inner = _surrounded(kept)
     if not inner.any():
         raise InputError("the mask has no voxel that lies two voxels deep on every side: give a larger mask")
     used, tets = np.unique(_sixths(np.argwhere(kept), kept.shape), return_inverse=True)
@@ -81,15 +81,13 @@ def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
     return kept
 
 
-def _inside(kept: np.ndarray) -> np.ndarray:
+def _surrounded(kept: np.ndarray) -> np.ndarray:
     """Voxels (2 cells + 1) all of whose bricks are kept, and that are not at the end of the grid."""
     inside = np.ones(tuple(2 * n + 1 for n in kept.shape), bool)
     for offset in np.ndindex(3, 3, 3):
         inside[_every_second(offset, kept.shape)] &= kept
     for a in range(3):
-        ends = [slice(None)] * 3
-        ends[a] = [0, -1]
-        inside[tuple(ends)] = False
+        np.moveaxis(inside, a, 0)[[0, -1]] = False
     return inside
 
 

@@ -27,7 +27,7 @@ class WaveField(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read(
+def read_waves(
     path: str | os.PathLike,
     frequencies: list[float] | None = None,
     mask: str | os.PathLike | None = None,
@@ -52,16 +52,16 @@ def read(
     found |= {key: formats.single(Path(file), key) for key, file in more.items() if file is not None}
     U, notes = _motion(name, found)
     U = U * _factor(name, unit or found.get("unit") or "m")
-    hertz = _frequencies(name, frequencies, found.get("frequencies"), len(U))
+    hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
     step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
     origin = np.zeros(3) if found.get("origin") is None else np.asarray(found["origin"], float).ravel()
     shape = U.shape[1:4]
-    measured = np.isfinite(U).any(axis=(0, 4))
-    chosen = _on_voxels(name, "mask", found.get("mask"), shape)
+    measured = np.asarray(np.isfinite(U).any(axis=(0, 4)))
+    chosen = _whole_numbers(name, "mask", found.get("mask"), shape)
     inside = measured if chosen is None else measured & (chosen != 0)
     if not inside.any():
         raise InputError(f"{name}: no voxel of the mask has a displacement: give the mask of these voxels")
-    regions = _on_voxels(name, "labels", found.get("labels"), shape)
+    regions = _whole_numbers(name, "labels", found.get("labels"), shape)
     order = np.argsort(hertz)
     field = WaveField(hertz[order], U[order], step, origin, inside, regions, np.zeros(len(U)), name, tuple(notes))
     return field._replace(noise=noise_of(field))
@@ -70,14 +70,14 @@ def read(
 def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
     """Complex displacements (F, nx, ny, nz, 3) in the file's unit, and notes."""
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, evenly apart
-        u = _numbers(name, "phases", found["phases"])
+        u = _array_of_numbers(name, "phases", found["phases"])
         if u.ndim not in (5, 6) or u.shape[-5] < 3:
             raise InputError(f"{name}: phases has shape {u.shape}: give (F, T, nx, ny, nz, 3) with 3 instants or more")
         U = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5]
     elif found.get("displacement") is not None:
-        U = _numbers(name, "displacement", found["displacement"])
+        U = _array_of_numbers(name, "displacement", found["displacement"])
     elif found.get("real") is not None and found.get("imag") is not None:
-        parts = [_numbers(name, key, found[key]) for key in ("real", "imag")]
+        parts = [_array_of_numbers(name, key, found[key]) for key in ("real", "imag")]
         if parts[0].shape != parts[1].shape:
             raise InputError(f"{name}: real has shape {parts[0].shape} and imag {parts[1].shape}: give equal ones")
         U = parts[0] + 1j * parts[1]
@@ -103,7 +103,7 @@ def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
     return np.concatenate([U, blank, blank], axis=-1), ["one component is measured: the other two are unknown"]
 
 
-def _numbers(name: str, field: str, values: Any) -> np.ndarray:
+def _array_of_numbers(name: str, field: str, values: Any) -> np.ndarray:
     a = np.asarray(values)
     if a.dtype.kind not in "fciu":
         raise InputError(f"{name}: {field} holds {a.dtype}, not numbers: store complex numbers")
@@ -116,7 +116,7 @@ def _factor(name: str, unit: str) -> float:
     return UNITS[unit]
 
 
-def _frequencies(name: str, asked: list[float] | None, held: Any, number: int) -> np.ndarray:
+def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.ndarray:
     if asked is None and held is None:
         raise InputError(f"{name}: holds no frequencies: give --frequencies with {number} in Hz, e.g. --frequencies 60")
     hertz = np.asarray(held if asked is None else asked, float).ravel()
@@ -143,7 +143,7 @@ def _lengths(name: str, field: str, given: Any, option: str) -> np.ndarray:
     return values
 
 
-def _on_voxels(name: str, field: str, values: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+def _whole_numbers(name: str, field: str, values: Any, shape: tuple[int, ...]) -> np.ndarray | None:
     if values is None:
         return None
     a = np.asarray(values)
@@ -193,7 +193,7 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
         raise InputError(f"a stride of {stride} leaves no voxel of {field.mask.shape}: give a smaller --stride")
     cut = tuple(slice(0, k * stride) for k in n)
     blocks = (n[0], stride, n[1], stride, n[2], stride)
-    mask = field.mask[cut].reshape(blocks).all(axis=(1, 3, 5))
+    mask = np.asarray(field.mask[cut].reshape(blocks).all(axis=(1, 3, 5)))
     U = np.where(
         mask[None, ..., None], field.displacement[(slice(None), *cut)].reshape(-1, *blocks, 3).mean((2, 4, 6)), np.nan
     )
