@@ -65,9 +65,10 @@ def test_a_hole_in_the_mask_takes_away_its_bricks_and_their_inner_nodes():
     assert whole.inner.sum() - body.inner.sum() == 2**3  # inner nodes of that brick: the four around it look in
     labels = np.zeros((7, 7, 7), int)
     labels[4:] = 5
-    of = voxels.elements_of(whole, labels)
+    known, shares = voxels.shares_of(whole, labels)
     x = np.asarray(whole.linear.points)[np.asarray(whole.linear.tetrahedra)].mean(axis=1)[:, 0]
-    assert np.all(of[x < 2] == 0) and np.all(of[x > 4] == 5)
+    assert list(known) == [0, 5] and np.allclose(shares.sum(axis=1), 1)
+    assert np.all(shares[x < 2, 0] == 1) and np.all(shares[x > 4, 1] == 1)
 
 
 def test_the_block_solver_is_that_of_the_whole_matrix(small):
@@ -124,15 +125,15 @@ def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
     """Forty measurements with 5 % of noise: mean and scatter of (found - true) / error are 0 and 1."""
     first = organ((7, 7, 7), noise=5e-7)
     clean = plane_waves((7, 7, 7)).displacement[(slice(None), *first.body.voxel.T)].reshape(2, -1)
-    zero = np.zeros(first.body.mesh.number_of_elements, int)
+    alone = np.ones((first.body.mesh.number_of_elements, 1))
     exact = regions.moduli_of_regions(
-        first.matrices, first.waves._replace(motion=clean), zero, np.array([modulus(100.0)])
+        first.matrices, first.waves._replace(motion=clean), alone, np.array([modulus(100.0)])
     )
     rng, pulls = np.random.default_rng(1), []
     for _ in range(20):
         noise = 5e-7 * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
         found = regions.moduli_of_regions(
-            first.matrices, first.waves._replace(motion=clean + noise), zero, exact.modulus[0]
+            first.matrices, first.waves._replace(motion=clean + noise), alone, exact.modulus[0]
         )
         d = (found.modulus - exact.modulus) / np.sqrt(np.real(found.covariance[:, 0]))
         pulls += [*d.real.ravel(), *d.imag.ravel()]

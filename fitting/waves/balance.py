@@ -65,12 +65,12 @@ class Balanced(NamedTuple):
     multipliers: np.ndarray  # q (I,)
     factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, by diagonals
 
-    def whitened(self, columns: scipy.sparse.csc_array) -> np.ndarray:
+    def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
         """L^-1 of columns (I, k): their products with each other are those of S^-1."""
-        left, (bands, n) = columns.toarray(), self.factor.shape
+        left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)
-            block = _columns_of(self.factor, a, b)
+            block = _columns_of(self.factor, a, b).astype(kind)
             left[a:b] = scipy.linalg.solve_triangular(block[: b - a], left[a:b], lower=True, check_finite=False)
             rest = block[b - a : b - a + n - b]
             left[b : b + len(rest)] -= rest @ left[a:b]

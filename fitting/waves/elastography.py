@@ -62,12 +62,12 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     """Moduli of the whole organ, and of its regions where labels are given."""
     m, waves, elements = organ.matrices, organ.waves, organ.body.mesh.number_of_elements
     start = regions.first_modulus(m, waves)
-    whole = regions.moduli_of_regions(m, waves, np.zeros(elements, int), np.array([start]), progress)
+    whole = regions.moduli_of_regions(m, waves, np.ones((elements, 1)), np.array([start]), progress)
     bias = np.array([plane_wave_bias(G, w, organ) for G, w in zip(whole.modulus[:, 0], waves.omega, strict=True)])
     if organ.field.labels is None:
         return Found(whole, None, None, bias)
-    known, number = np.unique(voxels.elements_of(organ.body, organ.field.labels), return_inverse=True)
-    parts = regions.moduli_of_regions(m, waves, number, np.full(len(known), whole.modulus[0, 0]), progress)
+    known, shares = voxels.shares_of(organ.body, organ.field.labels)
+    parts = regions.moduli_of_regions(m, waves, shares, np.full(len(known), whole.modulus[0, 0]), progress)
     return Found(whole, known, parts, bias)
 
 
@@ -86,6 +86,6 @@ def plane_wave_bias(G: complex, omega: float, organ: Organ) -> complex:
         n, a = (np.array(v) / np.linalg.norm(v) for v in (along, across))
         d = (np.exp(-1j * k * (X @ n))[:, None] * a).ravel()
         waves = MeasuredWaves(np.array([omega]), d[None], np.array([1e-3]))
-        own = regions.moduli_of_regions(m, waves, np.zeros(body.mesh.number_of_elements, int), np.array([G]))
+        own = regions.moduli_of_regions(m, waves, np.ones((body.mesh.number_of_elements, 1)), np.array([G]))
         total, weight = total + count * (own.modulus[0, 0] / G - 1), weight + count
     return total / weight

@@ -59,7 +59,7 @@ def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
 def moduli_of_regions(
     m: Matrices,
     waves: MeasuredWaves,
-    region: np.ndarray,
+    shares: np.ndarray,
     start: np.ndarray,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Regions:
@@ -68,28 +68,27 @@ def moduli_of_regions(
     Args:
         m: `balance.matrices`.
         waves: what was measured.
-        region: number of the region of each element (E,), from 0.
+        shares: part of each element that is in each region (E, R); its modulus is their mean.
         start: complex modulus of each region (R,) [Pa], of the lowest frequency.
         progress: told of every iteration: its number, and chi^2 over the number of components.
     """
     found, G = [], np.asarray(start, complex)
     for f in range(len(waves.omega)):
-        found.append(_one_frequency(m, waves, f, region, G, progress))
+        found.append(_one_frequency(m, waves, f, shares, G, progress))
         G = found[-1][0]
     G, covariance, chi2, iterations, converged = (np.array(each) for each in zip(*found, strict=True))
     return Regions(G, covariance, chi2, m.balances, iterations, converged)
 
 
-def _one_frequency(m, waves, f, region, G, progress):
+def _one_frequency(m, waves, f, shares, G, progress):
     """Modulus (R,), covariance (R, R), chi^2, iterations, and whether they ended by themselves."""
-    one_hot = np.eye(len(G))[region]  # (E, R)
     at = waves.omega[f], waves.motion[f], waves.sd[f]
-    here, converged, k = balance.balanced(m, one_hot @ G, *at), False, 0
-    step, H = _gauss_newton(m, here, one_hot, waves.sd[f])
+    here, converged, k = balance.balanced(m, shares @ G, *at), False, 0
+    step, H = _gauss_newton(m, here, shares, waves.sd[f])
     for k in range(1, ITERATIONS + 1):
         part = min(1.0, 0.5 / max(np.max(np.abs(step / G)), 1e-300))  # a modulus changes by half of itself at most
         for _ in range(8):
-            new = balance.balanced(m, one_hot @ (G + part * step), *at)
+            new = balance.balanced(m, shares @ (G + part * step), *at)
             if new.chi2 <= here.chi2 * (1 + 1e-10):
                 break
             part *= 0.5
@@ -97,16 +96,16 @@ def _one_frequency(m, waves, f, region, G, progress):
             break
         G, here = G + part * step, new
         progress(k, here.chi2 / m.balances)
-        step, H = _gauss_newton(m, here, one_hot, waves.sd[f])
+        step, H = _gauss_newton(m, here, shares, waves.sd[f])
         converged = bool(np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))))
         if converged or part < 1e-2:
             break
     return G, np.linalg.inv(H), here.chi2, k, converged
 
 
-def _gauss_newton(m: Matrices, here: Balanced, one_hot: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_newton(m: Matrices, here: Balanced, shares: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
     """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2."""
-    J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(one_hot)).tocsc()
+    J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(shares)).tocsc()
     X = here.whitened(J)
     H = X.conj().T @ X / sd**2
     g = J.conj().T @ here.multipliers / sd**2

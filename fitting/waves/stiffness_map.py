@@ -3,8 +3,9 @@
 At frequency f the modulus of an element is g_f exp(c), g_f that of the whole organ and c = ln(size) + i (loss angle)
 the mean of a complex nodal field (P,), one field for all frequencies. Its real and its imaginary part have the prior of
 `fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number of
-equations (discrepancy principle; Morozov 1966), or no longer falls. The minimum of chi^2/2 + |z|^2/2 over the whitened
-z is sought by Gauss-Newton. The uncertainty is that of the Hessian I + J^H J.
+equations (discrepancy principle; Morozov 1966), or no longer falls. Of the deviations on this way, that of the highest
+evidence is taken: -(chi^2/n + |z|^2)/2 - ln det H. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by
+Gauss-Newton. The uncertainty is that of the Hessian H = I + J^H J/n, n the factor by which chi^2 is too large.
 """
 
 import time
@@ -30,7 +31,7 @@ DEVIATIONS = (0.2, 0.4, 0.8)
 #: A larger one must lower chi^2 by this part, or it is no better.
 WORTH = 0.01
 #: Steps of Gauss-Newton for each, and the part of the cost below which one is the last.
-STEPS, LAST = 6, 3e-3
+STEPS, LAST = 8, 3e-4
 
 
 class WaveMap(NamedTuple):
@@ -128,11 +129,15 @@ def map_of(
     """
     begin = time.perf_counter()
     point, history = _first_or_resumed(course, file if resume else None)
-    point = _each_deviation(course, point, history, file, progress)
+    components = course.m.balances * len(course.waves.omega)
+    visited = _each_deviation(course, point, history, file, progress)
+    excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
+    for row, one in zip(history[-len(visited) :], visited, strict=True):
+        row["evidence"] = _evidence(*one, excess)
+    point = max(visited, key=lambda one: _evidence(*one, excess))[0]
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
-    before, after, departures = _spread(course, point, draws)
-    components = course.m.balances * len(course.waves.omega)
+    before, after, departures = _spread(course, point, excess, draws)
     return WaveMap(
         exponent=c,
         sd=after,
@@ -162,15 +167,22 @@ def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
     return _Reached(z, k, here, chi2, 0.5 * chi2 + 0.5 * float(np.vdot(z, z).real))
 
 
-def _each_deviation(course, point, history, file, progress) -> _Reached:
+def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
+    """Logarithm of the probability of the data at this deviation, but for a number that is the same for all."""
+    H = np.eye(len(information)) + DEVIATIONS[point.k] ** 2 / excess * information
+    logarithm = 2 * float(np.sum(np.log(np.real(np.diagonal(np.linalg.cholesky(H))))))
+    return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
+
+
+def _each_deviation(course, point, history, file, progress) -> list[tuple[_Reached, np.ndarray]]:
     """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
-    components = course.m.balances * len(course.waves.omega)
+    components, visited = course.m.balances * len(course.waves.omega), []
     while True:
         begin, steps = time.perf_counter(), 0
-        H = _hessian(course, point)  # the other steps make do with the first one's
+        information = _information(course, point)  # the other steps make do with the first one's
         while steps < STEPS:
             steps += 1
-            new = _stepped(course, point, H)
+            new = _stepped(course, point, information)
             fell = point.cost - new.cost
             point = new
             progress(point.k, point.chi2 / components)
@@ -185,32 +197,33 @@ def _each_deviation(course, point, history, file, progress) -> _Reached:
                 "seconds": time.perf_counter() - begin,
             }
         )
+        visited.append((point, information))
         last = [row["chi2_per_component"] for row in history[-2:]]
         idle = len(last) == 2 and last[1] > (1 - WORTH) * last[0]
         if point.chi2 <= components or idle or point.k + 1 == len(DEVIATIONS):
-            return point
+            return visited
         point = _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
 
 
-def _hessian(course: Course, point: _Reached) -> np.ndarray:
-    """I + J^H J in whitened z, complex (P, P)."""
-    deviation = DEVIATIONS[point.k]
-    c = deviation * course.field(point.z)
+def _information(course: Course, point: _Reached) -> np.ndarray:
+    """J^H J in whitened z of a field of deviation 1, complex (P, P)."""
+    c = DEVIATIONS[point.k] * course.field(point.z)
     H = np.zeros((len(c), len(c)), complex)
     for J, b in zip(course.jacobians(c, point.here), point.here, strict=True):
-        X = b.whitened(J)
+        X = b.whitened(J, np.complex64)  # a Hessian that steers needs no more digits
         H += X.conj().T @ X
     # T^T H T, with T the real matrix of `field`, from both sides.
     half = course.whitened(H)
-    return np.eye(len(c)) + deviation**2 * course.whitened(half.conj().T).conj().T
+    return course.whitened(half.conj().T).conj().T
 
 
-def _stepped(course: Course, point: _Reached, H: np.ndarray) -> _Reached:
+def _stepped(course: Course, point: _Reached, information: np.ndarray) -> _Reached:
     """A step of Gauss-Newton that lowers the cost, or the point itself."""
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
     each = zip(course.jacobians(c, point.here), point.here, course.waves.sd, strict=True)
     slope = deviation * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
+    H = np.eye(len(c)) + deviation**2 * information
     step = -scipy.linalg.solve(H, slope + point.z, assume_a="pos")
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
@@ -219,10 +232,10 @@ def _stepped(course: Course, point: _Reached, H: np.ndarray) -> _Reached:
     return point
 
 
-def _spread(course: Course, point: _Reached, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _spread(course: Course, point: _Reached, excess: float, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard deviations (P,) before and after the data, and departures (D, P) of samples of the posterior."""
     deviation, n = DEVIATIONS[point.k], len(point.z)
-    L = np.linalg.cholesky(_hessian(course, point))
+    L = np.linalg.cholesky(np.eye(n) + deviation**2 / excess * _information(course, point))
     roots = course.field(np.linalg.inv(L).conj().T)  # R R^H is the covariance
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(n, draws)) + 1j * rng.normal(size=(n, draws))
@@ -234,13 +247,16 @@ def _spread(course: Course, point: _Reached, draws: int) -> tuple[np.ndarray, np
     )
 
 
+_HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
+
+
 def _write(file: Path | None, course: Course, point: _Reached, history: list[dict[str, float]]) -> None:
     """The point reached, whole or not at all."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:
         f["z"], f["k"], f["whole"] = point.z, point.k, course.whole
-        f["history"] = np.array([list(row.values()) for row in history]).reshape(-1, 4)
+        f["history"] = np.array([[row[name] for name in _HISTORY] for row in history]).reshape(-1, len(_HISTORY))
         f.attrs["balances"], f.attrs["size"] = course.m.balances, float(np.linalg.norm(course.waves.motion))
 
 
@@ -252,6 +268,5 @@ def _first_or_resumed(course: Course, file: Path | None) -> tuple[_Reached, list
         same = f.attrs["balances"] == course.m.balances and len(f["z"]) == len(course.p.root_mass)
         if not (same and np.isclose(f.attrs["size"], np.linalg.norm(course.waves.motion))):
             raise InputError(f"{file} is of another fit: leave out --resume or name another --out")
-        names = ("deviation", "chi2_per_component", "steps", "seconds")
-        history = [dict(zip(names, map(float, row), strict=True)) for row in f["history"][:]]
+        history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
         return _reached(course, f["z"][:], int(f["k"][()])), history

@@ -107,10 +107,9 @@ def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
     return values
 
 
-def elements_of(body: VoxelBody, labels: np.ndarray) -> np.ndarray:
-    """The label (E,) that most nodes of each element have, of labels (nx, ny, nz)."""
+def shares_of(body: VoxelBody, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The labels (R,) that are there, and the part (E, R) of each element's ten voxels that has each."""
     own = labels[tuple(body.voxel.T)]
     known, index = np.unique(own, return_inverse=True)
     nodes = np.stack([np.asarray(n) for n in body.mesh.element_nodes])
-    votes = np.stack([np.sum(index[nodes] == k, axis=0) for k in range(len(known))])
-    return known[np.argmax(votes, axis=0)]
+    return known, np.stack([np.mean(index[nodes] == k, axis=0) for k in range(len(known))], axis=1)
