@@ -10,7 +10,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
-from liverjax.reduced.sampling import nonnegative_weights
+from liverjax.reduced.sampling import MOST_STATES, nonnegative_weights, states_of
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -80,6 +80,17 @@ def trained() -> tuple:
     gravity = np.stack([rng.uniform(-2, 2, 8), rng.uniform(-2, 2, 8), down], axis=1)
     rows = {"law.mu": rng.uniform(700.0, 1000.0, 8), "body.gravity": gravity}
     return scene, lj.reduce_scene(scene, rows, most_modes=5, point_tolerance=1e-3)
+
+
+@pytest.mark.parametrize("runs", [1, 8, MOST_STATES // 2 + 1, 3 * MOST_STATES])
+def test_states_of_all_times_are_sampled(runs):
+    """With many runs each gives few states: they are of all times, not of the first step."""
+    found = states_of(runs, 24)
+    times = np.concatenate([times for _, times in found])
+    assert len(times) <= MOST_STATES and times.min() >= 0 and times.max() < 24
+    assert len({r for r, _ in found}) == min(runs, MOST_STATES)
+    thirds = np.bincount(times // 8, minlength=3) / len(times)
+    assert np.all(thirds > 0.25)  # a third each, but for the few that the ends cut
 
 
 def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):

@@ -19,8 +19,8 @@ from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 
-#: The most states whose forces are taken: more cost memory and change little.
-MOST_STATES = 60
+#: The most states whose forces are taken: memory and time grow with them and their square.
+MOST_STATES = 160
 
 
 def sampled(
@@ -35,11 +35,8 @@ def sampled(
         q: coordinates [m].
         tolerance: part of the forces that may be left out [1].
     """
-    R, T, _ = q.shape
-    each = max(1, MOST_STATES // R)
-    times = np.unique(np.linspace(0, T - 1, each).round().astype(int))
     rows = []
-    for r in np.unique(np.linspace(0, R - 1, min(R, MOST_STATES)).round().astype(int)):
+    for r, times in states_of(*q.shape[:2]):
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
         rows.append(np.asarray(_contributions(whole, own, q[r], jnp.asarray(times))).reshape(-1, whole.weights.size))
     xi = nonnegative_weights(np.concatenate(rows), np.asarray(whole.weights), tolerance)
@@ -50,6 +47,19 @@ def sampled(
         weights=whole.weights[points] * xi[points],
         points=whole.points[points],
     )
+
+
+def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
+    """Runs and, of each, the steps whose forces are taken: evenly apart, from another place in every run.
+
+    So all times are seen, however few steps each run has; the first steps alone would know of no large motion.
+    """
+    chosen = np.unique(np.linspace(0, runs - 1, min(runs, MOST_STATES)).round().astype(int))
+    each = min(steps, max(1, MOST_STATES // len(chosen)))
+    golden = 0.5 * (np.sqrt(5) - 1)
+    return [
+        (int(r), ((np.arange(each) + (k + 1) * golden % 1) / each * steps).astype(int)) for k, r in enumerate(chosen)
+    ]
 
 
 @jax.jit
