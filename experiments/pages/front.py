@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from experiments.pages import elements
+from experiments.pages import elements, identification
 from experiments.pages.results import error_text, load, percent
 from experiments.pages.stability import Returned, returned
 
@@ -237,4 +237,4 @@ SIMULATOR = {
     "extremes": extremes,
     "elements": elements.sentences,
 }
-FITS = {"maps": maps, "together": together}
+FITS = {"maps": maps, "together": together, "elastography": identification.plate}

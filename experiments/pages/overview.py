@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import bodies, elements, reduced, rigs
+from experiments.pages import bodies, elements, identification, reduced, rigs
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
 from experiments.pages.stability import Returned, returned
@@ -453,6 +453,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         "a sphere on a layer: how wrong is a half-space, and how well do noisy curves give modulus and contact point?",
         bodies.indented,
         "",
+    ),
+    "elastography": (
+        "four stiff cylinders in a plate, from its waves (synthetic, data of another mesh): how far off, how sure?",
+        identification.plate_came_out,
+        "names elastography as a way to measure the liver in a patient",
     ),
     "stability_rigs": ("error of tension, indentation and creep against run time: mesh, elements", rigs.came_out, ""),
     "reduced": (

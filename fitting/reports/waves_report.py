@@ -52,7 +52,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     _write_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
         _for_paraview(out / "waves.vtu", organ, drawn)
-        save(_picture(organ, drawn, usual), out / "waves.png")
+        save(picture(organ, drawn, usual), out / "waves.png")
     return content
 
 
@@ -84,7 +84,10 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[dict[str
 def _by_label(organ: Organ, found: Found) -> dict[str, Any] | None:
     if found.parts is None or found.labels is None:
         return None
+    assert found.by_edges is not None
     rows = _of_regions(organ, found.parts, found.mesh_bias)
+    for row, moved in zip(rows, found.by_edges.T, strict=True):
+        row["moved_by_edges_storage_Pa"], row["moved_by_edges_loss_Pa"] = moved.real.tolist(), moved.imag.tolist()
     return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
 
 
@@ -134,6 +137,14 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
                 f"{hertz:g} Hz: the voxels themselves move the moduli by {100 * bias:.2g} % "
                 f"(standard error {100 * error.min():.2g} %): subtract mesh_bias, or measure smaller voxels"
             )
+    if found.parts is not None and found.by_edges is not None and found.labels is not None:
+        moved = np.abs(found.by_edges) > 2 * found.parts.standard_errors
+        if np.any(moved | ~np.isfinite(found.by_edges)):
+            names = ", ".join(str(label) for label, any_ in zip(found.labels, moved.any(axis=0), strict=True) if any_)
+            told.append(
+                f"regions {names}: how elements on their edges are counted moves the moduli by more than two standard "
+                "errors (moved_by_edges): the voxels are large for these regions"
+            )
     if drawn is not None and not drawn.reached and drawn.chi2 > TOO_FAR * drawn.components:
         told.append(
             f"chi2 of the map stays at {drawn.chi2 / drawn.components:.3g} an equation: edges sharper than the map, or "
@@ -166,7 +177,7 @@ def table(content: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
-def _at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
+def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
     """Values at the voxels (nx, ny, nz), NaN outside, from those of the corners (P,)."""
     out = np.full(organ.field.mask.shape, np.nan, corners.dtype)
     out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
@@ -180,11 +191,11 @@ def _write_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.nda
         file["direct_inversion"] = usual
         if drawn is None:
             return
-        whole = np.stack([_at_voxels(organ, G) for G in drawn.modulus])
-        sd = _at_voxels(organ, drawn.sd)
+        whole = np.stack([at_voxels(organ, G) for G in drawn.modulus])
+        sd = at_voxels(organ, drawn.sd)
         file["modulus"], file["sd_of_logarithm"] = whole, sd
         file["sd"] = np.abs(whole) * sd
-        file["draws_of_exponent"] = np.stack([_at_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
+        file["draws_of_exponent"] = np.stack([at_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
         file["modulus"].attrs["unit"] = file["sd"].attrs["unit"] = "Pa"
 
 
@@ -196,11 +207,11 @@ def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
     meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
 
 
-def _picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
+def picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
     """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
-    G, sd = _at_voxels(organ, drawn.modulus[f]), _at_voxels(organ, drawn.sd)
+    G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd)
     panels = (
         ("storage modulus [kPa]", G.real / 1e3, "viridis"),
         ("loss modulus [kPa]", G.imag / 1e3, "viridis"),
@@ -210,7 +221,7 @@ def _picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
     size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)
     across = [a for a in range(3) if a != axis]
     fig, axes = pyplot().subplots(1, 4, figsize=(13, 4.2), layout="constrained")
-    top = np.nanmax(panels[0][1])
+    top = np.nanquantile(panels[0][1], 0.995)  # one voxel shall not set the scale
     for ax, (title, values, colours) in zip(axes, panels, strict=True):
         limits = {"vmin": 0.0, "vmax": top} if "storage" in title else {"vmin": 0.0}
         shown = np.take(values, k, axis).T

@@ -70,7 +70,7 @@ class Balanced(NamedTuple):
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)
-            block = _columns_of(self.factor, a, b).astype(kind)
+            block: np.ndarray = _columns_of(self.factor, a, b).astype(kind)
             left[a:b] = scipy.linalg.solve_triangular(block[: b - a], left[a:b], lower=True, check_finite=False)
             rest = block[b - a : b - a + n - b]
             left[b : b + len(rest)] -= rest @ left[a:b]

@@ -34,6 +34,7 @@ class Found(NamedTuple):
     labels: np.ndarray | None  # (R,) of the regions
     parts: Regions | None
     mesh_bias: np.ndarray  # (F,) complex: relative, of plane waves of the whole's modulus
+    by_edges: np.ndarray | None = None  # (F, R) complex [Pa]: change where no element is of two regions
 
 
 def body_of(field: WaveField) -> VoxelBody:
@@ -68,7 +69,10 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
         return Found(whole, None, None, bias)
     known, shares = voxels.shares_of(organ.body, organ.field.labels)
     parts = regions.moduli_of_regions(m, waves, shares, np.full(len(known), whole.modulus[0, 0]), progress)
-    return Found(whole, known, parts, bias)
+    most = np.eye(len(known))[np.argmax(shares, axis=1)]
+    sharp = regions.moduli_of_regions(m, waves, most, parts.modulus[0], progress) if np.all(most.any(axis=0)) else None
+    moved = np.full(parts.modulus.shape, np.nan + 0j) if sharp is None else sharp.modulus - parts.modulus
+    return Found(whole, known, parts, bias, moved)
 
 
 def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:

@@ -132,9 +132,10 @@ def map_of(
     components = course.m.balances * len(course.waves.omega)
     visited = _each_deviation(course, point, history, file, progress)
     excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
-    for row, one in zip(history[-len(visited) :], visited, strict=True):
-        row["evidence"] = _evidence(*one, excess)
-    point = max(visited, key=lambda one: _evidence(*one, excess))[0]
+    evidence = [_evidence(p, information, excess) for p, information in visited]
+    for row, value in zip(history[-len(visited) :], evidence, strict=True):
+        row["evidence"] = value
+    point = visited[int(np.argmax(evidence))][0]
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
     before, after, departures = _spread(course, point, excess, draws)
