@@ -234,6 +234,8 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
         ({"mask": np.ones((4, 5, 5), int)}, "on the same voxels"),
         ({"labels": np.full((5, 5, 5), 0.5)}, "whole numbers"),
         ({"unit": "inch"}, "unit 'inch' is not known"),
+        ({"frequencies": ["sixty", "hundred"]}, "frequencies holds"),
+        ({"origin": [0.0, np.nan, 0.0]}, "three coordinates"),
     ],
 )
 def test_a_file_that_cannot_be_used_gets_a_sentence(tmp_path, change, words):
@@ -295,6 +297,32 @@ def test_options_that_cannot_be_are_refused_in_a_sentence(tmp_path, options, wor
     assert command.main(["waves", str(path), *options, "--out", str(tmp_path)]) == 2
     told = capsys.readouterr().err
     assert words in told and told.count("\n") == 1
+
+
+def test_zeros_around_the_organ_are_not_measured(tmp_path):
+    field = plane_waves((5, 6, 7), noise=1e-7)
+    U = np.zeros((2, 9, 9, 9, 3), complex)
+    U[:, 2:7, 1:7, 1:8] = field.displacement
+    U[0, 0, 0, 0, 0] = np.inf
+    np.savez(tmp_path / "zeros.npz", displacement=U, spacing=H, frequencies=HERTZ)
+    found = wave_field.read_waves(tmp_path / "zeros.npz")
+    assert found.mask.sum() == 5 * 6 * 7 and "do not move at all" in found.notes[0]
+    assert np.all(np.isfinite(found.displacement[:, found.mask]))
+
+
+def test_other_frequencies_than_those_of_the_file_are_refused(tmp_path):
+    path = written(tmp_path, ".npz", plane_waves((5, 5, 5)))
+    with pytest.raises(InputError, match="leave out --frequencies"):
+        wave_field.read_waves(path, [50.0, 70.0])
+
+
+def test_the_direct_inversion_leaves_out_what_the_edge_smooths():
+    """Without noise every voxel that is given is within the error of its differences, (k h)^2 / 12 on each axis."""
+    field = plane_waves((17, 17, 17))
+    G = direct_inversion.invert(field, DENSITY)
+    assert np.isfinite(G[0]).sum() == 7**3
+    worst = np.nanmax(np.abs(G / modulus(HERTZ)[:, None, None, None] - 1), axis=(1, 2, 3))
+    assert np.all(worst < 0.5 * (np.abs(2 * np.pi * HERTZ * np.sqrt(DENSITY / modulus(HERTZ)) * H) ** 2))
 
 
 def test_one_component_is_not_enough_for_forces(tmp_path, capsys):

@@ -2,6 +2,8 @@
 
 import argparse
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,14 +63,13 @@ def run(options: argparse.Namespace) -> int:
     field = wave_field.read_waves(
         options.data, options.frequencies, options.mask, options.labels, options.unit, options.spacing
     )
-    if options.noise is not None:
-        field = field._replace(noise=np.full(len(field.frequencies), options.noise))
+    field = wave_field.with_noise(field, options.noise)
     for note in field.notes:
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, FILES)
     organ = _organ(options, field)
     bar, told = cost_bar("steps")
-    with bar:
+    with bar, _forces_that_balance(options.data):
         found = elastography.regions_of(organ, told)
         drawn = None
         if not options.no_map:
@@ -84,6 +85,18 @@ def run(options: argparse.Namespace) -> int:
     files = [name for name in FILES[:-1] if (options.out / name).exists()]
     print(f"written: {options.out}/{', '.join(files)}")
     return 0 if np.all(found.whole.converged) and (found.parts is None or np.all(found.parts.converged)) else 1
+
+
+@contextmanager
+def _forces_that_balance(data: Path) -> Iterator[None]:
+    """One sentence where the equations have no solution."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"{data}: no modulus balances the forces of these waves: look at the mask, the spacing, the units and the "
+            "noise"
+        ) from None
 
 
 def _organ(options: argparse.Namespace, field) -> "Organ":

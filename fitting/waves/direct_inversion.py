@@ -5,14 +5,18 @@ By least squares over the three components and a window of voxels
 
     G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
 
-(Oliphant et al. 2001, Magn. Reson. Med. 45, 299). Noise of laplace(q) is squared below the line, so noise pulls the
-modulus down; and a window over an edge mixes both sides. Both are known faults of the method, and left as they are.
+(Oliphant et al. 2001, Magn. Reson. Med. 45, 299; Papazoglou et al. 2008, Phys. Med. Biol. 53, 3147). Noise of
+laplace(q) is squared below the line, so noise pulls the modulus down; and a window over an edge mixes both sides. Both
+are known faults of the method, and left as they are.
 """
+
+import math
 
 import numpy as np
 from scipy import ndimage
 
 from fitting.waves.wave_field import WaveField
+from liverjax.core.errors import InputError
 
 #: Standard deviation of the Gaussian that smooths displacements before they are differentiated [voxels].
 SMOOTHING = 1.0
@@ -21,14 +25,19 @@ WINDOW = 3
 
 
 def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
-    """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside and where the mask's edge comes into the derivatives.
+    """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside and where the mask's edge comes into derivatives or smoothing.
 
     Args:
         field: three components are needed; NaN everywhere without.
         density: [kg/m^3].
-        smoothing: [voxels] standard deviation of the Gaussian.
+        smoothing: [voxels] standard deviation of the Gaussian; 0 along an axis that is too short for it.
         window: [voxels] an odd number.
     """
+    if not density > 0 or window < 1 or window % 2 == 0 or smoothing < 0:
+        raise InputError(
+            f"density {density:g}, smoothing {smoothing:g}, window {window}: give a density above 0, a smoothing not "
+            "below 0 and an odd window"
+        )
     omega = 2 * np.pi * field.frequencies
     ratios = [_one(field, U, smoothing, window) for U in field.displacement]
     return -density * omega[:, None, None, None] ** 2 * np.stack(ratios)
@@ -36,9 +45,17 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
 
 def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
     inside = field.mask & np.all(np.isfinite(U), axis=-1)
-    # Two derivatives, then one more: each looks one voxel further.
-    whole = ndimage.binary_erosion(inside, np.ones((3, 3, 3)), iterations=2)
-    u = [_smooth(U[..., c], inside, smoothing) for c in range(3)]
+    # A derivative and a second difference look one voxel further each, the Gaussian three of its deviations.
+    reach = [2 + math.ceil(3 * smoothing)] * 3
+    ends = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a))) for a in range(3)]
+    widths = [0.0] * 3
+    for a, found in enumerate(ends):
+        if len(found) and found[-1] - found[0] + 1 > 2 * reach[a]:
+            widths[a] = smoothing
+        else:
+            reach[a] = 2
+    whole = ndimage.binary_erosion(inside, np.ones([2 * n + 1 for n in reach]))
+    u = [_smooth(U[..., c], inside, widths) for c in range(3)]
     d = [np.gradient(c, *field.spacing) if min(c.shape) > 1 else [np.full_like(c, np.nan)] * 3 for c in u]
     curl = (d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1])
     above, below = np.zeros(inside.shape, complex), np.zeros(inside.shape)
@@ -53,13 +70,13 @@ def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.n
     return np.where(whole & (near > 0) & (below > 0), above / np.where(below > 0, below, 1.0), np.nan)
 
 
-def _smooth(u: np.ndarray, inside: np.ndarray, width: float) -> np.ndarray:
-    """Mean of the voxels inside, weighted by a Gaussian."""
-    if width == 0:
-        return np.where(inside, u, 0.0)
-    weight = ndimage.gaussian_filter(inside.astype(float), width)
+def _smooth(u: np.ndarray, inside: np.ndarray, widths: list[float]) -> np.ndarray:
+    """Mean of the voxels inside, weighted by a Gaussian of deviations along the axes."""
     known = np.where(inside, u, 0.0)
-    sums = ndimage.gaussian_filter(known.real, width) + 1j * ndimage.gaussian_filter(known.imag, width)
+    if not any(widths):
+        return known
+    weight = ndimage.gaussian_filter(inside.astype(float), widths)
+    sums = ndimage.gaussian_filter(known.real, widths) + 1j * ndimage.gaussian_filter(known.imag, widths)
     return sums / np.maximum(weight, 1e-12)
 
 

@@ -12,7 +12,19 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 
-NAMES = ("displacement", "real", "imag", "phases", "frequencies", "spacing", "origin", "mask", "labels", "unit")
+NAMES = (
+    "displacement",
+    "real",
+    "imag",
+    "phases",
+    "wrapped",
+    "frequencies",
+    "spacing",
+    "origin",
+    "mask",
+    "labels",
+    "unit",
+)
 HDF5 = (".h5", ".hdf5", ".mat")
 
 
@@ -88,32 +100,35 @@ COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_i
 def _voxel_table(path: Path) -> dict[str, Any]:
     """x, y, z [m], real and imaginary parts, with or without frequency [Hz] and label, on a regular grid."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
-    head = [cell.strip().lower() for cell in lines[0]] if lines else []
+        numbered = [(k, row) for k, row in enumerate(csv.reader(file), 1)]
+    lines = [(k, row) for k, row in numbered if row and not row[0].lstrip().startswith("#")]
+    head = [cell.strip().lower() for cell in lines[0][1]] if lines else []
     missing = [name for name in COLUMNS if name not in head]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, of several, frequency")
     rows = np.full((len(lines) - 1, len(head)), np.nan)
-    for k, row in enumerate(lines[1:]):
+    for k, (number, row) in enumerate(lines[1:]):
         try:
             rows[k, : len(row)] = [float(cell) if cell.strip() else np.nan for cell in row[: len(head)]]
         except ValueError:
             raise InputError(
-                f"{path}: row {k + 2}: {','.join(row)[:40]!r} has a cell that is no number: mend it"
+                f"{path}: row {number}: {','.join(row)[:40]!r} has a cell that is no number: mend it"
             ) from None
     column = dict(zip(head, rows.T, strict=True))
     at, spacing, origin, shape = _grid(path, np.stack([column[a] for a in "xyz"], axis=1))
     hertz, of = (None, np.zeros(len(rows), int))
     if "frequency" in column:
         hertz, of = np.unique(column["frequency"], return_inverse=True)
+    if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
+        raise InputError(f"{path}: a voxel has two rows of one frequency: leave one of them")
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
     found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
     if "label" not in column:
         return found
-    labels = np.zeros(shape, int)
-    labels[tuple(at.T)] = np.nan_to_num(column["label"]).astype(int)
+    labels = np.zeros(shape)
+    labels[tuple(at.T)] = np.nan_to_num(column["label"])
     return found | {"labels": labels}
 
 
@@ -143,9 +158,10 @@ def _nifti(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: NIfTI needs nibabel: pip install 'liverjax[nifti]', or give .npz") from None
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
-    size = np.asarray(image.header.get_zooms()[:3], float) * 1e-3
+    unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm where it is not said
+    size = np.asarray(image.header.get_zooms()[:3], float) * unit
     if not np.iscomplexobj(data):
         return {"labels": data, "spacing": size}
     if data.ndim == 5:
         data = np.moveaxis(data, 3, 0)
-    return {"displacement": data, "spacing": size}
+    return {"displacement": data, "spacing": size, "origin": unit * np.asarray(image.affine)[:3, 3]}
