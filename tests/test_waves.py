@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from fitting import __main__ as command
+from fitting.readers import rheometer
+from fitting.reports import waves_report
 from fitting.waves import balance, direct_inversion, elastography, regions, voxels, wave_field
 from liverjax.core.errors import InputError
 
@@ -279,6 +281,20 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "waves.json").read_text())
     assert again["map"]["chi2_per_component"] <= 1.001 * first["map"]["chi2_per_component"]
     assert "map: chi2" in capsys.readouterr().out
+
+
+def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
+    three = np.array([60.0, 80.0, 100.0])
+    content = {
+        "frequencies_Hz": three.tolist(),
+        "whole": {k: [1.0, 2.0, 3.0] for k in ("storage_Pa", "loss_Pa", "standard_error_Pa")},
+        "regions": None,
+    }
+    field = plane_waves((5, 5, 5))._replace(frequencies=three)
+    waves_report._sweeps(tmp_path, elastography.Organ(field, None, None, None, DENSITY), content)
+    sweep = rheometer.read_sweep(tmp_path / "sweep_whole.csv")
+    np.testing.assert_allclose(sweep.angular_frequency, 2 * np.pi * three)
+    np.testing.assert_allclose(sweep.storage_sd, [1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,8 @@ from liverjax.core.versions import versions
 
 #: chi^2 over the number of equations beyond which something is missing.
 TOO_FAR = 1.5
+#: Frequencies that make a sweep.
+FEWEST = 3
 #: Standard deviations beyond which a voxel of the map is told from the organ's mean.
 TOLD = 3.0
 
@@ -48,6 +50,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "versions": versions(),
     }
     content = numbers(content)
+    _sweeps(out, organ, content)
     (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
     _write_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
@@ -79,6 +82,17 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[dict[str
             }
         )
     return rows
+
+
+def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> None:
+    """A frequency sweep of the whole and of every region, for ``python -m fitting``, where frequencies are enough."""
+    if len(organ.field.frequencies) < FEWEST:
+        return
+    for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
+        columns = [content["frequencies_Hz"], own["storage_Pa"], own["loss_Pa"], *[own["standard_error_Pa"]] * 2]
+        rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
+        rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
+        (out / f"sweep_{name}.csv").write_text("\n".join(rows) + "\n")
 
 
 def _by_label(organ: Organ, found: Found) -> dict[str, Any] | None:
