@@ -56,7 +56,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Find moduli; 1 if a fit did not converge."""
-    _refuse(options)
+    _check_waves(options)
     from fitting.reports import waves_report
     from fitting.waves import direct_inversion, elastography, stiffness_map, wave_field
 
@@ -121,7 +121,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
     return elastography.organ_of(coarse, body, options.density)
 
 
-def _refuse(options: argparse.Namespace) -> None:
+def _check_waves(options: argparse.Namespace) -> None:
     """Refuse numbers that no measurement has."""
     for name in ("length", "noise"):
         value = getattr(options, name)
