@@ -1,16 +1,19 @@
-"""``python -m fitting SWEEP.csv …``, ``… relaxation | creep | indentation FILE``, ``… curves | field | waves …``."""
+"""``python -m fitting SWEEP.csv …``, and other tests: ``… curves | field | relaxation | creep | … | waves FILE …``."""
 
 import importlib
 import sys
 
 from liverjax.commands.exit_codes import exit_code
 
+#: Of their own files; everything else is a frequency sweep.
+COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude", "waves")
+
 
 def main(arguments: list[str] | None = None, prog: str = "python -m fitting") -> int:
     """Entry point; returns the exit code: 0 done, 1 not converged, 2 unusable input."""
     arguments = sys.argv[1:] if arguments is None else arguments
     name = "sweep"
-    if arguments[:1] in (["curves"], ["field"], ["relaxation"], ["creep"], ["indentation"], ["waves"]):
+    if arguments[:1] and arguments[0] in COMMANDS:
         name, arguments = arguments[0], arguments[1:]
         prog = f"{prog} {name}"
     command = importlib.import_module(f"fitting.commands.{name}")  # the others stay unloaded, for a quick start

@@ -1,0 +1,1 @@
+"""Strain sweeps: moduli that change with the amplitude of an oscillation, and the law behind them."""

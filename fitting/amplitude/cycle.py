@@ -1,0 +1,101 @@
+"""One steady cycle of large shear: storage and loss modulus of the first harmonic, and how large the third is.
+
+The sample is incompressible and isotropic, and keeps its strain energy function W; the part of the second
+Piola-Kirchhoff stress S that W gives relaxes with a memory that no strain changes (chapter, section 4.2). In simple
+shear of amount g(t) = a sin(wt) the shear stress is S12 + g S22, whatever the pressure is. S is a sum of harmonics of
+w, and the memory multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates every ring of the sample is in
+simple shear of its own amount (a universal deformation: Rivlin 1949), so the torque is a sum over rings; a rheometer
+reads it as if the sample were linear.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.laws.base import Law
+from liverjax.laws.terms.stretch_terms import stress_at_constant
+from liverjax.tensors.matrices import pack, unpack
+
+#: Instants of a cycle, and rings between plates (Gauss' points). Stresses of harmonics beyond the 15th are left out.
+INSTANTS, RINGS = 32, 8
+#: Shears at which the law is asked: S12/g and S22 are even in g, and polynomials of g^2 lie between.
+ASKED = 24
+
+
+class Reading(NamedTuple):
+    """What turns stresses at `ASKED` shears into what a rheometer reads; the same for every law."""
+
+    shears: np.ndarray  # (K,) above 0
+    F: jax.Array  # (K, 3, 3)
+    harmonics: jax.Array  # (M, 2, A, 2, K) complex: memories, harmonic 1 or 3, amplitudes, S12/g or S22, shears
+
+
+def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
+    """Of cycles of amplitudes at the rim.
+
+    Args:
+        strains: (A,).
+        memories: m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n); what is read is linear in it.
+        plates: parallel, or cone, between which the strain is the same everywhere.
+    """
+    rho, weights = _radii_and_weights(plates)
+    own = np.asarray(strains)[:, None] * rho
+    shear = own[..., None] * np.sin(2 * np.pi * np.arange(INSTANTS) / INSTANTS)
+    squares = 0.5 * np.max(own) ** 2 * (1 + np.cos(np.pi * (np.arange(ASKED) + 0.5) / ASKED))
+    lines = _lagrange(squares, shear**2)  # (A, R, T, K)
+    out = np.empty((len(memories), 2, len(own), 2, ASKED), complex)
+    for c, S in enumerate((shear[..., None] * lines, lines)):
+        spectrum = np.fft.rfft(S, axis=-2)
+        for k, memory in enumerate(memories):
+            relaxed = np.fft.irfft(spectrum * memory[:, None], INSTANTS, axis=-2)
+            stress = relaxed if c == 0 else shear[..., None] * relaxed
+            found = 2j * np.fft.rfft(stress, axis=-2) / INSTANTS / own[..., None, None]
+            out[k, :, :, c] = np.einsum("r,arhk->hak", weights, found[..., [1, 3], :])
+    F = np.tile(np.eye(3), (ASKED, 1, 1))
+    F[:, 0, 1] = np.sqrt(squares)
+    return Reading(np.sqrt(squares), jnp.asarray(F), jnp.asarray(out))
+
+
+def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
+    """Radii over that of the rim, and weights of their moduli."""
+    if plates == "cone":
+        return np.ones(1), np.ones(1)
+    x, w = np.polynomial.legendre.leggauss(RINGS)
+    rho = 0.5 * (1 + x)
+    return rho, 0.5 * w * 4 * rho**3  # 2 M / (pi R^3) over the strain at the rim, ring by ring
+
+
+def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values (..., K) of Lagrange's polynomials of Chebyshev's nodes (K,) (barycentric; Berrut, Trefethen 2004)."""
+    k = np.arange(len(nodes))
+    w = (-1.0) ** k * np.sin(np.pi * (k + 0.5) / len(nodes))
+    off = at[..., None] - nodes
+    exact = off == 0
+    terms = w / np.where(exact, 1.0, off)
+    values = terms / terms.sum(axis=-1, keepdims=True)
+    return np.where(exact.any(axis=-1, keepdims=True), exact, values)
+
+
+def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Complex modulus of the first harmonic (A,) [Pa], and amplitude of the third over the first (A,).
+
+    Args:
+        law: of the instantaneous stress; a volumetric energy has no part in it.
+        r: `reading`.
+        shares: of the memories (M,).
+    """
+    S = _instantaneous_stress(law, r.F)
+    asked = jnp.stack([S[:, 0, 1] / r.shears, S[:, 1, 1]])
+    first, third = jnp.einsum("m,mhack,ck->ha", shares, r.harmonics, asked)
+    return first, jnp.abs(third) / jnp.abs(first)
+
+
+def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
+    """S (K, 3, 3) of the isochoric energy, for F that is data."""
+    split = law.isochoric_part()
+    if split is not None and split.stretch_energy is not None:
+        return pack(stress_at_constant(split, unpack(F)))
+    inverse = F.at[:, 0, 1].multiply(-1.0)  # of a simple shear
+    return inverse @ (law if split is None else split).first_piola(F)

@@ -1,0 +1,139 @@
+"""Hyperelastic laws from strain sweeps: least squares of the first harmonic from many starts."""
+
+import json
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.amplitude import cycle
+from fitting.amplitude.strain_sweep import StrainSweep
+from fitting.fits.stress_stretch import STARTS, Candidate, LawFit, assessed
+from fitting.methods.generalised_maxwell import Maxwell, moduli
+from fitting.methods.least_squares import levenberg_marquardt
+from fitting.readers.curves import Curve
+from liverjax.core.errors import InputError
+from liverjax.laws import Law
+
+#: A loss tangent that changes by more than this part over the sweep is no memory that strain leaves as it is.
+CHANGED = 0.2
+
+
+class Memory(NamedTuple):
+    """What is left of each harmonic n: m(nw) of a Prony series; without one, 1 but for the loss of one tangent."""
+
+    series: Maxwell | None = None
+
+    def of(self, omega: float) -> np.ndarray:
+        """m(nw) (1, n) of the series; or (2, n), of which the second counts by the loss tangent."""
+        n = np.arange(cycle.INSTANTS // 2 + 1)
+        if self.series is None:
+            return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
+        storage, loss = moduli(self.series, omega * n)
+        return np.asarray(storage + 1j * loss)[None] / self.series.shear_modulus
+
+
+class StrainFit(NamedTuple):
+    """A law, and what it makes of the sweep."""
+
+    law: LawFit
+    storage: np.ndarray  # (n,) [Pa]
+    loss: np.ndarray  # (n,) [Pa]
+    third: np.ndarray  # (n,) amplitude of the torque's third harmonic over the first
+
+
+def memory_from(path: Path) -> Memory:
+    """The Prony series of a fit.json that a frequency sweep has left.
+
+    Raises:
+        InputError: no such file, or one without a series.
+    """
+    try:
+        held = json.loads(path.read_text())
+        model = Maxwell(
+            float(held["shear_modulus"]), np.asarray(held["ratios"], float), np.asarray(held["relaxation_times"], float)
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path} is no fit.json of a frequency sweep ({type(error).__name__}): make one first"
+        ) from None
+    return Memory(model)
+
+
+def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
+    """Least squares of the relative misfit of G* at all amplitudes, the best of many starts.
+
+    Without a Prony series the loss tangent is one more number, and the modulus is that of the frequency.
+    """
+    own = candidate if memory.series is not None else with_loss_tangent(candidate)
+    memories = memory.of(sweep.angular_frequency)
+    r = cycle.reading(sweep.strain, memories, plates)
+    measured = sweep.storage + 1j * sweep.loss
+    scale = float(np.abs(measured[0]) / np.abs(memories[0, 1]))
+
+    def model(u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        values = own.values(u, scale)
+        shares = jnp.ones(1) if memory.series is not None else jnp.stack([jnp.ones(()), values[-1]])
+        return cycle.first_and_third(own.law(values), r, shares)
+
+    def residuals(u: jax.Array) -> jax.Array:
+        ratio = model(u)[0] / measured - 1
+        return jnp.concatenate([ratio.real, ratio.imag])
+
+    begin = time.perf_counter()
+    points = jnp.asarray(own.random(np.random.default_rng(0), STARTS))
+    program = jax.jit(jax.vmap(lambda u: levenberg_marquardt(residuals, u))).lower(points).compile()
+    compiled = time.perf_counter()
+    found = jax.block_until_ready(program(points))
+    times = (time.perf_counter() - compiled, compiled - begin)
+    law = assessed(own, _as_curves(sweep), found, scale, times)
+    best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
+    G, third = (np.asarray(v) for v in model(best))
+    return StrainFit(law, G.real, G.imag, third)
+
+
+def with_loss_tangent(candidate: Candidate) -> Candidate:
+    """The candidate with one more number, the tangent of the loss angle."""
+
+    def values(u: jax.Array, scale: object) -> jax.Array:
+        return jnp.concatenate([candidate.values(u[:-1], scale), u[-1:]])
+
+    def law(p: jax.Array) -> Law:
+        return candidate.law(p[:-1])
+
+    def random(rng: np.random.Generator, n: int) -> np.ndarray:
+        return np.column_stack([candidate.random(rng, n), rng.uniform(0.05, 0.5, n)])
+
+    return candidate._replace(
+        names=(*candidate.names, "loss_tangent"), units=(*candidate.units, "1"), values=values, law=law, random=random
+    )
+
+
+def _as_curves(sweep: StrainSweep) -> list[Curve]:
+    """The two moduli at the shear of the rim, for what is said of a fit."""
+    F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
+    F[:, 0, 1] = sweep.strain
+    return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
+
+
+def said_of(sweep: StrainSweep, best: StrainFit) -> list[str]:
+    """What a reader of the fit must know: sentences."""
+    told = list(best.law.warnings)
+    tangents = sweep.loss / sweep.storage
+    change = tangents[-1] / tangents[0] - 1
+    if abs(change) > CHANGED:
+        told.append(
+            f"the loss tangent changes by {100 * change:+.0f} % over the sweep: no law whose memory is the same at all "
+            "strains does that; fit the part before it changes (--max-strain)"
+        )
+    if np.sqrt(np.mean(np.abs((best.storage + 1j * best.loss) / (sweep.storage + 1j * sweep.loss) - 1) ** 2)) > 0.05:
+        told.append("the law misses the moduli by more than 5 % on average: it does not describe this sweep")
+    if sweep.storage[-1] < 0.8 * sweep.storage[0]:
+        told.append(
+            "the storage modulus falls with strain: tissue that slips, yields or tears does so too, and a hyperelastic "
+            "law that follows it is only a description"
+        )
+    return told

@@ -1,0 +1,81 @@
+"""A strain sweep from a file: moduli against the amplitude of the strain, at one frequency."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers.rheometer import MODULUS_UNITS
+from fitting.readers.sweep_columns import FREQUENCY_UNITS, is_angular
+from fitting.readers.sweep_tables import Table, tables_of
+from fitting.readers.text_tables import text_of
+from liverjax.core.errors import InputError
+
+FEWEST_POINTS, LARGEST_STRAIN = 4, 10.0
+
+
+class StrainSweep(NamedTuple):
+    """Moduli of the first harmonic at growing strain."""
+
+    strain: np.ndarray  # (n,) amplitude at the rim [1]
+    storage: np.ndarray  # (n,) [Pa]
+    loss: np.ndarray  # (n,) [Pa]
+    angular_frequency: float  # [rad/s]
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | None = None) -> StrainSweep:
+    """Read a strain sweep: text, CSV or workbook with frequency, storage and loss modulus, and the strain's amplitude.
+
+    Args:
+        path: of the file; a strain column is named strain, with % or 1 as its unit.
+        table: name, or a part of it, of one of several tables.
+        max_strain: points of larger strain [1] are left out.
+
+    Raises:
+        InputError: no table with a strain, several frequencies, too few points.
+    """
+    found = [t for t in tables_of(str(path), text_of(path).splitlines()) if "strain" in t.raw]
+    if table is not None:
+        found = [t for t in found if table.lower() in t.name.lower()]
+    if not found:
+        raise InputError(f"{path}: no table{f' {table!r}' if table else ''} has a column strain in % or 1: add it")
+    chosen = max(found, key=lambda t: np.ptp(np.log(np.maximum(t.raw["strain"], 1e-12))))
+    omega = _column_in_si(path, chosen, "frequency")
+    G = [_column_in_si(path, chosen, quantity) for quantity in ("storage", "loss")]
+    strain = chosen.raw["strain"]
+    good = np.isfinite(strain) & (strain > 0) & np.isfinite(G[0]) & np.isfinite(G[1]) & (G[0] > 0) & (G[1] > 0)
+    kept = good & (strain <= (np.inf if max_strain is None else max_strain))
+    notes = [f"{(~good).sum()} points without a positive strain or modulus are left out"] if not good.all() else []
+    if good.sum() > kept.sum():
+        notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as asked for")
+    if len(np.unique(strain[kept])) < FEWEST_POINTS:
+        raise InputError(f"{path}: {kept.sum()} points of strain are left: give {FEWEST_POINTS} or more")
+    if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
+        low, high = omega[kept].min() / 2 / np.pi, omega[kept].max() / 2 / np.pi
+        raise InputError(
+            f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a sweep of the strain alone"
+        )
+    if strain[kept].max() > LARGEST_STRAIN:
+        raise InputError(f"{path}: a strain of {strain[kept].max():g} is none: write it in %, or as a part of 1")
+    order = np.argsort(strain[kept], kind="stable")
+    return StrainSweep(
+        strain[kept][order],
+        G[0][kept][order],
+        G[1][kept][order],
+        float(omega[kept].mean()),
+        str(path),
+        tuple(notes),
+    )
+
+
+def _column_in_si(path: Path, table: Table, quantity: str) -> np.ndarray:
+    j = next(k for k, c in enumerate(table.columns) if c.quantity == quantity)
+    column = table.columns[j]
+    units = FREQUENCY_UNITS if quantity == "frequency" else MODULUS_UNITS
+    plain = ("rad/s" if is_angular(column) else "hz") if quantity == "frequency" else "Pa"
+    unit = plain if column.unit is None else column.unit.lower() if quantity == "frequency" else column.unit
+    if unit not in units:
+        raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known: use {', '.join(units)}")
+    return units[unit] * np.asarray(table.rows)[:, j]

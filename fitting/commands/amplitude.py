@@ -1,0 +1,58 @@
+"""``python -m fitting amplitude LAW SWEEP``: a hyperelastic law from a strain sweep of a rheometer."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fitting.commands.exit_codes import EXIT_CODES
+from liverjax.core.errors import InputError
+from liverjax.core.files import writable
+
+
+def parser(prog: str) -> argparse.ArgumentParser:
+    """Options of the command, which --help calls `prog`."""
+    command = argparse.ArgumentParser(
+        prog=prog,
+        description="Fit the numbers of a hyperelastic law to moduli that change with the amplitude of the strain, at "
+        "one frequency, and show the third harmonic that the law foretells.",
+        epilog=EXIT_CODES,
+    )
+    command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
+    command.add_argument(
+        "sweep", type=Path, metavar="SWEEP", help="frequency, moduli and strain: CSV, text or workbook"
+    )
+    command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="of Ogden's law (default 1, 2 and 3)")
+    command.add_argument("--model", type=Path, metavar="fit.json", help="Prony series of a frequency sweep")
+    command.add_argument("--plates", choices=("parallel", "cone"), default="parallel", help="default parallel")
+    command.add_argument("--max-strain", type=float, metavar="X", help="leave out points above it; 0.1 is 10 %%")
+    command.add_argument("--table", metavar="NAME", help="of a file with several tables: a part of its name")
+    command.add_argument("--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results")
+    return command
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit one law, or all; 1 if the best fit did not converge."""
+    if options.max_strain is not None and not options.max_strain > 0:
+        raise InputError(f"--max-strain {options.max_strain:g} must be above 0: give e.g. 0.1 for 10 %")
+    from tqdm import tqdm
+
+    from fitting.amplitude import law_fit
+    from fitting.amplitude.strain_sweep import read_strain_sweep
+    from fitting.fits import stress_stretch
+    from fitting.reports import amplitude_report
+
+    candidates = stress_stretch.candidates(options.law, options.terms)
+    sweep = read_strain_sweep(options.sweep, options.table, options.max_strain)
+    memory = law_fit.Memory() if options.model is None else law_fit.memory_from(options.model)
+    for note in [*sweep.notes, *(n for candidate in candidates for n in candidate.notes)]:
+        print(f"note: {note}", file=sys.stderr)
+    writable(options.out, ("fit.json", "fit.png"))
+    bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
+    fits = [law_fit.fit_law(candidate, sweep, memory, options.plates) for candidate in bar]
+    fits.sort(key=lambda f: f.law.aicc)
+    content = amplitude_report.write(options.out, sweep, fits)
+    print(amplitude_report.table(sweep, fits))
+    for sentence in content["warnings"]:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"written: {options.out}/fit.json, fit.png")
+    return 0 if fits[0].law.converged else 1

@@ -1,0 +1,69 @@
+"""What a fit of a strain sweep leaves behind: fit.json, fit.png, and a table on the terminal."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.amplitude.law_fit import StrainFit, said_of
+from fitting.amplitude.strain_sweep import StrainSweep
+from fitting.reports import curves_report
+from fitting.reports.sweep_report import numbers
+from liverjax.core.plotting import BLUE, COLOURS, ORANGE, pyplot, save
+from liverjax.core.versions import versions
+
+
+def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> dict[str, Any]:
+    """fit.json and fit.png in the folder `out`, which exists; the best fit comes first."""
+    content = {
+        "error_is": "root mean square of the relative misfit of G' and G''",
+        "data": sweep.source,
+        "notes": list(sweep.notes),
+        "frequency_Hz": sweep.angular_frequency / (2 * np.pi),
+        "strain": sweep.strain.tolist(),
+        "laws": [
+            curves_report.summary(f.law)
+            | {
+                "storage_Pa": f.storage.tolist(),
+                "loss_Pa": f.loss.tolist(),
+                "third_harmonic_over_first": f.third.tolist(),
+            }
+            for f in fits
+        ],
+        "warnings": said_of(sweep, fits[0]),
+        "versions": versions(),
+    }
+    content = numbers(content)
+    (out / "fit.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    save(figure(sweep, fits), out / "fit.png")
+    return content
+
+
+def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
+    """The laws, the best first, and the third harmonic of the best at the largest strain."""
+    most, third = 100 * sweep.strain[-1], 100 * fits[0].third[-1]
+    said = f"{fits[0].law.label}: at a strain of {most:.3g} % the third harmonic is {third:.2g} % of the first"
+    return "\n".join([curves_report.table([f.law for f in fits]), said])
+
+
+def figure(sweep: StrainSweep, fits: list[StrainFit]) -> Any:
+    """Moduli against strain with the best laws on the left, the third harmonics that they foretell on the right."""
+    fig = pyplot().figure(figsize=(10, 4.2), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    percent = 100 * sweep.strain
+    left.plot(percent, sweep.storage, "o", color=BLUE, ms=4, mfc="none", label="G' measured")
+    left.plot(percent, sweep.loss, "s", color=ORANGE, ms=4, mfc="none", label="G'' measured")
+    for k, f in enumerate(fits[:4]):
+        style, width = ("-", 1.4) if k == 0 else ("--", 0.9)
+        name = f"{f.law.label}, {100 * f.law.mean_relative_error:.2g} %"
+        left.plot(percent, f.storage, style, color=COLOURS[k % len(COLOURS)], lw=width, label=name)
+        left.plot(percent, f.loss, style, color=COLOURS[k % len(COLOURS)], lw=width)
+        right.plot(percent, 100 * f.third, style, color=COLOURS[k % len(COLOURS)], lw=width, label=f.law.label)
+    left.set(xscale="log", yscale="log", xlabel="strain at the rim [%]", ylabel="modulus of the first harmonic [Pa]")
+    right.set(xscale="log", yscale="log", xlabel="strain at the rim [%]", ylabel="third harmonic over the first [%]")
+    right.set_ylim(bottom=1e-4)  # what is below is roundoff, or what no instrument sees
+    for axes in (left, right):
+        axes.legend(fontsize=8, frameon=False)
+        axes.grid(alpha=0.3)
+    return fig

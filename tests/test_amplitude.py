@@ -1,0 +1,186 @@
+"""Strain sweeps: the cycle against closed forms and a run in time, recovery of laws, files, the command."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting import __main__ as command
+from fitting.amplitude import cycle, law_fit, strain_sweep
+from fitting.fits import stress_stretch
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers import rheometer
+from liverjax.core.errors import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+STRAIN = np.geomspace(0.01, 0.8, 12)
+ELASTIC = np.ones((1, cycle.INSTANTS // 2 + 1), complex)
+ONE = jnp.ones(1)
+
+
+@pytest.mark.parametrize("plates, mean, mean_third", [("cone", 0.75, 0.25), ("parallel", 0.5, 1 / 6)])
+def test_a_cubic_stress_has_the_textbooks_harmonics(plates, mean, mean_third, verified):
+    """Yeoh's law to its second term: stress 2 c1 g + 4 c2 g^3, sin^3 = (3 sin - sin 3)/4, rings by r^5."""
+    law = lj.laws.Yeoh(c1=jnp.asarray(400.0), c2=jnp.asarray(150.0), c3=jnp.asarray(0.0), bulk=None)
+    first, third = cycle.first_and_third(law, cycle.reading(STRAIN, ELASTIC, plates), ONE)
+    exact = 800 + 600 * mean * STRAIN**2
+    np.testing.assert_allclose(first, exact, rtol=1e-9)
+    np.testing.assert_allclose(third, 600 * mean_third * STRAIN**2 / exact, rtol=1e-6, atol=1e-12)
+    error = float(np.abs(np.asarray(first) / exact - 1).max())
+    verified(f"moduli of a cubic stress at large amplitude, {plates} plates", "closed form", error, 1e-9)
+
+
+def test_a_neo_hookean_sample_shows_no_amplitude_and_its_own_moduli():
+    """Elastic stress linear in the shear. A memory of the second Piola-Kirchhoff stress adds terms of the square."""
+    prony = Maxwell(1000.0, np.array([0.4]), np.array([0.3]))
+    memories = law_fit.Memory(prony).of(5.0)
+    law = lj.laws.NeoHookean(mu=jnp.asarray(1000.0), bulk=None)
+    r = cycle.reading(np.array([1e-4, 0.2]), memories)
+    first, third = cycle.first_and_third(law, r, ONE)
+    exact = 1000 * (1 - 0.4 / (1 + 1.5j))
+    assert abs(complex(first[0]) / exact - 1) < 1e-7 and third[0] < 1e-7
+    elastic, _ = cycle.first_and_third(law, cycle.reading(np.array([1e-4, 0.2]), ELASTIC), ONE)
+    np.testing.assert_allclose(elastic, 1000.0, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_run_in_time_comes_to_it(verified):
+    """A block whose nodes all shear, with memory: the force of its upper face over the third cycle, order 2 in dt."""
+    omega, amplitude, tau = 2 * np.pi, 0.6, 0.05
+    mesh = lj.shapes.box((0.01, 0.01, 0.01), (1, 1, 1))
+    law = lj.laws.Yeoh(c1=400.0, c2=150.0, c3=0.0, bulk=5000.0)
+    memories = law_fit.Memory(Maxwell(800.0, np.array([0.5]), np.array([tau]))).of(omega)
+    exact, third = cycle.first_and_third(
+        lj.laws.Yeoh(c1=jnp.asarray(400.0), c2=jnp.asarray(150.0), c3=jnp.asarray(0.0), bulk=None),
+        cycle.reading(np.array([amplitude]), memories, "cone"),
+        ONE,
+    )
+    errors = []
+    for per_cycle in (40, 80):
+        n = 3 * per_cycle
+        times = np.arange(n + 1) / per_cycle
+        way = jnp.asarray(np.asarray(mesh.points)[:, 2:] * np.array([1.0, 0.0, 0.0]))
+        history = jnp.asarray(amplitude * np.sin(omega * times))
+        scene = lj.Scene(
+            mesh=mesh,
+            law=law,
+            viscosity=lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([tau]), part="isochoric"),
+            displaced=(
+                lj.Displaced(nodes=jnp.arange(mesh.number_of_nodes), by=way, times=jnp.asarray(times), history=history),
+            ),
+            solve=lj.Solve(dt=1 / per_cycle, steps=n),
+        )
+        top = np.asarray(mesh.node_sets["z_max"])
+        force = np.asarray(lj.simulate(scene).check().reactions)[:, top, 0].sum(axis=1) / 1e-4
+        last, phase = force[-per_cycle:], np.exp(-1j * omega * times[-per_cycle:])
+        found = 2j * np.mean(last * phase) / amplitude
+        errors.append(abs(found / complex(exact[0]) - 1))
+        own_third = abs(2 * np.mean(last * phase**3)) / amplitude / abs(found)
+    order = np.log2(errors[0] / errors[1])
+    assert 1.8 < order < 2.2 and errors[1] < 2e-3
+    assert own_third == pytest.approx(float(third[0]), rel=0.02)
+    verified("first harmonic of large shear with memory", "run in time", errors[1], 2e-3, float(order))
+
+
+def written(path, law, memories, noise=0.0, shares=ONE, strain=STRAIN):
+    """A CSV of a sweep at 1 Hz whose strains are in per cent."""
+    first, _ = cycle.first_and_third(law, cycle.reading(strain, memories), shares)
+    G = np.asarray(first) * (1 + noise * np.random.default_rng(2).normal(size=(2, len(strain))))[0]
+    rows = ["frequency_Hz,strain_%,storage_modulus_Pa,loss_modulus_Pa"]
+    rows += [f"1.0,{100 * s!r},{g.real!r},{g.imag!r}" for s, g in zip(strain.tolist(), G.tolist(), strict=True)]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tanned():
+    """A stiffening law and a loss tangent of 0.2."""
+    law = lj.laws.FungDemiray(c1=jnp.asarray(900.0), c2=jnp.asarray(1.5), bulk=None)
+    return law, law_fit.Memory().of(2 * np.pi), jnp.array([1.0, 0.2])
+
+
+def test_a_law_and_its_loss_come_back(tmp_path, tanned):
+    law, memories, shares = tanned
+    sweep = strain_sweep.read_strain_sweep(written(tmp_path / "a.csv", law, memories, 0.0, shares))
+    np.testing.assert_allclose(sweep.strain, STRAIN, rtol=1e-12)
+    assert sweep.angular_frequency == pytest.approx(2 * np.pi)
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    found = law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")
+    np.testing.assert_allclose(found.law.values, [900, 1.5, 0.2], rtol=1e-5)
+    noisy = strain_sweep.read_strain_sweep(written(tmp_path / "b.csv", law, memories, 0.02, shares))
+    found = law_fit.fit_law(candidate, noisy, law_fit.Memory(), "parallel").law
+    assert np.all(np.abs(found.values - [900, 1.5, 0.2]) < 4 * found.standard_errors + 1e-12)
+    assert found.mean_relative_error < 0.03
+    other = law_fit.fit_law(candidate, sweep, law_fit.Memory(), "cone").law  # with the wrong plates another law
+    assert abs(other.values[1] / 1.5 - 1) > 0.1
+
+
+def test_the_command_fits_with_the_series_of_a_sweep(tmp_path, capsys):
+    law = lj.laws.FungDemiray(c1=jnp.asarray(900.0), c2=jnp.asarray(1.5), bulk=None)
+    series = {"shear_modulus": 2000.0, "ratios": [0.5], "relaxation_times": [0.1]}
+    (tmp_path / "fit.json").write_text(json.dumps(series))
+    memories = law_fit.memory_from(tmp_path / "fit.json").of(2 * np.pi)
+    file = written(tmp_path / "sweep.csv", law, memories)
+    out = tmp_path / "out"
+    options = ["--model", str(tmp_path / "fit.json"), "--max-strain", "0.7", "--out", str(out)]
+    assert command.main(["amplitude", "fung_demiray", str(file), *options]) == 0
+    said = capsys.readouterr()
+    assert "third harmonic" in said.out and "left out as asked for" in said.err
+    content = json.loads((out / "fit.json").read_text())
+    (own,) = content["laws"]
+    assert own["parameters"]["c1"] == pytest.approx(900, rel=1e-4) and len(own["third_harmonic_over_first"]) == 11
+    assert (out / "fit.png").stat().st_size > 10_000
+
+
+def test_what_no_law_follows_is_said(tmp_path, tanned):
+    """A sample that yields: the modulus falls and the loss tangent rises."""
+    law, memories, shares = tanned
+    sweep = strain_sweep.read_strain_sweep(written(tmp_path / "a.csv", law, memories, 0.0, shares))
+    falls = 1 / (1 + (STRAIN / 0.1) ** 2)
+    sweep = sweep._replace(storage=1000 * falls, loss=np.full(len(STRAIN), 100.0))
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    told = " ".join(law_fit.said_of(sweep, law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")))
+    assert "the loss tangent changes" in told and "misses the moduli" in told and "slips, yields or tears" in told
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (("strain_%", "strein"), "has a column strain"),
+        (("strain_%", "strain_mm"), "has a column strain"),
+        (("\n1.0,", "\n2.0,"), None),
+        (("storage_modulus_Pa", "storage_modulus_psi"), "psi"),
+    ],
+)
+def test_files_that_are_no_strain_sweep_get_a_sentence(tmp_path, tanned, change, words):
+    law, memories, shares = tanned
+    path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
+    path.write_text(path.read_text().replace(*change))
+    if words is None:  # another frequency throughout is a sweep too
+        assert strain_sweep.read_strain_sweep(path).angular_frequency == pytest.approx(4 * np.pi)
+        return
+    with pytest.raises(InputError, match=words) as told:
+        strain_sweep.read_strain_sweep(path)
+    assert "\n" not in str(told.value)
+
+
+def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
+    law, memories, shares = tanned
+    path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
+    assert rheometer.tables_of(str(path), path.read_text().splitlines())[0].raw["strain"][0] == pytest.approx(0.01)
+    lines = path.read_text().splitlines()
+    lines[3] = lines[3].replace("1.0,", "3.0,", 1)
+    (tmp_path / "two.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match="a sweep of the strain alone"):
+        strain_sweep.read_strain_sweep(tmp_path / "two.csv")
+    with pytest.raises(InputError, match="points of strain are left"):
+        strain_sweep.read_strain_sweep(path, max_strain=0.012)
+    (tmp_path / "per_cent.csv").write_text(path.read_text().replace("strain_%", "strain_1"))
+    with pytest.raises(InputError, match="write it in %"):
+        strain_sweep.read_strain_sweep(tmp_path / "per_cent.csv")
+    assert command.main(["amplitude", "fung_demiray", str(path), "--max-strain", "-1"]) == 2
+    assert command.main(["amplitude", "fung_demiray", str(path), "--model", str(path), "--out", str(tmp_path)]) == 2
+    assert "is no fit.json" in capsys.readouterr().err
