@@ -1,9 +1,9 @@
-"""``liverjax simulate | sweep | reduce | design | laws | check | plot | fit``, the same as ``python -m liverjax …``."""
+"""``liverjax simulate | sweep | reduce | design | laws | check | plot | play | fit``, or ``python -m liverjax …``."""
 
 import argparse
 import sys
 
-from liverjax.commands import check, design, fit, laws, plot, reduce, simulate, sweep
+from liverjax.commands import check, design, fit, laws, play, plot, reduce, simulate, sweep
 from liverjax.commands.exit_codes import exit_code
 
 
@@ -14,7 +14,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
         epilog="Exit code 0: done; 1: a check or a step failed; 2: unusable input.",
     )
     parsers = parser.add_subparsers(dest="command", required=True)
-    for command in (simulate, sweep, reduce, design, laws, check, plot, fit):
+    for command in (simulate, sweep, reduce, design, laws, check, plot, play, fit):
         command.add(parsers)
     return parser
 

@@ -1,0 +1,139 @@
+"""A scene that is run step by step, while a spring pulls at one of its nodes.
+
+The spring is a `Ligament` whose numbers change from step to step, so that one compiled program serves all pulls.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.compiled import compiled
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.mesh.selection import boundary_triangles
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.equations import State, initial_state
+from liverjax.simulation.run import prepared, simulate_part
+
+#: A run without end.
+STEPS = 10**9
+#: A spring this slack, over the size of the body, has a direction wherever its end is.
+SLACK = 1e-3
+#: Of no pull, over the stiffness of a pull.
+NOTHING = 1e-12
+
+
+class Playing(NamedTuple):
+    """A body at one instant, and the program of its next step."""
+
+    scene: Scene
+    program: Callable[..., Any]
+    state: State
+    step: int  # finished ones
+    size: float  # diagonal of the body's box [m]
+    nodes: np.ndarray  # (n,) of the surface: numbers in the mesh
+    triangles: np.ndarray  # (m, 3) numbers in `nodes`
+    positions: np.ndarray  # (V, 3) [m]
+    code: int = status.CONVERGED  # of the last step
+
+    @property
+    def time(self) -> float:
+        """Of the body [s]; of a scene without time the number of the step."""
+        dt = self.scene.solve.dt
+        return self.step * (1.0 if dt is None else float(dt))
+
+    @property
+    def stiffness(self) -> float:
+        """Of a spring that is felt and does not tear [N/m]: shear modulus times a twentieth of the size."""
+        return float(np.mean(np.asarray(self.scene.law.shear_modulus()))) * self.size / 20
+
+
+def at_rest(scene: Scene) -> Playing:
+    """The body at rest in its reference shape, and its compiled program.
+
+    Raises:
+        InputError: a harmonic scene, or what `simulate` refuses.
+    """
+    if scene.solve.kind == "harmonic":
+        raise InputError("[solve] kind = 'harmonic' has no time: play with a static or a dynamic scene")
+    points = np.asarray(scene.mesh.points)
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    spring = Ligament(
+        nodes=jnp.zeros((1, 1), jnp.int32),
+        weights=jnp.ones((1, 1)),
+        to=jnp.asarray(points[0] + size),
+        stiffness=jnp.asarray(NOTHING),
+        rest_length=jnp.asarray(SLACK * size),
+    )
+    solve = replace(scene.solve, reduced="")
+    scene = prepared(replace(scene, physics=(*scene.physics, spring), solve=solve))
+    state = initial_state(scene) if scene.solve.dt is not None else _after_load_steps(scene)
+    scene = replace(scene, solve=replace(scene.solve, steps=STEPS))
+    program = compiled(partial(simulate_part, count=1), scene, state, 1.0)
+    nodes, triangles = np.unique(boundary_triangles(scene.mesh), return_inverse=True)
+    return Playing(scene, program, state, 0, size, nodes, triangles.reshape(-1, 3), np.asarray(state.x))
+
+
+def _after_load_steps(scene: Scene) -> State:
+    """The body after all load steps of a scene without time."""
+    count = scene.solve.steps
+    program = compiled(partial(simulate_part, count=count), scene, initial_state(scene), 1.0)
+    result, state = program(scene, initial_state(scene), 1.0)
+    for step, code in enumerate(np.asarray(result.status), 1):
+        if code not in (status.CONVERGED, status.ONE_STEP):
+            raise InputError(f"load step {step} of {count}, before anyone pulls: {status.advice(code)}")
+    return state
+
+
+def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = None, stiffness: float = 0.0) -> Playing:
+    """The body a step later; where the step fails, as it was, with the code of the failure.
+
+    Args:
+        playing: the body before.
+        node: number in the mesh of the node that is pulled; None: no pull.
+        to: end of the spring (3,) [m].
+        stiffness: of the spring [N/m].
+
+    Raises:
+        InputError: no such node, a place or a stiffness that is no number.
+    """
+    *others, spring = playing.scene.physics
+    if node is None:
+        spring = replace(spring, stiffness=jnp.asarray(NOTHING * playing.stiffness))
+    else:
+        end = _end_of_spring(playing, node, to, stiffness)
+        off = playing.positions[node] - end
+        if np.linalg.norm(off) < 0.5 * SLACK * playing.size:  # a spring of no length has no direction
+            end = end + 0.5 * SLACK * playing.size * np.array([1.0, 0.0, 0.0])
+        spring = replace(
+            spring, nodes=jnp.full((1, 1), node, jnp.int32), to=jnp.asarray(end), stiffness=jnp.asarray(stiffness)
+        )
+    scene = replace(playing.scene, physics=(*others, spring))
+    first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # without time: under the whole load
+    result, state = jax.block_until_ready(playing.program(scene, playing.state, float(first)))
+    code = int(result.status[0])
+    if code not in (status.CONVERGED, status.ONE_STEP):
+        return playing._replace(code=code)
+    positions = np.asarray(result.positions[0])
+    return playing._replace(state=state, step=playing.step + 1, positions=positions, code=code)
+
+
+def _end_of_spring(playing: Playing, node: int, to: Any, stiffness: float) -> np.ndarray:
+    """The end of the spring."""
+    if not isinstance(node, int) or not 0 <= node < len(playing.positions):
+        raise InputError(f"node = {node!r} is none of the mesh: give 0 to {len(playing.positions) - 1}")
+    try:
+        end = np.asarray(to, float)
+    except (TypeError, ValueError):
+        end = np.empty(0)
+    if end.shape != (3,) or not np.all(np.isfinite(end)):
+        raise InputError(f"to = {to!r} is no place: give three numbers in m")
+    if not (isinstance(stiffness, int | float) and np.isfinite(stiffness) and stiffness > 0):
+        raise InputError(f"stiffness = {stiffness!r} must be above 0 N/m: give e.g. {playing.stiffness:.3g}")
+    return end

@@ -1,0 +1,96 @@
+"""The body in a browser: a page, its surface, and a step for every picture. Only this machine can reach it."""
+
+import json
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.play.pulling import Playing, pulled
+
+
+class PlayServer(ThreadingHTTPServer):
+    """Serves one body to all pages that are open."""
+
+    daemon_threads = True
+
+    def __init__(self, playing: Playing, port: int):
+        super().__init__(("127.0.0.1", port), Answer)
+        self.first = self.playing = playing
+        self.one_at_a_time = threading.Lock()
+
+    @property
+    def address(self) -> str:
+        """Of the page."""
+        return f"http://127.0.0.1:{self.server_address[1]}/"
+
+
+class Answer(BaseHTTPRequestHandler):
+    """GET / and /surface; POST /step {node, to, stiffness} and /rest."""
+
+    protocol_version = "HTTP/1.1"  # one connection for all steps
+    server: PlayServer
+
+    def do_GET(self) -> None:
+        """The page, or the surface as JSON."""
+        if self.path == "/":
+            page = resources.files("liverjax.play").joinpath("page.html").read_bytes()
+            self._send(200, "text/html; charset=utf-8", page)
+        elif self.path == "/surface":
+            self._send(200, "application/json", json.dumps(surface(self.server.playing)).encode())
+        else:
+            self._send(404, "text/plain", b"there is /, /surface, /step and /rest")
+
+    def do_POST(self) -> None:
+        """A step of the body, or the body as it was in the beginning: float32 positions (n, 3) of the surface."""
+        try:
+            asked = json.loads(self.rfile.read(int(self.headers.get("Content-Length") or 0)) or b"{}")
+        except ValueError:
+            return self._send(400, "text/plain", b"the body of a request must be JSON")
+        if self.path not in ("/step", "/rest") or not isinstance(asked, dict):
+            return self._send(404, "text/plain", b"POST /step or /rest with a JSON object")
+        with self.server.one_at_a_time:
+            try:
+                self.server.playing = self.server.first if self.path == "/rest" else stepped(self.server.playing, asked)
+            except InputError as error:
+                return self._send(400, "text/plain; charset=utf-8", str(error).encode())
+            playing = self.server.playing
+        code = "" if playing.code in (status.CONVERGED, status.ONE_STEP) else status.advice(playing.code)
+        headers = {"X-Time": f"{playing.time:.9g}", "X-Failed": code}
+        self._send(200, "application/octet-stream", on_surface(playing).tobytes(), headers)
+
+    def _send(self, code: int, kind: str, content: bytes, headers: dict[str, str] | None = None) -> None:
+        self.send_response(code)
+        for name, value in {"Content-Type": kind, "Content-Length": str(len(content)), **(headers or {})}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Thirty lines a second would say nothing."""
+
+
+def stepped(playing: Playing, asked: dict[str, Any]) -> Playing:
+    """The body after the step that a page asked for."""
+    return pulled(playing, asked.get("node"), asked.get("to"), asked.get("stiffness", playing.stiffness))
+
+
+def on_surface(playing: Playing) -> np.ndarray:
+    """Positions of the surface's nodes (n, 3), float32 [m]."""
+    return playing.positions[playing.nodes].astype("<f4")
+
+
+def surface(playing: Playing) -> dict[str, Any]:
+    """What a page needs once."""
+    return {
+        "nodes": playing.nodes.tolist(),
+        "triangles": playing.triangles.ravel().tolist(),
+        "points": on_surface(playing).ravel().tolist(),
+        "size": playing.size,
+        "stiffness": playing.stiffness,
+        "timed": playing.scene.solve.dt is not None,
+    }
