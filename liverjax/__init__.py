@@ -36,6 +36,7 @@ from liverjax.reduced.estimate import reduced_error
 from liverjax.reduced.files import load_reduced, save_reduced
 from liverjax.reduced.model import ReducedModel, reduced_identity
 from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced
+from liverjax.reduced.separated import SeparatedModel, separate, separated_displacement
 from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve, with_parameters
@@ -67,6 +68,7 @@ __all__ = [
     "Region",
     "Result",
     "Scene",
+    "SeparatedModel",
     "Solve",
     "TetMesh",
     "Traction",
@@ -90,6 +92,8 @@ __all__ = [
     "reference",
     "refined",
     "save_reduced",
+    "separate",
+    "separated_displacement",
     "shapes",
     "simulate",
     "simulate_batch",

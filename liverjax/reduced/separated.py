@@ -1,0 +1,206 @@
+"""A static answer as a sum of products: a field of the place times one function of each parameter.
+
+    u(x, p_1 ... p_n) = sum over m of w_m(x) f_m1(p_1) ... f_mn(p_n)
+
+is the form of proper generalised decomposition (chapter, section 3.3; Chinesta, Ladeveze, Cueto 2011, Arch. Comput.
+Methods Eng. 18, 395). Laws of soft tissue have no products of their own, so the terms come from full runs at a grid of
+parameters: one after another, each by alternating least squares on what those before left out, and after each the
+fields w_m of all by least squares. Functions of a parameter are polynomials of Chebyshev.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import status
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, static, struct
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.scenes.scene import Scene, numbers_at
+from liverjax.simulation.batch import simulate_batch
+
+#: The most parameters, and runs of the grid.
+MOST_PARAMETERS, MOST_RUNS = 4, 2000
+#: Sweeps of alternating least squares for a term, and the change of its size at which they end.
+SWEEPS, SETTLED = 50, 1e-6
+
+
+@struct
+class SeparatedModel:
+    """M terms of a displacement that depends on n parameters."""
+
+    fields: jax.Array = param("m", "w (M, V, 3)")
+    functions: tuple[jax.Array, ...] = param("1", "of each parameter: coefficients of Chebyshev polynomials (M, k)")
+    ranges: jax.Array = param("1", "lowest and highest value of each parameter (n, 2)")
+    left_out: jax.Array = param("1", "part of the grid's displacements that the terms miss, root of mean squares")
+    error: jax.Array = param("1", "at runs between the grid's (c,): farthest node over the largest displacement there")
+    names: tuple[str, ...] = static(default=(), about="dotted names of the parameters")
+
+
+def separate(
+    scene: Scene,
+    ranges: Mapping[str, tuple[float, float]],
+    points: int = 5,
+    tolerance: float = 1e-4,
+    most_terms: int = 50,
+    checks: int = 8,
+) -> SeparatedModel:
+    """The separated form of a static scene's displacement, and its error at runs that it was not made from.
+
+    Args:
+        scene: `Scene` without time; its last load step is the answer.
+        ranges: dotted names, as in `with_parameters`, of one to four single numbers -> lowest and highest value.
+        points: of the grid along each parameter: points ** n full runs.
+        tolerance: part of the grid's displacements that the terms may leave out.
+        most_terms: the most terms.
+        checks: runs at random parameters, seed 0, that tell the error.
+
+    Raises:
+        InputError: a scene with time, ranges that are none, too many runs, a run that did not converge.
+    """
+    names, limits = _names_and_limits(scene, ranges, points)
+    t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev's points in (-1, 1)
+    axes = [low + (high - low) * 0.5 * (1 + t) for low, high in limits]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
+    between = limits[:, 0] + np.random.default_rng(0).random((checks, len(names))) * np.ptp(limits, axis=1)
+    u = _displacements(scene, names, np.concatenate([grid, between]))
+    roots = np.sqrt(np.repeat(np.asarray(nodal_volumes(scene.mesh)), 3))
+    known, unseen = u[: len(grid)].reshape(len(grid), -1) * roots, u[len(grid) :]
+    shape = (points,) * len(names)
+    products, factors, left = _terms(known, shape, tolerance, most_terms)
+    fields = np.linalg.lstsq(products, known, rcond=None)[0] / roots
+    inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(t, points - 1))
+    found = SeparatedModel(
+        fields=jnp.asarray(fields.reshape(-1, *scene.mesh.points.shape)),
+        functions=tuple(jnp.asarray(f @ inverse.T) for f in factors),
+        ranges=jnp.asarray(limits),
+        left_out=jnp.asarray(left),
+        error=jnp.zeros(0),
+        names=names,
+    )
+    at = {name: jnp.asarray(between[:, k]) for k, name in enumerate(names)}
+    off = np.linalg.norm(np.asarray(jax.vmap(lambda p: separated_displacement(found, p))(at)) - unseen, axis=-1)
+    largest = np.linalg.norm(unseen, axis=-1).max(axis=1)
+    return replace(found, error=jnp.asarray(off.max(axis=1) / largest))
+
+
+def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> jax.Array:
+    """Displacements (V, 3) [m] at a value of each parameter; may be differentiated, vmapped and jitted.
+
+    Raises:
+        InputError: a parameter without a value, a value of none, or one outside of the model's range.
+    """
+    wrong = sorted(set(model.names) ^ set(values))
+    if wrong:
+        raise InputError(f"the separated form is of {', '.join(model.names)}: leave out or give {wrong[0]}")
+    product = jnp.ones(model.fields.shape[0], model.fields.dtype)
+    for name, function, (low, high) in zip(model.names, model.functions, model.ranges, strict=True):
+        value = jnp.asarray(values[name], model.fields.dtype)
+        if not isinstance(value, jax.core.Tracer) and not low <= value <= high:
+            raise InputError(
+                f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make it wider"
+            )
+        product = product * (function @ _chebyshev(2 * (value - low) / (high - low) - 1, function.shape[1]))
+    return jnp.tensordot(product, model.fields, axes=1)
+
+
+def _chebyshev(t: jax.Array, number: int) -> jax.Array:
+    """The first polynomials at t: (number,)."""
+    out = [jnp.ones_like(t), t]
+    for _ in range(number - 2):
+        out.append(2 * t * out[-1] - out[-2])
+    return jnp.stack(out[:number])
+
+
+def _names_and_limits(
+    scene: Scene, ranges: Mapping[str, tuple[float, float]], points: int
+) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and limits (n, 2) of the parameters."""
+    if scene.solve.kind != "static" or scene.solve.dt is not None:
+        raise InputError("a separated form is of a static answer: give a scene of kind 'static' without dt")
+    if not 1 <= len(ranges) <= MOST_PARAMETERS:
+        raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
+    if points < 2 or points ** len(ranges) > MOST_RUNS:
+        raise InputError(
+            f"points = {points} means {points ** len(ranges)} runs: give 2 or more, {MOST_RUNS} runs at most"
+        )
+    for name, limits in ranges.items():
+        if np.ndim(numbers_at(scene, name)) != 0:
+            raise InputError(f"{name} is not one number: name one of them, e.g. {name}.0")
+        if np.shape(limits) != (2,) or not np.all(np.isfinite(limits)) or not limits[0] < limits[1]:
+            raise InputError(f"ranges[{name!r}] = {limits!r} is no range: give the lowest and the highest value")
+    return tuple(ranges), np.array([ranges[name] for name in ranges], float)
+
+
+def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
+    """Of the full model at every row: (N, V, 3) [m]."""
+    result = simulate_batch(scene, {name: rows[:, k] for k, name in enumerate(names)}).result
+    bad = np.flatnonzero(np.any(np.asarray(result.status) != status.CONVERGED, axis=1))
+    if len(bad):
+        at = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, rows[bad[0]], strict=True))
+        code = np.asarray(result.status)[bad[0]].max()
+        raise InputError(
+            f"{len(bad)} of {len(rows)} runs failed, first at {at}: {status.advice(code)}; narrow the ranges"
+        )
+    return np.asarray(result.positions[:, -1] - scene.mesh.points[None])
+
+
+def _terms(
+    known: np.ndarray, shape: tuple[int, ...], tolerance: float, most: int
+) -> tuple[np.ndarray, list[np.ndarray], float]:
+    """Products of the terms at the grid (N, M), their factors, each (M, points), and what is left out.
+
+    Args:
+        known: displacements at the grid (N, 3 V), times the roots of the volumes.
+        shape: of the grid.
+        tolerance, most: as of `separate`.
+    """
+    # In coordinates of the runs' own space: as many numbers as there are runs.
+    U, S, _ = np.linalg.svd(known, full_matrices=False)
+    data = U * S
+    size, left = np.linalg.norm(data), data
+    factors: list[list[np.ndarray]] = [[] for _ in shape]
+    products = np.zeros((len(data), 0))
+    while len(factors[0]) < most and np.linalg.norm(left) > tolerance * size:
+        own = _rank_one(left.reshape(*shape, -1))
+        for kept, f in zip(factors, own, strict=True):
+            kept.append(f)
+        product = own[0]
+        for f in own[1:]:
+            product = np.multiply.outer(product, f)
+        products = np.column_stack([products, product.ravel()])
+        left = data - products @ np.linalg.lstsq(products, data, rcond=None)[0]
+    return products, [np.array(f) for f in factors], float(np.linalg.norm(left) / size)
+
+
+def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
+    """Unit factors of the best product near a tensor, of all axes but the last."""
+    n = tensor.ndim
+    # Begins with the largest singular vectors of each axis.
+    factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]
+    last, size = tensor.shape[-1], 0.0
+    w = np.zeros(last)
+    for _ in range(SWEEPS):
+        before = size
+        w = _against(tensor, [*factors, None])
+        w = w / max(float(np.linalg.norm(w)), 1e-300)
+        for a in range(n - 1):
+            f = _against(tensor, [*(None if b == a else factors[b] for b in range(n - 1)), w])
+            size = float(np.linalg.norm(f))
+            factors[a] = f / max(size, 1e-300)
+        if abs(size - before) <= SETTLED * size:
+            break
+    return factors
+
+
+def _against(tensor: np.ndarray, factors: list[np.ndarray | None]) -> np.ndarray:
+    """The tensor summed with all factors; the axis without one is left."""
+    out = tensor
+    for a in reversed(range(tensor.ndim)):
+        f = factors[a]
+        if f is not None:
+            out = np.tensordot(out, f, axes=(a, 0))
+    return out

@@ -1,0 +1,107 @@
+"""Separated form of a static answer (proper generalised decomposition): exact cases, errors, derivatives, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.reduced.separated import _terms
+
+pytestmark = pytest.mark.quick_to_compile
+
+RANGES = {"law.mu": (600.0, 900.0), "body.gravity.2": (-1.5, -0.2)}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    mesh = lj.shapes.box([0.03, 0.01, 0.01], [3, 1, 1])
+    held = jnp.asarray(lj.boundary.select(mesh, {"x_max": 0.0}, None, "fixed"))
+    body = lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -1.0]))
+    law = lj.laws.NeoHookean(mu=800.0, bulk=3000.0)
+    return lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=held),), body=body)
+
+
+@pytest.fixture(scope="module")
+def model(scene):
+    return lj.separate(scene, RANGES, points=4, tolerance=1e-5)
+
+
+def test_the_error_at_unseen_runs_is_stated(scene, model):
+    assert model.left_out < 1e-5 and model.error.shape == (8,)
+    for mu, g in ((612.0, -1.45), (750.0, -0.7), (890.0, -0.25)):
+        exact = lj.simulate(lj.with_parameters(scene, {"law.mu": mu, "body.gravity.2": g})).check().positions[-1]
+        u = lj.separated_displacement(model, {"law.mu": mu, "body.gravity.2": g})
+        off = np.linalg.norm(scene.mesh.points + u - exact, axis=1).max() / np.linalg.norm(u, axis=1).max()
+        assert 0 < off < 3 * float(model.error.max())
+    assert float(model.error.max()) < 0.01
+
+
+@pytest.mark.slow
+def test_more_points_of_the_grid_lower_the_error_by_powers(scene, model):
+    """Polynomials of degree 1 and 3 in numbers on which the answer depends analytically."""
+    coarse = lj.separate(scene, RANGES, points=2, tolerance=1e-5)
+    assert float(coarse.error.max()) > 10 * float(model.error.max())
+
+
+def test_products_are_found_as_what_they_are():
+    """Known by construction: three terms of three parameters give the tensor back, and no fourth is taken."""
+    rng = np.random.default_rng(0)
+    a, b, c, w = (rng.normal(size=(3, n)) for n in (4, 4, 4, 30))
+    tensor = np.einsum("mi,mj,mk,mx->ijkx", a * np.array([[9.0], [3.0], [1.0]]), b, c, w)
+    products, factors, left = _terms(tensor.reshape(64, 30), (4, 4, 4), 1e-9, 40)
+    assert left < 1e-9
+    fields = np.linalg.lstsq(products, tensor.reshape(64, 30), rcond=None)[0]
+    np.testing.assert_allclose(products @ fields, tensor.reshape(64, 30), atol=1e-7)
+    few = _terms(tensor.reshape(64, 30), (4, 4, 4), 0.9, 40)
+    assert few[0].shape[1] == 1 and [f.shape for f in factors] == [factors[0].shape] * 3
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_the_runs(scene, model):
+    """By the load and by the modulus, against the full model's own."""
+
+    def tip(u):
+        return u[-1, 2]
+
+    def full(mu):
+        at = lj.simulate(lj.with_parameters(scene, {"law.mu": mu, "body.gravity.2": -0.8}))
+        return tip(at.positions[-1])  # a position has the displacement's derivative
+
+    def separated(mu):
+        return tip(lj.separated_displacement(model, {"law.mu": mu, "body.gravity.2": -0.8}))
+
+    own = jax.grad(separated)(740.0)
+    assert own == pytest.approx(float(jax.jacfwd(separated)(740.0)), rel=1e-12)
+    assert own == pytest.approx(float(jax.grad(full)(740.0)), rel=0.02)
+    lanes = jax.jit(jax.vmap(separated))(jnp.array([700.0, 800.0]))
+    assert lanes[0] == pytest.approx(float(separated(700.0)), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "ranges, more, words",
+    [
+        ({}, {}, "1 to 4"),
+        ({"law.mew": (1.0, 2.0)}, {}, "mu"),
+        ({"body.gravity": (1.0, 2.0)}, {}, r"body.gravity.0"),
+        ({"law.mu": (900.0, 600.0)}, {}, "lowest and the highest"),
+        ({"law.mu": 600.0}, {}, "lowest and the highest"),
+        (RANGES, {"points": 1}, "2 or more"),
+        (RANGES, {"points": 50}, "2000 runs at most"),
+        ({"law.mu": (1e-3, 2e-3)}, {"points": 2, "checks": 1}, "narrow the ranges"),
+    ],
+)
+def test_what_cannot_be_separated_gets_a_sentence(scene, ranges, more, words):
+    with pytest.raises(lj.InputError, match=words) as told:
+        lj.separate(scene, ranges, **more)
+    assert "\n" not in str(told.value)
+
+
+def test_scenes_with_time_and_values_outside_are_refused(scene, model):
+    with pytest.raises(lj.InputError, match="static answer"):
+        lj.separate(replace(scene, solve=lj.Solve(kind="dynamic", dt=0.1)), RANGES)
+    with pytest.raises(lj.InputError, match="outside of 600 to 900"):
+        lj.separated_displacement(model, {"law.mu": 500.0, "body.gravity.2": -1.0})
+    with pytest.raises(lj.InputError, match=r"leave out or give body\.gravity\.2"):
+        lj.separated_displacement(model, {"law.mu": 700.0})
