@@ -41,8 +41,8 @@ PARTS = ("all", "isochoric")
 class Prony:
     """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the instantaneous law relaxes to 1 - sum g_k of its stress."""
 
-    ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,)", lower=0.0, upper=1.0)
-    relaxation_times: Any = param("s", "tau_k (N,)", above=0.0)
+    ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,), or (N, E)", lower=0.0, upper=1.0)
+    relaxation_times: Any = param("s", "tau_k (N,), or one an element (N, E)", above=0.0)
     part: str = static(
         default="all", about="all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)"
     )
@@ -65,7 +65,7 @@ class Recall(NamedTuple):
     """What the memory contributes to a step, constant during its Newton iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
-    now: Any  # 1 - sum_k a_k
+    now: Any  # 1 - sum_k a_k, () or with the axes of the points
 
 
 def check(prony: Prony, law: Law) -> None:
@@ -75,18 +75,11 @@ def check(prony: Prony, law: Law) -> None:
         InputError: unknown scheme or part, lengths that differ, values out of bounds, ratios adding up to 1 or more,
             isochoric relaxation of a law without isochoric split.
     """
-    import numpy as np
-
-    bounds.check(prony, "viscosity")
-    g, tau = np.atleast_1d(np.asarray(prony.ratios, float)), np.atleast_1d(np.asarray(prony.relaxation_times, float))
+    check_series(prony)
     if prony.scheme not in SCHEMES:
         raise InputError(f"viscosity scheme = {prony.scheme!r} is not known: use one of {', '.join(SCHEMES)}")
     if prony.part not in PARTS:
         raise InputError(f"viscosity part = {prony.part!r} is not known: use one of {', '.join(PARTS)}")
-    if g.shape != tau.shape:
-        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one of each a mode")
-    if not g.sum() < 1:
-        raise InputError(f"viscosity.ratios = {g.tolist()} must add up to less than 1: lower them")
     if prony.part == "isochoric" and isochoric_part(law) is None:
         raise InputError(
             f"viscosity part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
@@ -94,14 +87,44 @@ def check(prony: Prony, law: Law) -> None:
         )
 
 
+def check_series(prony: Prony) -> None:
+    """Refuse ratios and times that are no Prony series; host side.
+
+    Raises:
+        InputError: lengths that differ, values out of bounds, ratios adding up to 1 or more.
+    """
+    import numpy as np
+
+    bounds.check(prony, "viscosity")
+    g, tau = np.atleast_1d(np.asarray(prony.ratios, float)), np.atleast_1d(np.asarray(prony.relaxation_times, float))
+    if g.shape != tau.shape:
+        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one of each a mode")
+    if not np.all(g.sum(axis=0) < 1):
+        shown = g if g.ndim == 1 else g[:, int(np.argmax(g.sum(axis=0)))]
+        raise InputError(f"viscosity.ratios = {shown.tolist()} must add up to less than 1: lower them")
+
+
 def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """a, b, c (N,) of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s]."""
+    """a, b, c, shaped as the ratios, of gamma^n = a S^n + c S^(n-1) + b gamma^(n-1) for a step dt [s]."""
     g, tau = jnp.asarray(prony.ratios), jnp.asarray(prony.relaxation_times)
     r = dt / tau
     if prony.scheme == "backward_euler":
         return g * r / (1 + r), 1 / (1 + r), jnp.zeros_like(g)
     one_minus_q, q_minus_e = _weights(r)
     return g * one_minus_q, jnp.exp(-r), g * q_minus_e
+
+
+def lasting(prony: Prony, order: int = 1) -> jax.Array:
+    """The part of the stress that never relaxes: (), or by element with the axes of the points of that order."""
+    left = 1 - jnp.sum(jnp.asarray(prony.ratios), axis=0)
+    return left[None] if left.ndim and order > 1 else left
+
+
+def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
+    """Numbers (N,) or (N, E) with axes for arrays of so many dimensions (N, 6, …, E)."""
+    if numbers.ndim == 1:
+        return numbers[(slice(None), *(None,) * (ndim - 1))]
+    return numbers[(slice(None), *(None,) * (ndim - 2))]
 
 
 def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -141,29 +164,40 @@ def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: Any = fl
 
 def relaxed_history(prony: Prony, stress: jax.Array) -> History:
     """Memory of a body that has been held under `stress` (6, …) [Pa] until nothing relaxes any more."""
-    g = jnp.asarray(prony.ratios)
-    gamma = g.reshape(-1, *(1,) * stress.ndim) * stress[None]
+    gamma = _beside(jnp.asarray(prony.ratios), 1 + stress.ndim) * stress[None]
     return History(gamma, None if prony.scheme == "backward_euler" else stress)
 
 
 def recall(prony: Prony, history: History, dt: Any) -> Recall:
     """The constant part of the next step's stress, from the memory at its beginning."""
     a, b, c = coefficients(prony, dt)
+    if a.ndim == 2:
+        return _recall_by_element(a, b, c, history)
     past: Any = sum(b[k] * history.gamma[k] for k in range(b.shape[0]))
     if history.stress is not None:
         past = past + jnp.sum(c) * history.stress
     return Recall(symmetric(tuple(past)), 1 - jnp.sum(a))
 
 
+def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: History) -> Recall:
+    """`recall` with coefficients (N, E)."""
+    ndim = history.gamma.ndim
+    past = jnp.sum(_beside(b, ndim) * history.gamma, axis=0)
+    if history.stress is not None:
+        past = past + _beside(jnp.sum(c, axis=0)[None], ndim)[0] * history.stress
+    now = 1 - jnp.sum(a, axis=0)
+    return Recall(symmetric(tuple(past)), now if ndim == 3 else now[None])
+
+
 def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> History:
     """Memory at the end of an accepted step with deformation gradient F."""
     a, b, c = coefficients(prony, dt)
     S = relaxing_stress(prony, law, F)
-    columns = (slice(None), *(None,) * S.ndim)
-    gamma = a[columns] * S[None] + b[columns] * history.gamma
+    a, b, c = (_beside(each, 1 + S.ndim) for each in (a, b, c))
+    gamma = a * S[None] + b * history.gamma
     if history.stress is None:
         return History(gamma, None)
-    return History(gamma + c[columns] * history.stress[None], S)
+    return History(gamma + c * history.stress[None], S)
 
 
 def relaxing_stress(prony: Prony, law: Law, F: Matrix) -> jax.Array:

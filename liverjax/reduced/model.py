@@ -100,6 +100,8 @@ def refuse_unknown_physics(scene: Scene) -> None:
         InputError: porosity, supports and other named physics, a loaded mesh, pressures that follow, averaged or mixed
             volumes.
     """
+    if any(region.viscosity for region in scene.region):
+        raise InputError("a reduced model has one viscosity: leave that of regions out, or run the full model")
     if scene.porosity is not None:
         raise InputError("a reduced model has no pore pressures: leave [porosity] out, or run the full model")
     if scene.points_are == "loaded":

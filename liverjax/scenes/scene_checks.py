@@ -127,6 +127,7 @@ def check_bounds(scene: Scene) -> None:
     for name, physics in _named_physics(scene):
         bounds.check(physics, name)
     regions.check_regions(scene.law, scene.region)
+    regions.check_viscosity(scene.viscosity, scene.region)
 
 
 def check_numbers(scene: Scene) -> None:

@@ -34,7 +34,7 @@ from liverjax.scenes.scene_checks import CHOICES, check_scene
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
     "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
-    "region": ("where", "set", "law"),
+    "region": ("where", "set", "law", "viscosity"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
     "porosity": (
         "bulk",
@@ -247,10 +247,18 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
     where, given = table.get("where"), table.get("law")
     if where is not None and not isinstance(where, dict):
         raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
-    if not isinstance(given, dict) or not given:
+    viscous = table.get("viscosity", {})
+    for key, part in (("law", {} if given is None else given), ("viscosity", viscous)):
+        if not isinstance(part, dict):
+            raise InputError(f"{name} {key} = {part!r} must be a table: write e.g. law = {{mu = 2000.0}}")
+    if not given and not viscous:
         raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
     elements = regions.select_elements(mesh, where, table.get("set"), name)
-    return Region(elements=jnp.asarray(elements, jnp.int32), law=dict(_dotted(f"{name} law", given)))
+    return Region(
+        elements=jnp.asarray(elements, jnp.int32),
+        law=dict(_dotted(f"{name} law", given or {})),
+        viscosity={key: jnp.asarray(_numbers(f"{name} viscosity.{key}", v)) for key, v in viscous.items()} or None,
+    )
 
 
 def _dotted(name: str, table: dict) -> list[tuple[str, float]]:
@@ -333,7 +341,7 @@ def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[st
     """Times and numbers of a table's history, where it has one."""
     if "history" not in table:
         return {}
-    times, numbers = history.read(table["history"], name, forms)
+    times, numbers = history.read_history(table["history"], name, forms)
     return {"times": times, "history": numbers}
 
 

@@ -17,7 +17,7 @@ from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
 from liverjax.simulation import automatic, checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs, unknowns
-from liverjax.simulation.mesh_error import MeshError, estimate, refuse
+from liverjax.simulation.mesh_error import MeshError, mesh_error_of, refuse
 from liverjax.simulation.step import problem_of, step
 from liverjax.simulation.unloaded import Unloaded, unload
 from liverjax.solvers import continuation
@@ -145,7 +145,7 @@ def simulate(
     result = _run(scene, start, report, checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
         return result
-    return replace(result, mesh_error=estimate(scene, result.positions, result.reactions))
+    return replace(result, mesh_error=mesh_error_of(scene, result.positions, result.reactions))
 
 
 def simulate_part(
@@ -216,8 +216,11 @@ def _ready(scene: Scene) -> Scene:
     if scene.solve.newton_iterations == 1:
         scene = replace(scene, solve=replace(scene.solve, newton="one_step"))
     if scene.region:
-        per_element = regions.law_of_elements(scene.law, scene.region, scene.mesh.number_of_elements)
-        scene = replace(scene, law=per_element, region=())
+        E = scene.mesh.number_of_elements
+        law, prony = regions.law_of_elements(scene.law, scene.region, E), scene.viscosity
+        if prony is not None:
+            prony = regions.viscosity_of_elements(prony, scene.region, E)
+        scene = replace(scene, law=law, viscosity=prony, region=())
     scene = replace(scene, law=scene.mesh.at_points(scene.law))
     scene = replace(scene, solve=replace(scene.solve, volumetric=automatic.form_of_volumes(scene)))
     if scene.solve.linear_solver == "auto":

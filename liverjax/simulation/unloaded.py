@@ -21,6 +21,7 @@ from liverjax.core.struct import replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh, with_points
 from liverjax.physics.prescribed import Fixed
+from liverjax.physics.viscosity import lasting
 from liverjax.scenes.scene import Scene
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, equations, force_sizes, initial_state, residual, unknowns
@@ -60,7 +61,7 @@ def resting(scene: Scene) -> Scene:
     """The same body at rest for long under the loads of time 0."""
     law = scene.law
     if scene.viscosity is not None:
-        left = 1 - jnp.sum(jnp.asarray(scene.viscosity.ratios))
+        left = lasting(scene.viscosity, scene.mesh.order)
         split, volume = law.isochoric_part(), law.volumetric_part()
         if scene.viscosity.part == "all" or split is None:
             law = laws.scaled(law, left)

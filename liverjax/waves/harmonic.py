@@ -13,6 +13,7 @@ from liverjax.core.struct import param, replace, struct
 from liverjax.physics import viscosity
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.physics.prescribed import prescribed
+from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
@@ -149,10 +150,14 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
 
 
 def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
-    """m (F,) of the scene's viscosity."""
-    if scene.viscosity is None:
+    """m (F,) of the scene's viscosity, or (F, E)."""
+    prony = scene.viscosity
+    if prony is None:
         return jnp.ones(omegas.shape, complex)
-    return 1 - jnp.sum(viscosity.complex_ratios(scene.viscosity, omegas), axis=0)
+    of = partial(viscosity.complex_ratios, omega=omegas)
+    by_element = jnp.ndim(prony.ratios) == 2
+    ratios = jax.vmap(of, in_axes=1, out_axes=-1)(prony) if by_element else of(prony)
+    return 1 - jnp.sum(ratios, axis=0)
 
 
 def _small(scene: Scene, mass: str) -> Scene:
@@ -174,5 +179,9 @@ def _small(scene: Scene, mass: str) -> Scene:
     solve = replace(scene.solve, **_STILL)
     traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
     body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)
-    viscous, scene = scene.viscosity, replace(scene, viscosity=None, traction=traction, body=body, solve=solve)
-    return replace(prepared(scene), viscosity=viscous)
+    viscous = scene.viscosity
+    if viscous is not None:
+        viscous = regions.viscosity_of_elements(viscous, scene.region, scene.mesh.number_of_elements)
+    elastic = tuple(replace(region, viscosity=None) for region in scene.region)
+    still = replace(scene, viscosity=None, region=elastic, traction=traction, body=body, solve=solve)
+    return replace(prepared(still), viscosity=viscous)

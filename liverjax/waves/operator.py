@@ -82,7 +82,7 @@ def _blocks(scene: Scene, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[M
         S = symmetric(tuple(viscosity.relaxing_stress(prony, law, F)))
         metric = [_times_identity(dot(D[i], matvec(S, D[j]))) for i, j in _OWN]
         K = [add_matrices(k, scale_matrix(-1.0, g)) for k, g in zip(K, metric, strict=True)]
-        rest = [scale_matrix(1 - jnp.sum(jnp.asarray(prony.ratios)), g) for g in metric]
+        rest = [scale_matrix(viscosity.lasting(prony, mesh.order), g) for g in metric]
     volume = volumetric_part(law) if prony.part == "isochoric" else None
     if volume is not None:
         U = invariant_terms.blocks(invariant_terms.state(volume, F), D, _OWN)
