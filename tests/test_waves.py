@@ -1,6 +1,7 @@
 """Elastography: waves on voxels from files, the balance of forces, regions, maps and the command."""
 
 import json
+import sys
 
 import h5py
 import numpy as np
@@ -120,7 +121,26 @@ def test_moduli_of_plane_waves_within_their_errors(small, verified):
     assert np.all(found.whole.converged) and np.all(found.whole.chi2 / found.whole.components < 1.3)
     share = np.abs(found.mesh_bias * G)  # a mean of directions; these waves have theirs
     assert np.all(np.abs(off.real) < 3 * e + share) and np.all(np.abs(off.imag) < 3 * e + share)
-    verified("complex modulus from plane waves on voxels, 100 Hz", "closed form", abs(off[1] / G[1]), 0.01)
+    allowed = float((3 * e + share)[1] * np.sqrt(2) / abs(G[1]))  # real and imaginary part
+    verified(
+        "complex modulus from plane waves on voxels, 100 Hz, 2 % noise", "closed form", abs(off[1] / G[1]), allowed
+    )
+
+
+def test_elements_on_edges_have_geometric_means(small):
+    """Whole elements have their region's modulus; others what lies between; the derivative is the difference."""
+    shares, G = np.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]]), np.array([2000 + 300j, 8000 + 100j])
+    elements, slopes = regions.geometric(shares, G)
+    np.testing.assert_allclose(elements[:2], G)
+    assert 1 / (0.25 / abs(G[0]) + 0.75 / abs(G[1])) < abs(elements[2]) < abs(regions.side_by_side(shares, G)[0][2])
+    for k, step in enumerate(np.eye(2) * 1e-3):
+        found = (regions.geometric(shares, G + step)[0] - regions.geometric(shares, G - step)[0]) / 2e-3
+        np.testing.assert_allclose(found, slopes[:, k], rtol=1e-7, atol=1e-9)
+    # Where no element is of two regions, both means are the same: nothing moves.
+    m, w = small.matrices, small.waves
+    half = np.eye(2)[(np.arange(m.rows.shape[-1]) > 200).astype(int)]
+    own = regions.moduli_of_regions(m, w, half, np.full(2, modulus(60.0)))
+    assert np.all(np.abs(regions.moved_by_mixing(m, w, half, own.modulus)) < 0.2 * own.standard_errors)
 
 
 def test_noise_does_not_pull_the_modulus_down_and_the_errors_are_right():
@@ -219,6 +239,41 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
 
 
+def wrapped_file(path, radians_per_metre=2.8e5):
+    """Phases of waves that go over 2 pi several times, as a scanner stores them: a corner is not measured."""
+    field = plane_waves((12, 12, 14))
+    t = np.arange(8) / 8
+    motion = np.stack([np.real(field.displacement * np.exp(2j * np.pi * one)) for one in t], axis=1)
+    wrapped = np.angle(np.exp(1j * radians_per_metre * motion))
+    wrapped[:, :, :2, :2, :2] = np.nan
+    np.savez(path, wrapped=wrapped, spacing=H, frequencies=HERTZ)
+    return radians_per_metre * field.displacement, np.ptp(radians_per_metre * motion)
+
+
+def test_wrapped_phases_are_unwrapped(tmp_path):
+    pytest.importorskip("skimage")
+    exact, reach = wrapped_file(tmp_path / "wrapped.npz")
+    assert reach > 2 * np.pi  # else nothing is wrapped
+    found = wave_field.read_waves(tmp_path / "wrapped.npz")
+    off = (found.displacement - exact)[:, 2:]
+    np.testing.assert_allclose(off, 0, atol=1e-12)
+    assert np.all(np.isnan(found.displacement[:, :2, :2, :2])) and found.mask.sum() == found.mask.size - 8
+    assert not found.notes
+    wrapped_file(tmp_path / "steep.npz", 6e5)  # more than pi from one voxel to the next
+    assert "mask them" in wave_field.read_waves(tmp_path / "steep.npz").notes[0]
+
+
+def test_wrapped_phases_that_are_no_radians_get_a_sentence(tmp_path, monkeypatch):
+    wrapped_file(tmp_path / "wrapped.npz")
+    held = dict(np.load(tmp_path / "wrapped.npz"))
+    np.savez(tmp_path / "grey.npz", **held | {"wrapped": 1300 * held["wrapped"]})
+    with pytest.raises(InputError, match="radians between -pi and pi"):
+        wave_field.read_waves(tmp_path / "grey.npz")
+    monkeypatch.setitem(sys.modules, "skimage.restoration", None)
+    with pytest.raises(InputError, match=r"pip install 'liverjax\[unwrap\]'"):
+        wave_field.read_waves(tmp_path / "wrapped.npz")
+
+
 @pytest.mark.parametrize(
     "change, words",
     [
@@ -287,7 +342,7 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
     three = np.array([60.0, 80.0, 100.0])
     content = {
         "frequencies_Hz": three.tolist(),
-        "whole": {k: [1.0, 2.0, 3.0] for k in ("storage_Pa", "loss_Pa", "standard_error_Pa")},
+        "whole": {k: [1.0, 2.0, 3.0] for k in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")},
         "regions": None,
     }
     field = plane_waves((5, 5, 5))._replace(frequencies=three)

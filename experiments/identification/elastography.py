@@ -172,7 +172,7 @@ def main() -> None:
         "covered_90": covered(organ, drawn, part),
         "rows": rows,
     }
-    figure = waves_report.picture(organ, drawn, usual)
+    figure = waves_report.maps_picture(organ, drawn, usual)
     for axes in figure.axes[:4]:
         for c, r in CYLINDERS:
             place = 1e3 * (np.array(c) - field.origin[:2] + VOXEL / 2)

@@ -465,6 +465,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         reduced.came_out,
         "weighs its model against reduced bases and names no error",
     ),
+    "separated": (
+        "the phantom at rest as a sum of products (proper generalised decomposition), beside a reduced basis",
+        reduced.separated_came_out,
+        "weighs its model against proper generalised decomposition and gives no number",
+    ),
     "stability_cost": ("what does robustness at hand cost where it is not needed?", _cost, ""),
     "laws_table": ("every law: error of its terms beside time and compile time", _laws, ""),
     "curves_fit": (

@@ -42,7 +42,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "spacing_m": organ.field.spacing.tolist(),
         "voxels": int(organ.body.mesh.number_of_nodes),
         "elements": int(organ.body.mesh.number_of_elements),
-        "whole": _of_regions(organ, found.whole, found.mesh_bias)[0],
+        "whole": _of_regions(organ, found.whole, found.mesh_bias, None)[0],
         "regions": _by_label(organ, found),
         "direct_inversion": _direct(organ, found, usual),
         "map": None if drawn is None else _of_map(drawn),
@@ -55,21 +55,27 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     _write_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
         _for_paraview(out / "waves.vtu", organ, drawn)
-        save(picture(organ, drawn, usual), out / "waves.png")
+        save(maps_picture(organ, drawn, usual), out / "waves.png")
     return content
 
 
-def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[dict[str, Any]]:
-    """One dictionary a region, lists over the frequencies."""
+def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarray | None) -> list[dict[str, Any]]:
+    """One dictionary a region, lists over the frequencies. Errors are of noise, of elements and of edges together."""
     omega, rows = organ.waves.omega, []
     for r in range(found.modulus.shape[1]):
         G, e = found.modulus[:, r], found.standard_errors[:, r]
         c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
+        moved = np.zeros(len(G), complex) if edges is None else edges[:, r]
+        whole = [np.sqrt(e**2 + b**2 + (0.5 * m) ** 2) for b, m in _complex_parts(G * bias, moved)]
         rows.append(
             {
                 "storage_Pa": G.real.tolist(),
                 "loss_Pa": G.imag.tolist(),
+                "error_storage_Pa": whole[0].tolist(),
+                "error_loss_Pa": whole[1].tolist(),
                 "standard_error_Pa": e.tolist(),
+                "moved_by_edges_storage_Pa": moved.real.tolist(),
+                "moved_by_edges_loss_Pa": moved.imag.tolist(),
                 "mesh_bias_storage_Pa": (G * bias).real.tolist(),
                 "mesh_bias_loss_Pa": (G * bias).imag.tolist(),
                 "phase_velocity_m_s": c.tolist(),
@@ -84,12 +90,23 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[dict[str
     return rows
 
 
+def _complex_parts(*values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Real parts of all, imaginary parts of all."""
+    return [v.real for v in values], [v.imag for v in values]
+
+
 def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> None:
     """A frequency sweep of the whole and of every region, for ``python -m fitting``, where frequencies are enough."""
     if len(organ.field.frequencies) < FEWEST:
         return
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
-        columns = [content["frequencies_Hz"], own["storage_Pa"], own["loss_Pa"], *[own["standard_error_Pa"]] * 2]
+        columns = [
+            content["frequencies_Hz"],
+            own["storage_Pa"],
+            own["loss_Pa"],
+            own["error_storage_Pa"],
+            own["error_loss_Pa"],
+        ]
         rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
         rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
         (out / f"sweep_{name}.csv").write_text("\n".join(rows) + "\n")
@@ -98,10 +115,7 @@ def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> None:
 def _by_label(organ: Organ, found: Found) -> dict[str, Any] | None:
     if found.parts is None or found.labels is None:
         return None
-    assert found.by_edges is not None
-    rows = _of_regions(organ, found.parts, found.mesh_bias)
-    for row, moved in zip(rows, found.by_edges.T, strict=True):
-        row["moved_by_edges_storage_Pa"], row["moved_by_edges_loss_Pa"] = moved.real.tolist(), moved.imag.tolist()
+    rows = _of_regions(organ, found.parts, found.mesh_bias, found.by_edges)
     return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
 
 
@@ -156,7 +170,7 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
         if np.any(moved | ~np.isfinite(found.by_edges)):
             names = ", ".join(str(label) for label, any_ in zip(found.labels, moved.any(axis=0), strict=True) if any_)
             told.append(
-                f"regions {names}: how elements on their edges are counted moves the moduli by more than two standard "
+                f"regions {names}: how elements on their edges are mixed moves the moduli by more than two standard "
                 "errors (moved_by_edges): the voxels are large for these regions"
             )
     if drawn is not None and not drawn.reached and drawn.chi2 > TOO_FAR * drawn.components:
@@ -173,10 +187,9 @@ def table(content: dict[str, Any]) -> str:
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
         direct = content["direct_inversion"][name]
         for f, hertz in enumerate(content["frequencies_Hz"]):
-            e = own["standard_error_Pa"][f]
             usual = [direct[part][f] for part in ("storage_Pa", "loss_Pa")]
             pair = "none" if usual[0] is None else f"{usual[0]:.4g} + {usual[1]:.3g}i"
-            cells = [f"{own[part][f]:.5g} ± {e:.2g}" for part in ("storage_Pa", "loss_Pa")]
+            cells = [f"{own[f'{part}_Pa'][f]:.5g} ± {own[f'error_{part}_Pa'][f]:.2g}" for part in ("storage", "loss")]
             rows.append(
                 f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
                 f"{own['chi2_per_component'][f]:7.2f}   {pair}"
@@ -221,7 +234,7 @@ def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
     meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
 
 
-def picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
+def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
     """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))

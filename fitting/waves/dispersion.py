@@ -58,7 +58,7 @@ def names_velocities(path: str | os.PathLike) -> bool:
     return _header(text_of(Path(path), "shear waves").splitlines()) is not None
 
 
-def read(path: str | os.PathLike, density: float | None = None) -> Dispersion:
+def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Dispersion:
     """Read a table with a header such as ``frequency_Hz,phase_velocity_m/s,attenuation_Np/m``.
 
     Args:

@@ -34,7 +34,9 @@ class Found(NamedTuple):
     labels: np.ndarray | None  # (R,) of the regions
     parts: Regions | None
     mesh_bias: np.ndarray  # (F,) complex: relative, of plane waves of the whole's modulus
-    by_edges: np.ndarray | None = None  # (F, R) complex [Pa]: change where no element is of two regions
+    by_edges: np.ndarray | None = (
+        None  # (F, R) complex [Pa]: change where elements of two regions have the arithmetic mean
+    )
 
 
 def body_of(field: WaveField) -> VoxelBody:
@@ -69,9 +71,7 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
         return Found(whole, None, None, bias)
     known, shares = voxels.shares_of(organ.body, organ.field.labels)
     parts = regions.moduli_of_regions(m, waves, shares, np.full(len(known), whole.modulus[0, 0]), progress)
-    most = np.eye(len(known))[np.argmax(shares, axis=1)]
-    sharp = regions.moduli_of_regions(m, waves, most, parts.modulus[0], progress) if np.all(most.any(axis=0)) else None
-    moved = np.full(parts.modulus.shape, np.nan + 0j) if sharp is None else sharp.modulus - parts.modulus
+    moved = regions.moved_by_mixing(m, waves, shares, parts.modulus)
     return Found(whole, known, parts, bias, moved)
 
 

@@ -68,7 +68,7 @@ def moduli_of_regions(
     Args:
         m: `balance.matrices`.
         waves: what was measured.
-        shares: part of each element that is in each region (E, R); its modulus is their mean.
+        shares: part of each element that is in each region (E, R); see `geometric`.
         start: complex modulus of each region (R,) [Pa], of the lowest frequency.
         progress: told of every iteration: its number, and chi^2 over the number of components.
     """
@@ -80,15 +80,41 @@ def moduli_of_regions(
     return Regions(G, covariance, chi2, m.balances, iterations, converged)
 
 
+def geometric(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Moduli of elements (E,) from shares (E, R) and moduli of regions (R,) [Pa], and their derivatives (E, R).
+
+    Between springs in a row and springs side by side, which are the least and the most that a mixture can have.
+    """
+    elements = np.exp(shares @ np.log(G))
+    return elements, elements[:, None] * shares / G
+
+
+def side_by_side(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `geometric`, of arithmetic means."""
+    return shares @ G, shares
+
+
+def moved_by_mixing(m: Matrices, waves: MeasuredWaves, shares: np.ndarray, modulus: np.ndarray) -> np.ndarray:
+    """What `side_by_side` would add to moduli (F, R) [Pa] that were found as `geometric`: one step of Gauss-Newton."""
+    out = np.empty_like(modulus)
+    for f, G in enumerate(modulus):
+        elements, by_regions = side_by_side(shares, G)
+        here = balance.balanced(m, elements, waves.omega[f], waves.motion[f], waves.sd[f])
+        out[f] = _gauss_newton(m, here, by_regions, waves.sd[f])[0]
+    return out
+
+
 def _one_frequency(m, waves, f, shares, G, progress):
     """Modulus (R,), covariance (R, R), chi^2, iterations, and whether they ended by themselves."""
     at = waves.omega[f], waves.motion[f], waves.sd[f]
-    here, converged, k = balance.balanced(m, shares @ G, *at), False, 0
-    step, H = _gauss_newton(m, here, shares, waves.sd[f])
+    elements, by_regions = geometric(shares, G)
+    here, converged, k = balance.balanced(m, elements, *at), False, 0
+    step, H = _gauss_newton(m, here, by_regions, waves.sd[f])
     for k in range(1, ITERATIONS + 1):
         part = min(1.0, 0.5 / max(np.max(np.abs(step / G)), 1e-300))  # a modulus changes by half of itself at most
         for _ in range(8):
-            new = balance.balanced(m, shares @ (G + part * step), *at)
+            elements, by_regions = geometric(shares, G + part * step)
+            new = balance.balanced(m, elements, *at)
             if new.chi2 <= here.chi2 * (1 + 1e-10):
                 break
             part *= 0.5
@@ -96,16 +122,16 @@ def _one_frequency(m, waves, f, shares, G, progress):
             break
         G, here = G + part * step, new
         progress(k, here.chi2 / m.balances)
-        step, H = _gauss_newton(m, here, shares, waves.sd[f])
+        step, H = _gauss_newton(m, here, by_regions, waves.sd[f])
         converged = bool(np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))))
         if converged or part < 1e-2:
             break
     return G, np.linalg.inv(H), here.chi2, k, converged
 
 
-def _gauss_newton(m: Matrices, here: Balanced, shares: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
-    """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2."""
-    J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(shares)).tocsc()
+def _gauss_newton(m: Matrices, here: Balanced, by_regions: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
+    """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2, with derivatives (E, R) of the moduli."""
+    J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(by_regions)).tocsc()
     X = here.whitened(J)
     H = X.conj().T @ X / sd**2
     g = J.conj().T @ here.multipliers / sd**2

@@ -3,9 +3,9 @@
 At frequency f the modulus of an element is g_f exp(c), g_f that of the whole organ and c = ln(size) + i (loss angle)
 the mean of a complex nodal field (P,), one field for all frequencies. Its real and its imaginary part have the prior of
 `fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number of
-equations (discrepancy principle; Morozov 1966), or no longer falls. Of the deviations on this way, that of the highest
-evidence is taken: -(chi^2/n + |z|^2)/2 - ln det H. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by
-Gauss-Newton. The uncertainty is that of the Hessian H = I + J^H J/n, n the factor by which chi^2 is too large.
+equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. Of the
+deviations on this way, that of the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is
+sought by Gauss-Newton. The uncertainty is that of the Hessian H = I + J^H J/n, where n is chi^2 over what it should be.
 """
 
 import time
@@ -28,8 +28,6 @@ from liverjax.core.files import whole
 
 #: Standard deviations of c to try, from a nearly uniform organ to a free one.
 DEVIATIONS = (0.2, 0.4, 0.8)
-#: A larger one must lower chi^2 by this part, or it is no better.
-WORTH = 0.01
 #: Steps of Gauss-Newton for each, and the part of the cost below which one is the last.
 STEPS, LAST = 8, 3e-4
 
@@ -131,8 +129,7 @@ def map_of(
     point, history = _first_or_resumed(course, file if resume else None)
     components = course.m.balances * len(course.waves.omega)
     visited = _each_deviation(course, point, history, file, progress)
-    excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
-    evidence = [_evidence(p, information, excess) for p, information in visited]
+    excess, evidence = _evidences(visited, components)
     for row, value in zip(history[-len(visited) :], evidence, strict=True):
         row["evidence"] = value
     point = visited[int(np.argmax(evidence))][0]
@@ -168,6 +165,12 @@ def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
     return _Reached(z, k, here, chi2, 0.5 * chi2 + 0.5 * float(np.vdot(z, z).real))
 
 
+def _evidences(visited: list[tuple[_Reached, np.ndarray]], components: int) -> tuple[float, list[float]]:
+    """The factor by which chi^2 is too large, and the evidence of each deviation tried."""
+    excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
+    return excess, [_evidence(p, information, excess) for p, information in visited]
+
+
 def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
     """Logarithm of the probability of the data at this deviation, but for a number that is the same for all."""
     H = np.eye(len(information)) + DEVIATIONS[point.k] ** 2 / excess * information
@@ -176,7 +179,7 @@ def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
 
 
 def _each_deviation(course, point, history, file, progress) -> list[tuple[_Reached, np.ndarray]]:
-    """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
+    """One deviation after another, each from the field of the last, until chi^2 is that of the noise or no better."""
     components, visited = course.m.balances * len(course.waves.omega), []
     while True:
         begin, steps = time.perf_counter(), 0
@@ -199,9 +202,8 @@ def _each_deviation(course, point, history, file, progress) -> list[tuple[_Reach
             }
         )
         visited.append((point, information))
-        last = [row["chi2_per_component"] for row in history[-2:]]
-        idle = len(last) == 2 and last[1] > (1 - WORTH) * last[0]
-        if point.chi2 <= components or idle or point.k + 1 == len(DEVIATIONS):
+        evidence = _evidences(visited, components)[1]
+        if point.chi2 <= components or evidence[-1] < max(evidence) or point.k + 1 == len(DEVIATIONS):
             return visited
         point = _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
 

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fitting.waves import formats
+from fitting.waves.unwrapping import unwrapped
 from liverjax.core.errors import InputError
 
 #: Units of displacements and their factors to metres.
-UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
+UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0}
 
 
 class WaveField(NamedTuple):
@@ -50,7 +51,12 @@ def read_waves(
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
     found |= {key: formats.single(Path(file), key) for key, file in more.items() if file is not None}
+    jumps: list[str] = []
+    if found.get("wrapped") is not None:
+        found["phases"], jumps = unwrapped(name, _instants(name, "wrapped", found["wrapped"]))
+        found["unit"] = "rad"
     U, notes = _motion(name, found)
+    notes += jumps
     U = np.where(np.isfinite(U), U, np.nan) * _factor(name, unit or found.get("unit") or "m")
     still = np.all((U == 0) | np.isnan(U), axis=(0, 4))  # how many programs write what they did not measure
     if np.any(still & np.any(U == 0, axis=(0, 4))):
@@ -85,9 +91,7 @@ def with_noise(field: WaveField, noise: float | None) -> WaveField:
 def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
     """Complex displacements (F, nx, ny, nz, 3) in the file's unit, and notes."""
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, evenly apart
-        u = _array_of_numbers(name, "phases", found["phases"])
-        if u.ndim not in (5, 6) or u.shape[-5] < 3:
-            raise InputError(f"{name}: phases has shape {u.shape}: give (F, T, nx, ny, nz, 3) with 3 instants or more")
+        u = _instants(name, "phases", found["phases"])
         U = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5]
     elif found.get("displacement") is not None:
         U = _array_of_numbers(name, "displacement", found["displacement"])
@@ -118,6 +122,16 @@ def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
         return U, []
     blank = np.full(U.shape, np.nan + 0j)
     return np.concatenate([U, blank, blank], axis=-1), ["one component is measured: the other two are unknown"]
+
+
+def _instants(name: str, field: str, values: Any) -> np.ndarray:
+    """Motion (F, T, nx, ny, nz, 3) at T instants of one period."""
+    u = _array_of_numbers(name, field, values)
+    if u.ndim not in (5, 6) or u.shape[-5] < 3 or u.shape[-1] not in (1, 3) or np.iscomplexobj(u):
+        raise InputError(
+            f"{name}: {field} has shape {u.shape}: give real (F, T, nx, ny, nz, 3) with 3 instants or more"
+        )
+    return u if u.ndim == 6 else u[None]
 
 
 def _array_of_numbers(name: str, field: str, values: Any) -> np.ndarray:

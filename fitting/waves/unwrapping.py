@@ -1,0 +1,39 @@
+"""Phases that a scanner wraps into (-pi, pi], made continuous in space and in time."""
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+
+def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Phases without jumps, NaN where they are not measured; and a note where jumps are left.
+
+    In space by sorting of reliable edges (Herraez et al. 2002, Appl. Opt. 41, 7437). Each volume's level is then known
+    but for multiples of 2 pi. From one instant of the period to the next it is taken to move by less than pi.
+
+    Args:
+        name: of the file, for the sentence.
+        phases: (F, T, nx, ny, nz, 3) [rad], T instants of a period.
+
+    Raises:
+        InputError: phases outside [-pi, pi], or scikit-image is missing.
+    """
+    measured = phases[np.isfinite(phases)]
+    if not measured.size or np.abs(measured).max() > np.pi * (1 + 1e-3):
+        largest = np.abs(measured).max() if measured.size else np.nan
+        raise InputError(f"{name}: wrapped phases reach {largest:.3g}: give radians between -pi and pi")
+    try:
+        from skimage.restoration import unwrap_phase
+    except ImportError:
+        raise InputError(
+            f"{name}: wrapped phases need scikit-image: pip install 'liverjax[unwrap]', or unwrap them first"
+        ) from None
+    out = np.full(phases.shape, np.nan)
+    for f, t, c in np.ndindex(phases.shape[0], phases.shape[1], phases.shape[-1]):
+        one = phases[f, t, ..., c]
+        volume = np.ma.masked_array(np.nan_to_num(one), np.isnan(one))  # NaN would be sorted for ever
+        out[f, t, ..., c] = np.ma.filled(unwrap_phase(volume, rng=0), np.nan)
+    levels = np.nanmedian(out, axis=(2, 3, 4))  # (F, T, 3)
+    left = sum(int(np.sum(np.abs(np.diff(out, axis=a)) > np.pi)) for a in (2, 3, 4))
+    note = f"{left} neighbouring voxels still differ by more than pi after unwrapping: their waves are wrong; mask them"
+    return out + (np.unwrap(levels, axis=1) - levels)[:, :, None, None, None], [note] if left else []
