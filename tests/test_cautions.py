@@ -9,7 +9,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
-from liverjax.simulation.cautions import cautions
+from liverjax.simulation.cautions import cautions_of_run
 from liverjax.simulation.run import Result
 
 pytestmark = pytest.mark.quick_to_compile
@@ -31,15 +31,15 @@ BOX = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
 def test_a_sound_run_has_none():
     # Bounds themselves are allowed: J = 1/4 and 4, exact in binary, lie inside; a box 1 m long is no organ too long.
     gradients = [np.diag([0.25, 1.0, 1.0]), np.diag([1.0, 4.0, 1.0])]
-    assert cautions(scene(BOX), run(BOX, gradients, [1.0, 2.0])) == []
+    assert cautions_of_run(scene(BOX), run(BOX, gradients, [1.0, 2.0])) == []
     one = lj.shapes.box((1.0, 0.1, 0.1), (1, 1, 1))
-    assert cautions(scene(one), run(one, gradients[:1], [1.0])) == []
+    assert cautions_of_run(scene(one), run(one, gradients[:1], [1.0])) == []
 
 
 def test_volumes_name_how_many_which_and_when():
     x = np.asarray(BOX.points)
     result = run(BOX, [np.diag([0.5, 0.08, 1.0]), np.diag([24.0, 1.0, 1.0]), np.eye(3)], [0.1, 0.2, 0.3])
-    small, large = cautions(scene(BOX, dt=0.1), result)
+    small, large = cautions_of_run(scene(BOX, dt=0.1), result)
     assert small.startswith("6 of 6 elements shrank below J = 0.2 (worst: element ") and "J = 0.04 at 0.1 s)" in small
     assert large.startswith("6 of 6 elements grew above J = 5 (worst: element ") and "J = 24 at 0.2 s)" in large
     # One node pushed through: only its elements are counted, the worst by an independent volume.
@@ -48,7 +48,7 @@ def test_volumes_name_how_many_which_and_when():
     tets = np.asarray(BOX.tetrahedra)
     J = np.array([np.dot(*(lambda a, b, c: (np.cross(a, b), c))(*(moved[t[1:]] - moved[t[0]]))) for t in tets])
     J /= 6 * np.asarray(BOX.volumes)
-    found = cautions(scene(BOX), replace(result, positions=moved[None], times=np.array([1.0])))
+    found = cautions_of_run(scene(BOX), replace(result, positions=moved[None], times=np.array([1.0])))
     worst = int(np.argmin(J))
     assert found[0].startswith(f"{np.sum(J < 0.2)} of 6 elements") and np.sum(J < 0.2) > 0
     assert f"worst: element {worst}, J = {J[worst]:.2g} at load step 1)" in found[0]
@@ -56,14 +56,14 @@ def test_volumes_name_how_many_which_and_when():
 
 def test_long_bodies_and_slivers():
     long = lj.shapes.box((6.0, 3.0, 3.0), (2, 1, 1))
-    assert cautions(scene(long), run(long, [np.eye(3)], [1.0])) == [
+    assert cautions_of_run(scene(long), run(long, [np.eye(3)], [1.0])) == [
         "the body is 6 m long: check the mesh's unit, e.g. write unit = 'mm'"
     ]
     # Four points of a square, one lifted by h: volume a^2 h / 6, mean square edge (4 + 2 * 2)/6 a^2 without h.
     a, h = 0.1, 1e-4
     flat = lj.tet_mesh([[0, 0, 0], [a, 0, 0], [a, a, h], [0, a, 0]], [[0, 1, 3, 2]])
     quality = 6 * np.sqrt(2) * a * a * h / 6 / ((4 / 3) ** 0.5 * a) ** 3  # to order (h/a)^2
-    (found,) = cautions(scene(flat), run(flat, [np.eye(3)], [1.0]))
+    (found,) = cautions_of_run(scene(flat), run(flat, [np.eye(3)], [1.0]))
     assert found.startswith("1 of 1 elements are slivers, of quality below 0.01 (worst: element 0, ")
     assert f"{quality:.2g}; regular: 1)" in found
 

@@ -279,7 +279,6 @@ def test_viscosity_from_a_time_series(tmp_path):
         assert found["standard_errors"][name] < 0.1 * true
 
 
-@pytest.mark.core
 @pytest.mark.slow
 def test_the_command_maps(tmp_path, capsys):
     """A map from files; everything written. That it goes on from what is written, the next test sees."""

@@ -27,7 +27,7 @@ FILES = [*((f, "sweep") for f in SWEEPS), *((f, "relaxation") for f in RELAXATIO
 
 
 def read(path, kind):
-    return read_sweep(path) if kind == "sweep" else time_tests.read(path, kind)
+    return read_sweep(path) if kind == "sweep" else time_tests.read_time_test(path, kind)
 
 
 @pytest.mark.parametrize(("file", "kind"), FILES)

@@ -303,7 +303,7 @@ def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
     G = 2e3 + 1e6 * slow / (1 + slow) + 1e9 * fast / (1 + fast)
     factor = 1 + 0.02 * np.random.default_rng(0).standard_normal((2, 160))
     s = Sweep(omega, G.real * factor[0], G.imag * factor[1])
-    f = models.spectrum(s)
+    f = models.spectrum_fit(s)
     assert np.mean(f.relative_errors(s)) < 0.02 and f.details["conversion"]["largest_relative_error"] < 0.01
     exact = np.concatenate([G.real, G.imag])
     # The noise of 2 % is averaged over about seven moduli a parameter.

@@ -169,7 +169,7 @@ def test_a_springpot_has_the_errors_of_its_curvature():
     start = jnp.log(jnp.array([700.0, 0.4]))
 
     def residuals(u):
-        return springpots.residuals(springpots.full(model, u), model.switches, *scaled)
+        return springpots.springpot_residuals(springpots.full(model, u), model.switches, *scaled)
 
     def values(u):
         return model.values(springpots.full(model, u), reference)

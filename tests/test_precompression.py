@@ -57,6 +57,7 @@ def test_weights_are_taken_back(law):
         np.testing.assert_allclose(a, b, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_smooth_plates_converge_to_the_closed_form(law):
     """A mesh of a cylinder that stayed one, too slow and too fast to relax: second order to the closed form."""
     shares, sizes, errors = compression.shares(law, STRAIN), [], []
@@ -71,6 +72,7 @@ def test_smooth_plates_converge_to_the_closed_form(law):
     assert np.all(errors[0] / errors[1] > 0.6 * (sizes[0] / sizes[1]) ** 2)
 
 
+@pytest.mark.slow
 def test_glued_torque_is_that_of_a_sample_compressed_and_then_turned(law):
     """Elastic: against nodes of the plate moved by hand in `lj.simulate`, torque from the nodal forces."""
     rig = rig_of(Simulation(precompression=STRAIN))

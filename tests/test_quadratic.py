@@ -325,7 +325,17 @@ def test_every_feature_runs_on_both_orders(feature):
     assert 0.9 < shown[1] / shown[0] < 6
 
 
-@pytest.mark.parametrize("feature", ["elastic", "porous", "pressure", "isochoric", "sliding", "membrane"])
+@pytest.mark.parametrize(
+    "feature",
+    [
+        "elastic",
+        pytest.param("porous", marks=pytest.mark.core),
+        "pressure",
+        "isochoric",
+        "sliding",
+        "membrane",
+    ],
+)
 def test_the_tangent_is_the_derivative_of_the_forces(feature):
     scene = scene_of(MESH, feature)
     e = equations(scene, initial_state(scene), 1.0)
@@ -437,6 +447,7 @@ def test_g_of_every_volumetric_energy_is_its_root():
         assert np.isclose(slope[4], 1.0, atol=1e-15) and np.all(slope > 0)
 
 
+@pytest.mark.slow
 def test_the_mixed_tangent_is_symmetric_and_the_derivative():
     scene = _cook(2, 2, 1e3, kind="simo", volumetric="mixed")
     e = equations(scene, initial_state(scene), 1.0)
@@ -536,7 +547,6 @@ def _pulled(scene: lj.Scene) -> float:
     return float(_force(scene.mesh)(result.positions, result.reactions))
 
 
-@pytest.mark.core
 def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
     """A linear problem: one linear solve is all, but for its tolerance of 1e-2."""
     scene = _pull(1, 2)

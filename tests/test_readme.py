@@ -45,9 +45,10 @@ by = [0.002, 0.0, 0.0]
 def blocks(language: str) -> list:
     """Examples of the three pages in one language, by page and number."""
     fence = re.compile(rf"^```{language}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-    # tests/test_rigs.py has quicker fits of several tests.
+    # Other tests have quicker cases of the same.
+    long = ("joint.fit", "lj.reduce_scene", "lj.separate", "lj.value_and_gradient")
     found = [
-        pytest.param(block, id=f"{name}-{k}", marks=[pytest.mark.slow] if "joint.fit" in block else [])
+        pytest.param(block, id=f"{name}-{k}", marks=[pytest.mark.slow] if any(one in block for one in long) else [])
         for name, page in GUIDES.items()
         for k, block in enumerate(fence.findall(page.read_text()))
     ]

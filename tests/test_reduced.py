@@ -35,7 +35,8 @@ def _every_motion(scene: lj.Scene) -> jax.Array:
     return jnp.asarray(np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape))
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_all_motions_and_all_points_are_the_full_model(order):
     # Another path to the same numbers: Newton's method on dense matrices, memory and inertia of coordinates.
     scene = _bar((1, 1, 1), order, viscosity=PRONY, solve=MOVING)
@@ -59,6 +60,7 @@ def test_prescribed_motion_and_histories_are_those_of_the_full_model():
     assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.004
 
 
+@pytest.mark.slow
 def test_a_body_that_is_only_moved_converges():
     # No load: at the solution the forces of the points cancel, and their sum is no size to compare with.
     scene = replace(_bar((2, 1, 1)), body=None)
@@ -139,6 +141,7 @@ def test_the_error_is_stated(trained):
         assert np.all(error < 2 * true) and np.all(true < 2 * error)
 
 
+@pytest.mark.slow
 def test_derivatives_and_lanes(trained):
     scene, model = trained
 

@@ -106,8 +106,10 @@ def test_parameters_by_the_files_own_names(folder):
 
 @pytest.mark.core
 def test_command_leaves_hdf5_vtu_and_a_picture(folder, capsys):
-    out = folder / "out"
-    assert main(["simulate", str(folder / "scene.toml"), "--out", str(out), "--vtu", "--png"]) == 0
+    out, text = folder / "out", (folder / "scene.toml").read_text()
+    mesh, one, other = text.split("[[law]]")  # one law compiles in half of the time
+    (folder / "one_law.toml").write_text(f"{mesh}[law]{one}[viscosity]{other.split('[viscosity]')[1]}")
+    assert main(["simulate", str(folder / "one_law.toml"), "--out", str(out), "--vtu", "--png"]) == 0
     text = capsys.readouterr().out
     assert "27 nodes, 48 tetrahedra, 3 steps" in text and "residual" in text and "compile" in text
     with h5py.File(out / "result.h5") as file:

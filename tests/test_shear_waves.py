@@ -64,7 +64,7 @@ def test_the_command_reads_waves_and_writes_waves(tmp_path):
     table = np.column_stack([HIGH / (2 * np.pi), 100 * w.velocity, 20 / np.log(10) * w.attenuation / 100])
     head = "frequency (Hz);phase velocity (cm/s);attenuation (dB/cm)"
     np.savetxt(tmp_path / "w.csv", table[::-1], delimiter=";", header=head, comments="# ultrasound\n", fmt="%.12g")
-    read = dispersion.read(tmp_path / "w.csv", 1060.0)
+    read = dispersion.read_dispersion(tmp_path / "w.csv", 1060.0)
     assert np.allclose([read.angular_frequency, read.velocity, read.attenuation], [HIGH, w.velocity, w.attenuation])
     arguments = [str(tmp_path / "s.csv"), "--with", str(tmp_path / "w.csv"), "--modes", "2", "--out", str(tmp_path)]
     assert main(arguments) == 0
@@ -91,4 +91,4 @@ def test_the_command_reads_waves_and_writes_waves(tmp_path):
 def test_bad_files_are_refused(tmp_path, text, words):
     (tmp_path / "w.csv").write_text(text)
     with pytest.raises(InputError, match=words):
-        dispersion.read(tmp_path / "w.csv")
+        dispersion.read_dispersion(tmp_path / "w.csv")

@@ -330,7 +330,6 @@ def test_viscous_ramp_and_hold_of_febio(febio, verified):
     assert errors[0] / errors[1] > 2.5
 
 
-@pytest.mark.core
 @pytest.mark.slow
 def test_vmap_is_the_loop():
     mesh = box(1)

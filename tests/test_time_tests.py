@@ -13,7 +13,7 @@ from fitting.__main__ import main
 from fitting.fits import time_tests as fits
 from fitting.methods import time_response
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.readers.time_tests import Sample, read
+from fitting.readers.time_tests import Sample, read_time_test
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -123,7 +123,7 @@ def test_what_an_ode_solver_computed_is_recovered_from_the_file(kind, tmp_path):
     value = np.interp(time, [0, 0.3], [0.0, value.max()])
     answer = driven(SOLID, time, value, kind)
     header, columns = "time_s,strain,stress_Pa", (value, answer) if kind == "relaxation" else (answer, value)
-    test = read(write(tmp_path / "t.csv", header, time, *columns), kind)
+    test = read_time_test(write(tmp_path / "t.csv", header, time, *columns), kind)
     f = fits.fit(test, 2)
     assert f.converged and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
     # Taken for a step, the ramp cannot be followed.
@@ -150,7 +150,7 @@ def test_a_ramp_that_no_column_has_is_an_option(tmp_path):
     stress = driven(SOLID, fine, np.minimum(fine, 1.0), "relaxation")
     modulus = stress[np.searchsorted(fine, t)]
     file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, modulus)
-    f = fits.fit(read(file, "relaxation", ramp=1.0, start=0.1), 2)
+    f = fits.fit(read_time_test(file, "relaxation", ramp=1.0, start=0.1), 2)
     assert np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
 
 
@@ -160,22 +160,22 @@ T = np.geomspace(0.1, 10, 12)
 def test_units_and_forms(tmp_path):
     G = relaxation(SOLID, T)
     file = write(tmp_path / "a.csv", "Time (min),Relaxation Modulus (kPa)", T / 60, G / 1e3)
-    a = read(file, "relaxation")
+    a = read_time_test(file, "relaxation")
     assert np.allclose(a.time[1:], T) and np.allclose(a.answer[1:], G) and np.all(a.driven == 1) and a.notes == ()
     r, h, strain = 0.01, 0.004, 0.02
     file = write(tmp_path / "b.csv", "time_s,angle_mrad,torque_uN.m", T, 0 * T + 1e3 * strain * h / r, G * strain * 1e6)
-    b = read(file, "relaxation", Sample(r, h))
+    b = read_time_test(file, "relaxation", Sample(r, h))
     # G = 2 M h / (pi r^4 theta), the formula of the rheometer's guide
     modulus = 2 * G * strain * h / (np.pi * r**4 * strain * h / r)
     assert np.allclose(b.answer[1:] / b.driven[1:], modulus)
     file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.1, -G)
-    c = read(file, "relaxation", Sample(r, h))
+    c = read_time_test(file, "relaxation", Sample(r, h))
     assert np.allclose(c.answer[1:] / c.driven[1:], G * 1e-3 / (np.pi * r**2) / (0.1e-3 / h) / 3)
     assert "G = E / 3" in c.notes[0]
     text = "Result:\tStep strain\nPoint No.\tTime\tShear Strain\tShear Stress\n\t\t\t\n\t[s]\t[%]\t[Pa]\n"
     rows = "".join(f"{k}\t{t:.4f}\t1,0\t{G / 100:.5f}\n".replace(".", ",") for k, (t, G) in enumerate(zip(T, G)))  # noqa: B905
     (tmp_path / "d.txt").write_bytes((text + rows).encode("utf-16"))
-    d = read(tmp_path / "d.txt", "relaxation")
+    d = read_time_test(tmp_path / "d.txt", "relaxation")
     assert np.allclose(d.answer[1:] / d.driven[1:], G, rtol=1e-3) and np.isclose(d.driven[-1], 0.01)
 
 
@@ -212,7 +212,7 @@ def test_unusable_files_get_one_sentence(name, tmp_path, capsys):
 
 def test_missing_files_and_damage_never_leave_a_traceback(tmp_path):
     with pytest.raises(InputError, match="no such file; give the CSV file of a relaxation or creep test"):
-        read(tmp_path / "none.csv", "creep")
+        read_time_test(tmp_path / "none.csv", "creep")
     rng = np.random.default_rng(0)
     good = ("time_s,strain,stress_Pa\n" + "".join(f"{t:.4g},0.01,{9 / t:.5g}\n" for t in T)).encode()
     for _ in range(200):
@@ -222,7 +222,7 @@ def test_missing_files_and_damage_never_leave_a_traceback(tmp_path):
             data[k : k + int(rng.integers(0, 4))] = bytes(rng.integers(0, 256, int(rng.integers(0, 4)), dtype=np.uint8))
         (tmp_path / "t.csv").write_bytes(bytes(data))
         try:
-            test = read(tmp_path / "t.csv", "relaxation")
+            test = read_time_test(tmp_path / "t.csv", "relaxation")
         except InputError as error:
             assert "\n" not in str(error)
         else:
@@ -235,7 +235,7 @@ def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
     if not folder.is_dir():
         pytest.skip("the measured tests are not here")
     creep, relaxed = (
-        read(folder / f"{name}_ps160_data.csv", kind)
+        read_time_test(folder / f"{name}_ps160_data.csv", kind)
         for name, kind in (("creep", "creep"), ("stressrelaxation", "relaxation"))
     )
     f = fits.fit(creep)

@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     check_samples(options.samples)
     out = options.out or Path(options.kind)
     sample = reader.Sample(options.radius, options.height)
-    test = reader.read(options.file, options.kind, sample, options.ramp, options.min_time)
+    test = reader.read_time_test(options.file, options.kind, sample, options.ramp, options.min_time)
     for note in test.notes:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))

@@ -25,7 +25,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
         prog=prog,
         description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
         epilog=f"Tests in time: {prog} relaxation --help, {prog} creep --help. "
-        f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. " + EXIT_CODES,
+        f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
+        f"Strain sweeps: {prog} amplitude --help. Waves on voxels: {prog} waves --help. " + EXIT_CODES,
     )
     command.add_argument(
         "sweep",
@@ -56,6 +57,13 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--method", choices=("torsion", "closed-form"), help="default torsion; of several samples closed-form"
     )
+    _add_sample(command)
+    _add_outputs(command)
+    return command
+
+
+def _add_sample(command: argparse.ArgumentParser) -> None:
+    """Options of the sample between its plates and of its simulation."""
     command.add_argument("--radius", type=float, metavar="M", help="plate radius [m] (default 0.01)")
     command.add_argument("--height", type=float, metavar="M", help="gap [m] (default 0.004)")
     command.add_argument(
@@ -77,8 +85,6 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--scheme", choices=("exponential", "backward_euler", "chapter"), default="exponential", help="Prony recursion"
     )
     command.add_argument("--optimizer", choices=("levenberg-marquardt", "bfgs"), default="levenberg-marquardt")
-    _add_outputs(command)
-    return command
 
 
 def _add_outputs(command: argparse.ArgumentParser) -> None:

@@ -55,7 +55,7 @@ def read_any(options: argparse.Namespace, path: Path) -> "Measured":
     from fitting.waves import dispersion
 
     if dispersion.names_velocities(path):
-        return dispersion.read(path, options.density)
+        return dispersion.read_dispersion(path, options.density)
     try:
         sweep = rheometer.read_sweep(path)
     except InputError as no_sweep:
@@ -63,4 +63,4 @@ def read_any(options: argparse.Namespace, path: Path) -> "Measured":
             raise
     else:
         return sweep
-    return time_tests.read(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))
+    return time_tests.read_time_test(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))

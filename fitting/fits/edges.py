@@ -88,7 +88,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         reference = springpots.reference_frequency(sweep)
         starts = springpots.starting_points(part)
         starts[-1, list(model.free)] = np.asarray(fit.solution.u)
-        best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
+        best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
         # The program is that of all points, some without weight: it is there already.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         data = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, scales)

@@ -25,7 +25,7 @@ def fractional(sweep: Sweep) -> list[Fit]:
     """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts; one program fits them all."""
     reference, starts = springpots.reference_frequency(sweep), springpots.starting_points(sweep)
     scaled = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
-    best = viscoelastic.best_of(levenberg_marquardt, springpots.residuals, 1)
+    best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
     out = []
     for model in springpots.FRACTIONAL:
         switches = np.tile(model.switches, (len(starts), 1))
@@ -50,7 +50,7 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
     return _finished(viscoelastic.fitted(sweep, found, kind, *seconds, {}), made)
 
 
-def spectrum(sweep: Sweep) -> Fit:
+def spectrum_fit(sweep: Sweep) -> Fit:
     """A smooth spectrum that is not negative, at 2 or 3 times a decade."""
     found = relaxation_spectrum.fit(sweep)
     solid = int(found.equilibrium > 0)
@@ -178,7 +178,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
     if model in ("fractional", "auto"):
         tried += fractional(sweep)
     if model in ("spectrum", "auto"):
-        tried.append(spectrum(sweep))
+        tried.append(spectrum_fit(sweep))
     if model == "auto" and prony is not None:
         tried.append(prony)
         if any("(a fluid)" in w for w in prony.warnings):

@@ -230,7 +230,7 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
     @jax.jit
     @jax.vmap
     def residuals(u):
-        return springpots.residuals(springpots.full(model, u), model.switches, x, *data[1:])
+        return springpots.springpot_residuals(springpots.full(model, u), model.switches, x, *data[1:])
 
     own = _sweep_target(fit.kind, sweep, lambda u: np.asarray(residuals(u)))
     return sample(own, len(fit.solution.u), count, seed)
@@ -282,7 +282,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
     """The density of a relaxation or creep test in closed form."""
-    one, data = time_tests.residuals_of(test, fit.kind)
+    one, data = time_tests.residuals_in_time(test, fit.kind)
     residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
     own = target(fit.kind, lambda u: np.asarray(residuals(u)), test.resolved, size, False)

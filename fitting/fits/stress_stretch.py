@@ -266,10 +266,10 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
     program = jax.jit(jax.vmap(lambda u: levenberg_marquardt(residuals, u))).lower(points).compile()
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
-    return _assessed(candidate, curves, found, scale, (time.perf_counter() - compiled, compiled - begin))
+    return assessed(candidate, curves, found, scale, (time.perf_counter() - compiled, compiled - begin))
 
 
-def _assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple) -> LawFit:
+def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple) -> LawFit:
     """The best start, what it is worth, and what the user should know."""
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))

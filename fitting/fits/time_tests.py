@@ -55,7 +55,7 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
-        return (response(kind, natural(u), time, driven, rows) - answer) / scales
+        return (response_in_time(kind, natural(u), time, driven, rows) - answer) / scales
 
     return residuals
 
@@ -123,7 +123,7 @@ def identifiable(fit: TimeFit, test: TimeTest) -> bool:
 
 
 def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
-    function, data = residuals_of(test, kind)
+    function, data = residuals_in_time(test, kind)
     scales = data[-1]
     best = viscoelastic.best_of(levenberg_marquardt, function)
     found, compiling, running = viscoelastic.timed(best, _starts(test, rows, modes, kind), *data)
@@ -134,7 +134,7 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
     return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, compiling, {})
 
 
-def residuals_of(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
+def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
     """Residuals (m,) of u and of the data that come second, for Prony modes of a solid or a fluid."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
@@ -158,7 +158,7 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
     return every[rows]
 
 
-def response(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax.Array:
+def response_in_time(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax.Array:
     """What a test measures: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
 
     Args:

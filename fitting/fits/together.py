@@ -34,7 +34,7 @@ APART = 1.5
 Measured = Sweep | TimeTest | Dispersion
 
 
-class Band(NamedTuple):
+class ResolvedBand(NamedTuple):
     """The relaxation times that one of the tests resolves."""
 
     resolved: tuple[float, float]
@@ -81,7 +81,7 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
     if isinstance(test, Dispersion):
         measured = test.measured
         return (test.angular_frequency, test.density, np.arange(len(measured))), measured, measured
-    _, (at, driven, rows, answer, scales) = time_tests.residuals_of(test, Kind())
+    _, (at, driven, rows, answer, scales) = time_tests.residuals_in_time(test, Kind())
     return (at, driven, rows), answer, scales
 
 
@@ -93,7 +93,7 @@ def _all_residuals(kinds: tuple[str, ...], fluid: bool) -> Callable[..., jax.Arr
     def residuals(u, data):
         model, rows = natural(u), []
         for kind, (at, measured, scales) in zip(kinds, data, strict=True):
-            rows.append((time_tests.response(kind, model, *at) - measured) / scales)
+            rows.append((time_tests.response_in_time(kind, model, *at) - measured) / scales)
         return jnp.concatenate(rows)
 
     return residuals
@@ -117,7 +117,7 @@ def fit(
         progress: told what is fitted.
     """
     tests = list(tests)
-    band = Band(_resolved(tests))
+    band = ResolvedBand(_resolved(tests))
     largest = (sum(len(reported_numbers(t)[1]) for t in tests) - 2) // 2
     if modes != "auto" and not 1 <= int(modes) <= largest:
         raise InputError(f"--modes {modes} is out of range: give 1 to {largest} for these files, or auto")
@@ -142,7 +142,7 @@ def _resolved(tests: list[Measured]) -> tuple[float, float]:
 
 
 def _raised_together(
-    tests: list[Measured], band: Band, numbers: range, kind: Kind, progress: Callable
+    tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
     """Fits of rising number of modes until the criterion twice fails to fall."""
     tried: list[Together] = []
@@ -157,7 +157,7 @@ def _raised_together(
     return tried
 
 
-def _able(fit: Together, band: Band) -> bool:
+def _able(fit: Together, band: ResolvedBand) -> bool:
     return fit.converged and not uncertainty.superfluous(band, fit.uncertainty)
 
 
@@ -167,7 +167,7 @@ def _criterion(fit: Together) -> float:
     return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + len(fit.solution.u) * np.log(total))
 
 
-def _one_test(tests: list[Measured], band: Band, modes: int, kind: Kind) -> Together:
+def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
     """Fit and weights in turn, for one number of modes."""
     parts = [reported_numbers(t) for t in tests]
     function = _all_residuals(tuple(map(name_of, tests)), kind.name == FLUID.name)
@@ -205,7 +205,7 @@ def _noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.
     return np.array(out)
 
 
-def _starts_of_all(tests: list[Measured], band: Band, modes: int, kind: Kind) -> np.ndarray:
+def _starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
     """Times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
     low, high = np.log(band.resolved)
     rng = np.random.default_rng(0)
@@ -250,7 +250,7 @@ def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
     return tuple(np.maximum(G, 1e-2 * np.abs(found[0]).max()) for G in found)
 
 
-def _told_of_all(chosen: Together, tried: list[Together], band: Band) -> Together:
+def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) -> Together:
     """With the shares of the tests, the table of what was tried, and the sentences that a user should read."""
     begin = time.perf_counter()
     chosen = chosen._replace(shares=_shares(chosen))
@@ -297,7 +297,9 @@ def _shares(fit: Together) -> list[Share]:
     function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
     best = viscoelastic.best_of(levenberg_marquardt, function)
     u = np.asarray(fit.solution.u)
-    starts = np.concatenate([u[None], _starts_of_all(fit.tests, Band(_resolved(fit.tests)), fit.modes, fit.kind)[1:]])
+    starts = np.concatenate(
+        [u[None], _starts_of_all(fit.tests, ResolvedBand(_resolved(fit.tests)), fit.modes, fit.kind)[1:]]
+    )
     vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
     jacobian = np.asarray(fit.solution.jacobian)
     out = []

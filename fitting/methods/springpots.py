@@ -43,7 +43,7 @@ class Fractional(NamedTuple):
         return np.array([float(k in self.free) for k in (0, 1, 4, 5)])
 
 
-def _exponents(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _orders(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """alpha, beta, gamma."""
     alpha = jax.nn.sigmoid(u[3])
     return alpha, alpha * jax.nn.sigmoid(u[5]), alpha * jax.nn.sigmoid(u[1])
@@ -55,13 +55,13 @@ def modulus(u: jax.Array, switches: jax.Array, x: jax.Array) -> jax.Array:
     def power(exponent):  # (i x)^exponent
         return x**exponent * jnp.exp(0.5j * jnp.pi * exponent)
 
-    alpha, beta, gamma = _exponents(u)
+    alpha, beta, gamma = _orders(u)
     beside = switches[0] * jnp.exp(u[0]) * power(switches[1] * gamma)
     compliance = power(-alpha) * jnp.exp(-u[2]) + switches[2] * power(-switches[3] * beta) * jnp.exp(-u[4])
     return beside + 1 / compliance
 
 
-def residuals(
+def springpot_residuals(
     u: jax.Array, switches: jax.Array, x: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array
 ) -> jax.Array:
     """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
@@ -70,7 +70,7 @@ def residuals(
 
 
 def _springpot(u, reference):
-    alpha, _, _ = _exponents(u)
+    alpha, _, _ = _orders(u)
     return jnp.stack([jnp.exp(u[2]) * reference**-alpha, alpha])
 
 
@@ -79,17 +79,17 @@ def _kelvin_voigt(u, reference):
 
 
 def _zener(u, reference):
-    alpha, _, _ = _exponents(u)
+    alpha, _, _ = _orders(u)
     return jnp.stack([jnp.exp(u[0]), jnp.exp(u[4]), jnp.exp((u[2] - u[4]) / alpha) / reference, alpha])
 
 
 def _maxwell(u, reference):
-    _, beta, _ = _exponents(u)
+    _, beta, _ = _orders(u)
     return jnp.concatenate([_springpot(u, reference), jnp.stack([jnp.exp(u[4]) * reference**-beta, beta])])
 
 
 def _parallel(u, reference):
-    _, _, gamma = _exponents(u)
+    _, _, gamma = _orders(u)
     return jnp.concatenate([jnp.stack([jnp.exp(u[0]) * reference**-gamma, gamma]), _springpot(u, reference)])
 
 

@@ -21,6 +21,10 @@ HEADINGS = (
     ("torque", "torque"),
     ("deflection angle", "angle"),
     ("angle", "angle"),
+    ("oscillation strain", "strain"),
+    ("shear strain", "strain"),
+    ("strain amplitude", "strain"),
+    ("strain", "strain"),
 )
 _TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}
 UNITS = {
@@ -28,10 +32,11 @@ UNITS = {
     "sample_torque": _TORQUE,
     "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6},
     "phase": {"°": np.pi / 180, "deg": np.pi / 180, "rad": 1.0},
+    "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "": 1.0},
 }
 
 
-class Share(NamedTuple):
+class SampleShare(NamedTuple):
     """The inertia of the instrument in a sweep."""
 
     inertia: float  # I [N m s^2]; NaN where K is not known
@@ -54,17 +59,17 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
             continue
         word, quantity = HEADINGS[rank]
         rest = re.sub(r"^[\s_\[(]+|[\s\])]+$", "", name[len(word) :])
-        unit = _plain(rest or (units[k] if k < len(units) else ""))
+        unit = _plain_unit(rest or (units[k] if k < len(units) else ""))
         if unit in UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
             found[quantity] = (rank, k, UNITS[quantity][unit])
     return {quantity: (k, factor) for quantity, (_, k, factor) in found.items()}
 
 
-def _plain(unit: str) -> str:
+def _plain_unit(unit: str) -> str:
     return unit.replace("µ", "u").replace("μ", "u").replace("·", ".").replace("⋅", ".").strip('[]() "')
 
 
-def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> Share | None:
+def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> SampleShare | None:
     """The inertia that was subtracted; None where the columns do not tell it.
 
     Args:
@@ -88,10 +93,10 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
     inertia = _agreed(omega, inertias)
     if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
         return None
-    return Share(inertia, inertia * omega**2 / K)
+    return SampleShare(inertia, inertia * omega**2 / K)
 
 
-def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> Share | None:
+def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
     """The same by the raw phase alone, which needs no torque and no size: I omega^2 / K = G' - G'' / tan(phase).
 
     None where there is no phase, where the phases do not agree on one inertia, or where it leads nowhere.
@@ -102,7 +107,7 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
         per_square = _agreed(omega, (G.real - G.imag / np.tan(raw["phase"])) / omega**2)
     if not per_square * omega[-1] ** 2 > np.abs(G[-1]):
         return None
-    return Share(np.nan, per_square * omega**2)
+    return SampleShare(np.nan, per_square * omega**2)
 
 
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:

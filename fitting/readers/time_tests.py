@@ -96,7 +96,7 @@ class Sample(NamedTuple):
     height: float | None = None
 
 
-def read(
+def read_time_test(
     path: str | os.PathLike, kind: str, sample: Sample = Sample(), ramp: float = 0.0, start: float = 0.0
 ) -> TimeTest:
     """Read a test.

@@ -59,7 +59,7 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
 
     def answers(p: jax.Array) -> jax.Array:
         model = Maxwell(p[0], p[1 : n + 1], p[n + 1 :])
-        return time_tests.response(name_of(test), model, *map(jnp.asarray, at))
+        return time_tests.response_in_time(name_of(test), model, *map(jnp.asarray, at))
 
     slopes = np.asarray(jax.jacfwd(answers)(jnp.asarray(vector)))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -115,10 +115,10 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
     import jax.numpy as jnp
 
     from liverjax.core.struct import replace
-    from liverjax.simulation.mesh_error import estimate
+    from liverjax.simulation.mesh_error import mesh_error_of
     from liverjax.simulation.run import prepared
 
-    whole = estimate(prepared(scene), jnp.asarray(result.positions), jnp.asarray(result.reactions))
+    whole = mesh_error_of(prepared(scene), jnp.asarray(result.positions), jnp.asarray(result.reactions))
     return replace(result, mesh_error=whole)
 
 
@@ -129,13 +129,13 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: 
     from liverjax.core.versions import versions
     from liverjax.jobs import output, parts
     from liverjax.physics import porosity
-    from liverjax.simulation.cautions import cautions, mesh_sentence
+    from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
 
     attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
     if scene.porosity is not None:
         attributes["bulk"] = porosity.bulk_in_force(scene.porosity, scene.law)
         print(attributes["bulk"])
-    said = cautions(scene, ran.result)
+    said = cautions_of_run(scene, ran.result)
     output.write_hdf5(target, scene, ran.result, attributes | {"warnings": said, "versions": versions()}, found)
     if parts.beside(target).exists():
         parts.remove(parts.beside(target))

@@ -16,7 +16,7 @@ from liverjax.core.errors import InputError
 _FACTOR, _VECTOR = ("time", "factor"), ("time", "x", "y", "z")
 
 
-def read(value: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> tuple[jax.Array, jax.Array]:
+def read_history(value: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> tuple[jax.Array, jax.Array]:
     """Times (T,) [s], and factors (T,) or vectors (T, 3), from a scene file's `history`.
 
     Args:

@@ -32,7 +32,7 @@ def areas(points: jax.Array, triangles: jax.Array) -> jax.Array:
     return 0.5 * jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
-def shares(mesh: TetMesh, triangles: jax.Array) -> list[tuple[jax.Array, float]]:
+def nodal_shares(mesh: TetMesh, triangles: jax.Array) -> list[tuple[jax.Array, float]]:
     """Nodes (m,) of flat triangles that take part of something uniform on them, and the part of each.
 
     A third at each vertex of a linear element. The functions of the vertices of a quadratic one have no integral: a

@@ -47,7 +47,7 @@ class ElasticSupport(Physics):
                 "for springs on nodes: give one of them"
             )
         if "history" in table:
-            given["times"], given["history"] = history.read(table["history"], name)
+            given["times"], given["history"] = history.read_history(table["history"], name)
         if "stiffness" in given:
             return cls(nodes=jnp.asarray(nodes, jnp.int32), **given)
         triangles = selection.boundary_triangles(mesh, nodes)
@@ -96,7 +96,7 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
         along = support.tangential if r == c else 0.0
         whole = area * ((support.normal - support.tangential) * n[:, r] * n[:, c] + along)
         total = zero
-        for nodes, part in surface.shares(mesh, support.triangles):
+        for nodes, part in surface.nodal_shares(mesh, support.triangles):
             total = total.at[nodes].add(part * whole)
         return total
 

@@ -41,7 +41,7 @@ def nodal_tractions(mesh: TetMesh, tractions: tuple) -> jax.Array:
         normal = surface.areas(mesh.points, load.triangles[:, :3])
         area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
         whole = area[:, None] * jnp.asarray(load.value, force.dtype)[None]
-        for nodes, part in surface.shares(mesh, load.triangles):
+        for nodes, part in surface.nodal_shares(mesh, load.triangles):
             force = force.at[nodes].add(part * whole)
     return force
 

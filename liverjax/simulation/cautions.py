@@ -18,7 +18,7 @@ SLIVER = 0.01
 LEAST_J, MOST_J = 0.2, 5.0
 
 
-def cautions(scene: Scene, result: Result) -> list[str]:
+def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     """Sentences about the mesh and the volumes of a run; an empty list if all is well.
 
     Args:

@@ -65,7 +65,7 @@ class MeshError:
         return jax.jvp(of, (result.positions, result.reactions), (self.positions, self.reactions))
 
 
-def estimate(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshError:
+def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> MeshError:
     """The estimate for a run from the reference positions; its node numbers may not be traced.
 
     Args:

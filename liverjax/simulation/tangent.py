@@ -98,7 +98,7 @@ def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached, 
 
 def _symmetric(e: Equations, more: tuple[Attached, ...]) -> tuple[Attached, ...]:
     """What a preconditioner takes of elements between nodes: friction has a stiffness without symmetry."""
-    return more if e.conservative else tuple(attached.symmetric(own) for own in more)
+    return more if e.conservative else tuple(attached.symmetric_part(own) for own in more)
 
 
 def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -> Block:

@@ -63,7 +63,7 @@ def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
     return Attached(jnp.concatenate(ends), jnp.concatenate([both, both], axis=2))
 
 
-def symmetric(A: Attached) -> Attached:
+def symmetric_part(A: Attached) -> Attached:
     """The symmetric part."""
     return Attached(A.nodes, 0.5 * (A.blocks + jnp.transpose(A.blocks, (2, 3, 0, 1, 4))))
 

@@ -8,7 +8,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
-from liverjax.laws.terms.green_terms import Moduli
+from liverjax.laws.terms.green_terms import GreenModuli
 from liverjax.tensors.material_axes import SIX, symmetric
 
 
@@ -52,7 +52,7 @@ class Costa(Law):
         b = self._weights()
         S = symmetric(tuple(s * w * E[i][j] for w, (i, j) in zip(b, SIX, strict=True)))
         normal = symmetric((s * b[0], s * b[1], s * b[2], 0.0, 0.0, 0.0))
-        return S, Moduli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
+        return S, GreenModuli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
 
     def shear_modulus(self):
         """Mean over all shears (Voigt's), c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""

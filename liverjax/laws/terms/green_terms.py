@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from liverjax.laws.base import Law
 
 
-class Moduli(NamedTuple):
+class GreenModuli(NamedTuple):
     """dS/dE = orthotropic moduli + `curvature` S (x) S, all in the axes of the material."""
 
     normal: Matrix  # C_mmnn

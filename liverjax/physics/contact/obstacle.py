@@ -78,7 +78,7 @@ class Obstacle(Physics):
         if "axis" in given:
             given["axis"] = given["axis"] / max(float(jnp.linalg.norm(given["axis"])), 1e-300)
         if "history" in table:
-            given["times"], given["history"] = history.read(table["history"], name)
+            given["times"], given["history"] = history.read_history(table["history"], name)
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:

@@ -37,7 +37,7 @@ def energy(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
     return jnp.sum(volumes * U.strain_energy(_invariants(U, mean)))
 
 
-def pressure(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
+def averaged_pressure(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
     """U' (V,) [Pa] of the nodes, positive in tension."""
     U = volumetric_part(law)
     return U.energy_derivatives(_invariants(U, _mean(mesh, J)[0]))[0]["J"]
@@ -72,7 +72,7 @@ class Averaged(VolumeStress):
 
     def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """See `pressure` of this module."""
-        return pressure(mesh, self.law, J)
+        return averaged_pressure(mesh, self.law, J)
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:
         """p cof F, p linear in every element."""
