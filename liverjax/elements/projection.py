@@ -33,6 +33,7 @@ from liverjax.tensors.matrices import (
     transpose,
 )
 from liverjax.tensors.principal import principal, symmetric_axes
+from liverjax.tensors.subsets import in_subset, put_together
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -93,6 +94,8 @@ def blocks(
         pairs: which blocks, as indices into D.
         volume: derivatives of a volumetric energy beside them, or None.
     """
+    if any(law.subsets is not None for _, law in parts):
+        return _by_subset(parts, S, F, D, pairs, volume)
     first: dict[str, Any] = {}
     second: dict[tuple[str, str], Any] = {}
     stretched, added = [], []
@@ -123,6 +126,20 @@ def blocks(
     return result
 
 
+def _by_subset(
+    parts: list[tuple[Any, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
+) -> list[Matrix]:
+    """`blocks` of laws of several kinds, each at its own elements."""
+    groups = next(law.subsets for _, law in parts if law.subsets is not None)
+
+    def own(k: int) -> list[Matrix]:
+        weights = [(in_subset(groups, k, weight), law.piece(k)) for weight, law in parts]
+        inner, here, corners, scalars = in_subset(groups, k, (S, F, D, volume))
+        return blocks(weights, inner, here, corners, pairs, scalars)
+
+    return put_together(groups, [own(k) for k in range(len(groups.elements))])
+
+
 def regularised(
     parts: list[tuple[Any, Law]],
     S: Matrix | None,
@@ -134,7 +151,7 @@ def regularised(
     """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
     result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
-    def with_more(weight: Any, state: invariant_terms.State) -> list[Matrix]:
+    def with_more(weight: Any, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:
         K = invariant_terms.blocks(state, D, pairs, regularised=True)
         return [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
 

@@ -110,7 +110,8 @@ def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
     corner, g, J = pressure[mesh.tetrahedra.T], volume_gradients(mesh, F), determinant(F)
     of = corner if mesh.order == 1 else corner[:, None]
     slope = [sum(of[a] * g[a][i] for a in range(4)) / J for i in range(3)]
-    return -jnp.asarray(scene.porosity.permeability) * jnp.stack(slope)  # type: ignore[union-attr]
+    permeability = jnp.asarray(scene.porosity.permeability)  # type: ignore[union-attr]
+    return -(permeability[None] if permeability.ndim else permeability) * jnp.stack(slope)
 
 
 def _means(P: np.ndarray, F: np.ndarray, energy: np.ndarray, velocity: np.ndarray, names: list[str]) -> dict:

@@ -1,6 +1,7 @@
 """Material laws: what one is (`base`), the families, and how to make one by name (`registry`)."""
 
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
+from liverjax.laws.by_region import ByRegion
 from liverjax.laws.continued import Continued, continued
 from liverjax.laws.families.arruda_boyce import ArrudaBoyce
 from liverjax.laws.families.bogen import Bogen
@@ -21,6 +22,7 @@ __all__ = [
     "LAWS",
     "ArrudaBoyce",
     "Bogen",
+    "ByRegion",
     "Continued",
     "Costa",
     "Exponential",

@@ -13,6 +13,7 @@ differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_de
 written by hand.
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -59,6 +60,8 @@ class Law:
     volumetric: str
     fibre: Any = None
     sheet: Any
+    #: Which elements have which law (`liverjax.tensors.subsets.Subsets`); None: one law everywhere.
+    subsets: Any = None
 
     # -- what a law states -------------------------------------------------------------------------------------------
 
@@ -106,6 +109,18 @@ class Law:
     def summands(self) -> tuple["Law", ...]:
         """The laws that add up to this one: itself, unless it is a sum."""
         return (self,)
+
+    def pieces(self) -> tuple["Law", ...]:
+        """The laws of the parts of the body: itself, unless regions have laws of other kinds."""
+        return (self,)
+
+    def piece(self, k: int) -> "Law":
+        """The law of part k of the body, with the numbers of its elements."""
+        return self
+
+    def each(self, change: Callable[["Law"], "Law"]) -> "Law":
+        """The law with that of every part of the body changed."""
+        return change(self)
 
     def isochoric_part(self) -> Any:
         """The law without U(J), or `None` where its energy has no such split (or is only volumetric)."""

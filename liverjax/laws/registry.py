@@ -125,6 +125,8 @@ def scaled(law: Law, factor: Any) -> Law:
         moduli = {f.name: getattr(s, f.name) for f in parameters(s) if f.metadata["unit"] == "Pa"}
         return replace(s, **{k: _times(v, factor) for k, v in moduli.items() if v is not None})
 
+    if law.subsets is not None:
+        return law.each(lambda own: scaled(own, factor))
     first, *others = (one(s) for s in law.summands())
     return sum(others, first)
 

@@ -113,7 +113,7 @@ def check(porosity: Porosity) -> None:
     """
     if porosity.scheme not in SCHEMES:
         raise InputError(f"porosity scheme = {porosity.scheme!r} is not known: use {' or '.join(SCHEMES)}")
-    bounds.check(porosity, "porosity")
+    check_sponge(porosity)
     for k, inlet in enumerate(porosity.inlet):
         name = f"porosity.inlet.{k}"
         history.check(inlet.times, inlet.history, name, (1,))
@@ -121,6 +121,15 @@ def check(porosity: Porosity) -> None:
             raise InputError(f"{name} needs either pressure in Pa or flux in m/s: give one of them")
         if (inlet.nodes is None) != (inlet.pressure is None) or (inlet.triangles is None) != (inlet.flux is None):
             raise InputError(f"{name} needs nodes with a pressure, triangles with a flux: give those")
+
+
+def check_sponge(porosity: Porosity) -> None:
+    """Refuse numbers of a sponge that no step can use; host side.
+
+    Raises:
+        InputError: values out of bounds, K_lim not above K0.
+    """
+    bounds.check(porosity, "porosity")
     bulk, limit = float(porosity.bulk), float(porosity.limit_bulk)
     if limit <= bulk:
         raise InputError(f"porosity limit_bulk = {limit:g} must be above bulk = {bulk:g}: a sponge stiffens")
@@ -130,8 +139,7 @@ def law_in_force(porosity: Porosity | None, law: Law) -> Law:
     """The law beside the sponge: without its own volumetric energy, lest bulk is counted twice, unless asked for."""
     if porosity is None or porosity.keep_bulk:
         return law
-    split = isochoric_part(law)
-    return law if split is None else split
+    return law.each(lambda own: own if isochoric_part(own) is None else isochoric_part(own))
 
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:

@@ -102,6 +102,8 @@ def refuse_unknown_physics(scene: Scene) -> None:
     """
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: leave that of regions out, or run the full model")
+    if len(regions.laws_of(scene.law, scene.region)) > 1:
+        raise InputError("a reduced model has one kind of law: give regions other numbers of it, or run the full model")
     if scene.porosity is not None:
         raise InputError("a reduced model has no pore pressures: leave [porosity] out, or run the full model")
     if scene.points_are == "loaded":

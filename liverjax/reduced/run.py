@@ -130,7 +130,7 @@ class _Found(NamedTuple):
     inverse: jax.Array
 
 
-class _Iterate(NamedTuple):
+class _ReducedIterate(NamedTuple):
     """Where the iterations of a step are."""
 
     q: jax.Array
@@ -157,7 +157,7 @@ def _upright(F: jax.Array) -> jax.Array:
     return jnp.min(determinant(as_matrix(F))) > 0
 
 
-def _corrected(e: _Equations, at: _Iterate) -> _Iterate:
+def _corrected(e: _Equations, at: _ReducedIterate) -> _ReducedIterate:
     """One iteration with the inverse at hand, which then takes up what was seen of the forces (Broyden 1965)."""
     dq = at.inverse @ at.r
     dF = jnp.tensordot(dq, e.model.slopes, axes=1)
@@ -174,7 +174,7 @@ def _corrected(e: _Equations, at: _Iterate) -> _Iterate:
     # An old inverse may lead astray: such a step is not taken.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
-    new = _Iterate(q, F, r, size, inverse, jnp.array(False), jnp.array(False), at.iterations, at.tangents)
+    new = _ReducedIterate(q, F, r, size, inverse, jnp.array(False), jnp.array(False), at.iterations, at.tangents)
     new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, at)
     return new._replace(slow=~(after < _LITTLE_GAIN * before), fresh=jnp.array(False), iterations=at.iterations + 1)
 
@@ -187,14 +187,14 @@ def _newton(newmark: bool, most: int, e: _Equations, tolerance: Any, inverse: ja
     """
     e = e._replace(newmark=newmark)
 
-    def unfinished(at: _Iterate) -> jax.Array:
+    def unfinished(at: _ReducedIterate) -> jax.Array:
         return (at.size > tolerance) & (at.tangents < most)
 
-    def inner(at: _Iterate) -> _Iterate:
+    def inner(at: _ReducedIterate) -> _ReducedIterate:
         going = lambda at: (at.size > tolerance) & ~at.slow  # noqa: E731
         return jax.lax.while_loop(going, lambda at: _corrected(e, at), at._replace(slow=jnp.array(False)))
 
-    def refreshed(at: _Iterate) -> _Iterate:
+    def refreshed(at: _ReducedIterate) -> _ReducedIterate:
         own = jnp.linalg.inv(_reduced_tangent(e, at.q))
         return at._replace(inverse=own, fresh=jnp.array(True), tangents=at.tangents + 1)
 
@@ -202,7 +202,7 @@ def _newton(newmark: bool, most: int, e: _Equations, tolerance: Any, inverse: ja
     start = jnp.where(_upright(_deformation(e, start)), start, e.q)
     F, none = _deformation(e, start), jnp.zeros((), jnp.int32)
     r, size = _judged(e, start, F)
-    begin = _Iterate(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
+    begin = _ReducedIterate(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
     at = inner(begin)
     # Where the old inverse does not lead to the end, the step begins again.
     begin = begin._replace(iterations=at.iterations)

@@ -1,4 +1,7 @@
-"""Parts of a body with other numbers in its law: they become one number an element, where a region changes them."""
+"""Parts of a body with other numbers in its law, or with a law of another kind.
+
+Other numbers become one number an element. A law of another kind is computed for the elements of its region alone.
+"""
 
 from typing import Any
 
@@ -11,23 +14,30 @@ from liverjax.core import names
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, struct
 from liverjax.laws import Law
+from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import boundary
+from liverjax.physics.porosity import Porosity, check_sponge
 from liverjax.physics.viscosity import Prony, check_series
+from liverjax.tensors.subsets import subsets
 
-#: What may differ in a region's viscosity.
+#: What may differ in a region's viscosity, and in its porosity.
 VISCOUS = ("ratios", "relaxation_times")
+POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 
 @struct
 class Region:
-    """Elements with other numbers than those of the scene; a later region wins where two meet."""
+    """Elements with other numbers than those of the scene, or with another law; a later region wins where two meet."""
 
     elements: Any = param("1", "element numbers (n,)")
-    law: dict[str, Any] | None = param(
-        "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values", default=None
+    law: dict[str, Any] | Law | None = param(
+        "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or a law of its own", default=None
     )
     viscosity: dict[str, Any] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
+    porosity: dict[str, Any] | None = param(
+        "1", "`bulk`, `limit_bulk`, `fluid_fraction`, `permeability` -> values", default=None
+    )
 
 
 def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | None, name: str = "region") -> np.ndarray:
@@ -49,16 +59,33 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
 
 
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
-    """The law with one number an element (E,) where a region has its own, and the scene's numbers elsewhere.
+    """The law of every element.
+
+    It has one number an element (E,) where a region changes it, and laws side by side where a region has its own.
 
     Raises:
         InputError: a name that the law does not have.
     """
     for region in regions:
-        for name, value in (region.law or {}).items():
+        for name, value in _changed(region).items():
             base = jnp.broadcast_to(jnp.asarray(_number_at(law, name), float), (number_of_elements,))
             law = names.put(law, name, base.at[region.elements].set(value), _refused_name(name))
-    return law
+    own = [(region.law, region.elements) for region in regions if isinstance(region.law, Law)]
+    if not own:
+        return law
+    groups = subsets([elements for _, elements in own], number_of_elements)
+    kinds = tuple(kind for kind, _ in own)
+    return ByRegion(laws=kinds if len(kinds) == len(groups.elements) else (law, *kinds), subsets=groups)
+
+
+def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
+    """The law of a scene, and those that regions have of their own."""
+    return (*law.pieces(), *(region.law for region in regions if isinstance(region.law, Law)))
+
+
+def _changed(region: Region) -> dict[str, Any]:
+    """Names and values where a region changes numbers of the scene's law."""
+    return region.law if isinstance(region.law, dict) else {}
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
@@ -83,6 +110,22 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
     return replace(prony, **plain | found)
 
 
+def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
+    """The porosity with one number an element (E,), or (1, E) of quadratic ones, where a region has its own."""
+    found: dict[str, Any] = {}
+    for region in regions:
+        for name, value in (region.porosity or {}).items():
+            before = jnp.asarray(found.get(name, getattr(porosity, name)), float)
+            base = jnp.broadcast_to(before, (mesh.number_of_elements,))
+            found[name] = base.at[region.elements].set(value)
+    return sponge_at_points(replace(porosity, **found), mesh)
+
+
+def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
+    """The porosity, its numbers by element as they go with arrays over the points."""
+    return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))
+
+
 def check(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> None:
     """Refuse regions that no scene can use; host side.
 
@@ -93,9 +136,26 @@ def check(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Non
         elements = np.asarray(region.elements)
         if elements.size == 0 or elements.min() < 0 or elements.max() >= number_of_elements:
             raise InputError(f"region.{k} names elements outside 0 to {number_of_elements - 1}: renumber them")
-        if not region.law and not region.viscosity:
+        if not region.law and not region.viscosity and not region.porosity:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
     check_regions(law, regions)
+    _check_own_laws(regions)
+
+
+def _check_own_laws(regions: tuple[Region, ...]) -> None:
+    """Refuse regions that leave open which law an element has."""
+    for k, region in enumerate(regions):
+        if not isinstance(region.law, Law):
+            continue
+        elements = np.asarray(region.elements)
+        if np.unique(elements).size < elements.size:
+            raise InputError(f"region.{k} names an element twice: name each once")
+        for later, other in enumerate(regions[k + 1 :], k + 1):
+            if other.law and np.isin(np.asarray(other.elements), elements).any():
+                raise InputError(
+                    f"region.{later} changes the law of elements to which region.{k} gives a law of its own: give them "
+                    "elements apart, or write the numbers into that law"
+                )
 
 
 def check_viscosity(prony: Prony | None, regions: tuple[Region, ...]) -> None:
@@ -128,6 +188,31 @@ def check_viscosity(prony: Prony | None, regions: tuple[Region, ...]) -> None:
             raise InputError(f"region.{k}: {error}") from None
 
 
+def check_porosity(porosity: Porosity | None, regions: tuple[Region, ...]) -> None:
+    """Refuse porous numbers of regions that no step can use; traced ones pass.
+
+    Raises:
+        InputError: no [porosity] in the scene, an unknown name, numbers out of bounds.
+    """
+    for k, region in enumerate(regions):
+        name, own = f"region.{k}: porosity", region.porosity or {}
+        if not own:
+            continue
+        if porosity is None:
+            raise InputError(f"{name} needs a [porosity] of the scene: give one")
+        for key, value in own.items():
+            if key not in POROUS:
+                raise InputError(f"{name} has {key}, which cannot differ in a region: {names.hint(key, POROUS)}")
+            if np.ndim(value):
+                raise InputError(f"{name}.{key} has {np.size(value)} numbers: give one")
+        numbers = (*own.values(), *(getattr(porosity, key) for key in POROUS))
+        if not any(isinstance(value, jax.core.Tracer) for value in numbers):
+            try:
+                check_sponge(replace(porosity, **own))
+            except InputError as error:
+                raise InputError(f"region.{k}: {error}") from None
+
+
 def check_regions(law: Law, regions: tuple[Region, ...]) -> None:
     """Refuse numbers of regions that their law does not allow; traced ones pass.
 
@@ -135,7 +220,7 @@ def check_regions(law: Law, regions: tuple[Region, ...]) -> None:
         InputError: a name that the law has not, a value that is not finite or out of bounds.
     """
     for k, region in enumerate(regions):
-        for name, value in (region.law or {}).items():
+        for name, value in _changed(region).items():
             _number_at(law, name)
             metadata = names.metadata(law, name, _refused_name(name)) | {"each": False}
             laws.check_value(f"region.{k}: law.{name}", metadata, value)

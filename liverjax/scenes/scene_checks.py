@@ -104,15 +104,20 @@ def _mixed(scene: Scene) -> None:
         raise InputError(f"{name} iterates with a solver of its own: leave linear_solver = 'direct' out")
     if scene.solve.robust != "off":
         raise InputError(f"{name} has no energy that a solution makes least, which robust needs: leave one of them out")
-    check_mixed_law(scene.law, name)
+    for law in regions.laws_of(scene.law, scene.region):
+        check_mixed_law(law, name)
 
 
 def _own_volumes(scene: Scene) -> None:
     name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
         raise InputError(f"{name} holds a law's own volumetric energy, a sponge has another: use 'element'")
-    if laws.isochoric_part(scene.law) is None or laws.volumetric_part(scene.law) is None:
-        raise InputError(f"{name} needs a law with bulk apart from its shear, {type(scene.law).__name__} is none")
+    several = regions.laws_of(scene.law, scene.region)
+    for law in several:
+        if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
+            raise InputError(f"{name} needs a law with bulk apart from its shear, {type(law).__name__} is none")
+    if scene.solve.volumetric == "nodal" and len(several) > 1:
+        raise InputError(f"{name} averages volumes across regions of several laws: use 'element' or 'mixed'")
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
         raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
 
@@ -128,6 +133,7 @@ def check_bounds(scene: Scene) -> None:
         bounds.check(physics, name)
     regions.check_regions(scene.law, scene.region)
     regions.check_viscosity(scene.viscosity, scene.region)
+    regions.check_porosity(scene.porosity, scene.region)
 
 
 def check_numbers(scene: Scene) -> None:
@@ -137,9 +143,10 @@ def check_numbers(scene: Scene) -> None:
         InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.
     """
     check_bounds(scene)
-    scene.law.check()
-    if scene.viscosity is not None:
-        viscosity.check(scene.viscosity, scene.law)
+    for law in regions.laws_of(scene.law, scene.region):
+        law.check()
+        if scene.viscosity is not None:
+            viscosity.check(scene.viscosity, law)
     if scene.porosity is not None:
         porosity.check(scene.porosity)
 

@@ -34,7 +34,7 @@ from liverjax.scenes.scene_checks import CHOICES, check_scene
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
     "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
-    "region": ("where", "set", "law", "viscosity"),
+    "region": ("where", "set", "law", "viscosity", "porosity"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
     "porosity": (
         "bulk",
@@ -231,12 +231,12 @@ def _cylinder(table: dict, scale: float) -> TetMesh:
     return shapes.cylinder(radius, height, cell_size, rim, rings.tolist(), match)
 
 
-def _law(value: Any) -> Law:
+def _law(value: Any, where: str = "[law]") -> Law:
     tables = value if isinstance(value, list) else [value]
     made = []
     for table in tables:
         if not isinstance(table, dict) or "name" not in table:
-            raise InputError('[law] needs name = "…": python -m liverjax laws lists them')
+            raise InputError(where + ' needs name = "…": python -m liverjax laws lists them')
         law = laws.create(table["name"], **{k: v for k, v in table.items() if k not in ("name", "continued_below")})
         made.append(laws.continued(law, table["continued_below"]) if "continued_below" in table else law)
     return made[0] if len(made) == 1 else laws.Sum(laws=tuple(made))
@@ -244,21 +244,29 @@ def _law(value: Any) -> Law:
 
 def _region(mesh: TetMesh, k: int, table: dict) -> Region:
     name = f"region.{k}"
-    where, given = table.get("where"), table.get("law")
+    where, given = table.get("where"), table.get("law", {})
     if where is not None and not isinstance(where, dict):
         raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
-    viscous = table.get("viscosity", {})
-    for key, part in (("law", {} if given is None else given), ("viscosity", viscous)):
-        if not isinstance(part, dict):
+    viscous, porous = table.get("viscosity", {}), table.get("porosity", {})
+    for key, part, kinds in (("law", given, (dict, list)), ("viscosity", viscous, dict), ("porosity", porous, dict)):
+        if not isinstance(part, kinds):
             raise InputError(f"{name} {key} = {part!r} must be a table: write e.g. law = {{mu = 2000.0}}")
-    if not given and not viscous:
+    if not given and not viscous and not porous:
         raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
     elements = regions.select_elements(mesh, where, table.get("set"), name)
     return Region(
         elements=jnp.asarray(elements, jnp.int32),
-        law=dict(_dotted(f"{name} law", given or {})),
+        law=_law_of_region(name, given),
         viscosity={key: jnp.asarray(_numbers(f"{name} viscosity.{key}", v)) for key, v in viscous.items()} or None,
+        porosity={key: _number(f"{name} porosity.{key}", v) for key, v in porous.items()} or None,
     )
+
+
+def _law_of_region(name: str, given: Any) -> dict[str, Any] | Law:
+    """A law of another kind, which has a name, or the numbers that differ."""
+    if isinstance(given, list) or "name" in given:
+        return _law(given, f"{name}: law")
+    return dict(_dotted(f"{name} law", given))
 
 
 def _dotted(name: str, table: dict) -> list[tuple[str, float]]:

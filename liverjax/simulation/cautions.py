@@ -6,6 +6,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.automatic import qualities
 from liverjax.simulation.run import Result
@@ -75,7 +76,8 @@ def _of_locking(scene: Scene) -> list[str]:
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
-        ratio = float(np.max(np.asarray(scene.law.bulk_modulus()) / np.asarray(scene.law.shear_modulus())))
+        laws = regions.laws_of(scene.law, scene.region)
+        ratio = max(float(np.max(np.asarray(a.bulk_modulus()) / np.asarray(a.shear_modulus()))) for a in laws)
     except InputError:  # a law need not state its moduli
         return []
     if ratio <= _LOCKING:

@@ -22,6 +22,7 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
+from liverjax.scenes import regions
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.scene import Scene
 from liverjax.simulation import automatic, tangent
@@ -85,7 +86,8 @@ def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> M
     # Linear elements lock: their error is that against elements which do not.
     volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
     solve = replace(rich.solve, linear_solver="cg", robust="off", volumetric=volumetric)
-    rich = replace(rich, law=rich.mesh.at_points(rich.law), solve=solve)
+    sponge = None if rich.porosity is None else regions.sponge_at_points(rich.porosity, rich.mesh)
+    rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, solve=solve)
     rich = replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
     return _estimate(scene, rich, positions, reactions)
 

@@ -220,7 +220,10 @@ def _ready(scene: Scene) -> Scene:
         law, prony = regions.law_of_elements(scene.law, scene.region, E), scene.viscosity
         if prony is not None:
             prony = regions.viscosity_of_elements(prony, scene.region, E)
-        scene = replace(scene, law=law, viscosity=prony, region=())
+        sponge = scene.porosity
+        if sponge is not None:
+            sponge = regions.porosity_of_elements(sponge, scene.region, scene.mesh)
+        scene = replace(scene, law=law, viscosity=prony, porosity=sponge, region=())
     scene = replace(scene, law=scene.mesh.at_points(scene.law))
     scene = replace(scene, solve=replace(scene.solve, volumetric=automatic.form_of_volumes(scene)))
     if scene.solve.linear_solver == "auto":

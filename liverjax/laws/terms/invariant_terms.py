@@ -30,6 +30,7 @@ from liverjax.tensors.matrices import (
     transpose,
 )
 from liverjax.tensors.principal import principal
+from liverjax.tensors.subsets import Subsets, in_subset, put_together
 
 if TYPE_CHECKING:
     from liverjax.laws.base import Law
@@ -64,8 +65,24 @@ class State(NamedTuple):
     frame: Any  # principal stretches and axes, where a summand has an energy of stretches
 
 
-def state(law: "Law", F: Matrix) -> State:
+class Pieces(NamedTuple):
+    """The same of laws of several kinds, each at its own elements."""
+
+    subsets: Subsets
+    states: tuple[State, ...]
+    F: Matrix
+    cof: Matrix
+
+
+def state(law: "Law", F: Matrix) -> State | Pieces:
     """The law (`liverjax.laws.base.Law`) at F."""
+    if law.subsets is not None:
+        own = (_state_of_law(law.piece(k), in_subset(law.subsets, k, F)) for k in range(len(law.pieces())))
+        return Pieces(law.subsets, tuple(own), F, cofactor(F))
+    return _state_of_law(law, F)
+
+
+def _state_of_law(law: "Law", F: Matrix) -> State:
     return _state(Scalars(*law.energy_derivatives(law.measures(F))), F, law.summands())
 
 
@@ -92,8 +109,10 @@ def fibre_invariants(laws: tuple) -> dict[str, Any]:
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}
 
 
-def stress(s: State) -> Stress:
+def stress(s: State | Pieces) -> Stress:
     """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; absent derivatives leave no term."""
+    if isinstance(s, Pieces):
+        return _put_together(s.subsets, [stress(own) for own in s.states])
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
     tensors = [scale_matrix(2 * s.first[key], outer(a, a)) for key, a in s.fibres.items()]
     tensors += [stretch_terms.stress(law, s.F, s.frame) for law in s.laws if law.stretch_energy is not None]
@@ -111,6 +130,18 @@ def stress(s: State) -> Stress:
     if W2 is None and "I1" in s.first:
         S = tuple(tuple(S[i][j] + (2 * W1 if i == j else 0.0) for j in range(3)) for i in range(3))
     return Stress(S, p)
+
+
+def _put_together(subsets: Subsets, found: list[Stress]) -> Stress:
+    """Stresses of all elements; a spherical one becomes a matrix where another is one."""
+    if any(isinstance(S, tuple) for S, _ in found):
+        found = [Stress(S if isinstance(S, tuple) else _spherical(S), p) for S, p in found]
+    return put_together(subsets, found)
+
+
+def _spherical(S: Any) -> Matrix:
+    zero = jnp.zeros_like(S)
+    return ((S, zero, zero), (zero, S, zero), (zero, zero, S))
 
 
 def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
@@ -226,7 +257,9 @@ def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
     return tuple(tuple(row) for row in K)
 
 
-def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regularised: bool = False) -> list[Matrix]:
+def blocks(
+    s: State | Pieces, D: list[Vector], pairs: tuple[tuple[int, int], ...], regularised: bool = False
+) -> list[Matrix]:
     """d2W/dx_i dx_j per reference volume: the chapter's G, H, I, Lambda, M and R of all terms at once.
 
     Args:
@@ -235,6 +268,9 @@ def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regula
         pairs: which blocks, as indices (i, j) into D.
         regularised: replace G as in section 4.1.2 iii, with eps/3 where the chapter prints eps (the trace is kept).
     """
+    if isinstance(s, Pieces):
+        own = [blocks(each, in_subset(s.subsets, k, D), pairs, regularised) for k, each in enumerate(s.states)]
+        return put_together(s.subsets, own)
     if s.frame is not None:
         s = s._replace(frame=stored(s.frame))
     parts = _parts(s, D, pairs)
@@ -252,7 +288,7 @@ def blocks(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...], regula
 _UNIT_VECTORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def tangent(s: State) -> list[list[Matrix]]:
+def tangent(s: State | Pieces) -> list[list[Matrix]]:
     """d2W/dF dF [Pa] as nested [J][L] of matrices (i, k): the blocks of shape vectors e_J and e_L."""
     pairs = tuple((J, L) for J in range(3) for L in range(3))
     A = blocks(s, list(_UNIT_VECTORS), pairs)

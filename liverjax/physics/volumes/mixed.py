@@ -34,7 +34,8 @@ def check(law: Law, name: str = "[solve] volumetric = 'mixed'") -> None:
     U = volumetric_part(law)
     if isochoric_part(law) is None or U is None:
         raise InputError(f"{name} needs a law with an isochoric part and bulk, which {type(law).__name__} has not")
-    kinds = {(part.volumetric, part.below) for part in U.summands() if isinstance(part, Volumetric)}
+    parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
+    kinds = {(part.volumetric, part.below) for part in parts}
     if len(kinds) != 1 or next(iter(kinds))[1] is not None:
         raise InputError(f"{name} needs one kind of volumetric energy in all laws: give each the same volumetric = …")
 
@@ -69,7 +70,7 @@ class MixedVolume(Physics):
         U = volumetric_part(self.law)
         mu, bulk = self.law.shear_modulus(), self.law.bulk_modulus()
         part = jnp.minimum(mu, bulk / 2)
-        kind = next(law.volumetric for law in U.summands())
+        kind = next(law.volumetric for law in U.pieces()[0].summands())
         mean = jax.lax.stop_gradient(jnp.sum(jnp.broadcast_to(mu, step.mesh.weights.shape) * step.mesh.weights))
         volume = jax.lax.stop_gradient(jnp.sum(step.mesh.volumes))
         width = (volume / step.mesh.number_of_vertices) ** (1 / 3)

@@ -1,0 +1,72 @@
+"""A body with laws of several kinds: each element has the law of its region, and is computed by that law alone."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, struct
+from liverjax.laws.base import Law, Volumetric
+from liverjax.tensors.matrices import Matrix
+from liverjax.tensors.subsets import Subsets, in_subset, put_together
+
+
+@struct
+class ByRegion(Law):
+    """Laws side by side, one for each subset of the elements.
+
+    Numbers of a law may be one an element of the whole body (E,); those of its subset count.
+    """
+
+    laws: tuple[Law, ...] = param("1", "one law for each subset", unnamed=True)
+    subsets: Subsets = param("1", "which elements each law has")  # type: ignore[assignment]
+
+    def pieces(self) -> tuple[Law, ...]:
+        """The laws, with the numbers of the whole body."""
+        return self.laws
+
+    def piece(self, k: int) -> Law:
+        """Law k with the numbers of its own elements."""
+        return in_subset(self.subsets, k, self.laws[k])
+
+    def each(self, change: Callable[[Law], Law]) -> "ByRegion":
+        """The same with every law changed."""
+        return ByRegion(laws=tuple(change(law) for law in self.laws), subsets=self.subsets)
+
+    def check(self) -> None:
+        """Check every law."""
+        for law in self.laws:
+            law.check()
+
+    def isochoric_part(self) -> Any:
+        """Of each law; None where one has none."""
+        if any(law.isochoric_part() is None for law in self.laws):
+            return None
+        return self.each(lambda law: law.isochoric_part())
+
+    def volumetric_part(self) -> Any:
+        """Of each law; None where none has one."""
+        if all(law.volumetric_part() is None for law in self.laws):
+            return None
+        return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))
+
+    def measures(self, F: Matrix) -> tuple:  # type: ignore[override]
+        """Those of each law at its own elements."""
+        return tuple(self.piece(k).measures(in_subset(self.subsets, k, F)) for k in range(len(self.laws)))
+
+    def strain_energy(self, I: tuple) -> jax.Array:  # type: ignore[override]
+        """Energy density (…, E) [Pa]."""
+        return put_together(self.subsets, [self.piece(k).strain_energy(i) for k, i in enumerate(I)])
+
+    def energy_derivatives(self, I: Any) -> Any:
+        """Laws of several kinds have no invariants in common."""
+        raise InputError("laws of several kinds have no derivatives in common: ask each of them")
+
+    def shear_modulus(self) -> jax.Array:
+        """(E,) [Pa]."""
+        return put_together(self.subsets, [self.piece(k).shear_modulus() for k in range(len(self.laws))])
+
+    def bulk_modulus(self) -> jax.Array:
+        """(E,) [Pa]."""
+        return put_together(self.subsets, [self.piece(k).bulk_modulus() for k in range(len(self.laws))])

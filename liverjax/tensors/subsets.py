@@ -1,0 +1,68 @@
+"""Elements in subsets that are computed apart: numbers of one subset, and all numbers put together again."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+T = TypeVar("T")
+
+
+class Subsets(NamedTuple):
+    """Every element in one subset."""
+
+    elements: tuple[jax.Array, ...]  # element numbers of each subset; (1, n), which no numbers by element are
+    places: jax.Array  # place of each element in all subsets, one after the other: (E,), or (1, E) of several points
+
+    @property
+    def number_of_elements(self) -> int:
+        """E."""
+        return self.places.shape[-1]
+
+
+def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
+    """First the elements of no group, if there are any, then each group.
+
+    Args:
+        groups: element numbers (n,) of groups that share none; they may be traced.
+        number_of_elements: E.
+    """
+    E = number_of_elements
+    groups = [jnp.asarray(group, jnp.int32) for group in groups]
+    rest = E - sum(len(group) for group in groups)
+    if rest:
+        others = jnp.ones(E, bool).at[jnp.concatenate(groups)].set(False)
+        groups = [jnp.nonzero(others, size=rest)[0].astype(jnp.int32), *groups]
+    places = jnp.zeros(E, jnp.int32).at[jnp.concatenate(groups)].set(jnp.arange(E, dtype=jnp.int32))
+    return Subsets(tuple(group[None] for group in groups), places)
+
+
+def in_subset(s: Subsets, k: int, numbers: T) -> T:
+    """Of a pytree, the numbers of subset k: of arrays (…, E) and (…, E, 3). What has no such axis stays."""
+    E, own = s.number_of_elements, s.elements[k][0]
+
+    def one(a: Any) -> Any:
+        shape = jnp.shape(a)
+        if shape[-1:] == (E,):
+            return jnp.asarray(a)[..., own]
+        return jnp.asarray(a)[..., own, :] if shape[-2:] == (E, 3) else a
+
+    return jax.tree.map(one, numbers)
+
+
+def put_together(s: Subsets, numbers: Sequence[T]) -> T:
+    """Numbers of all elements, from pytrees of one structure with the numbers (…, n) of each subset."""
+    leaves, trees = zip(*(jax.tree.flatten(each) for each in numbers), strict=True)
+    shapes = [
+        jnp.broadcast_shapes(*map(jnp.shape, own), (e.shape[1],)) for own, e in zip(leaves, s.elements, strict=True)
+    ]
+    lead = jnp.broadcast_shapes(s.places.shape[:-1], *(shape[:-1] for shape in shapes))
+    dtype = jnp.result_type(*(a for own in leaves for a in own))
+    # One array a subset: one copy in order, however many numbers an element has.
+    stacked = [
+        jnp.stack([jnp.broadcast_to(jnp.asarray(a, dtype), (*lead, shape[-1])) for a in own])
+        for own, shape in zip(leaves, shapes, strict=True)
+    ]
+    whole = jnp.concatenate(stacked, axis=-1)[..., s.places.reshape(-1)]
+    return jax.tree.unflatten(trees[0], list(whole))

@@ -1,0 +1,292 @@
+"""Regions with a law of another kind: terms against autodiff, bodies in series by hand, every scene, refusals."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.elements import mjed, projection, reference
+from liverjax.scenes import regions
+from liverjax.scenes.scene import with_parameters
+from liverjax.scenes.scene_file import scene_from
+from liverjax.tensors.matrices import deformation_gradient, unpack
+from liverjax.tensors.subsets import in_subset, put_together, subsets
+
+pytestmark = pytest.mark.quick_to_compile
+
+LIVER = lj.laws.NeoHookean(mu=800.0, bulk=3000.0)
+TUMOUR = lj.laws.create("ogden", mu=[600.0, 200.0], alpha=[2.0, -3.0], bulk=5000.0)
+
+
+def block(order=1, cells=(2, 2, 4)):
+    mesh = lj.shapes.box((0.01, 0.01, 0.02), cells)
+    return lj.quadratic(mesh) if order == 2 else mesh
+
+
+def upper(mesh):
+    centres = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
+    return jnp.asarray(np.flatnonzero(centres[:, 2] > 0.01))
+
+
+def test_subsets_come_apart_and_together():
+    groups = subsets([jnp.array([4, 1]), jnp.array([5])], 6)
+    assert [e.tolist() for e in groups.elements] == [[[0, 2, 3]], [[4, 1]], [[5]]]
+    numbers = {
+        "one": jnp.arange(6.0),
+        "points": jnp.arange(12.0).reshape(2, 6),
+        "vectors": jnp.arange(18.0).reshape(6, 3),
+    }
+    second = in_subset(groups, 1, numbers | {"same": 7.0})
+    assert second["one"].tolist() == [4, 1] and second["points"].tolist() == [[4, 1], [10, 7]] and second["same"] == 7.0
+    assert second["vectors"].tolist() == [[12, 13, 14], [3, 4, 5]]
+    found = put_together(groups, [(in_subset(groups, k, numbers["points"]), float(k)) for k in range(3)])
+    assert found[0].tolist() == numbers["points"].tolist() and found[1][0].tolist() == [0, 1, 0, 0, 1, 2]
+    assert len(subsets([jnp.array([1, 0])], 2).elements) == 1  # no element is left: no empty subset
+
+
+#: Kinds that differ in what they depend on: invariants, I2, stretches, Green's strain with fibres.
+KINDS = ("mooney_rivlin", "ogden", "costa", "exponential")
+
+
+@pytest.mark.parametrize("order, kinds", [(1, KINDS[1:3]), pytest.param(2, KINDS, marks=pytest.mark.slow)])
+def test_force_and_stiffness_are_derivatives_of_the_energy(order, kinds):
+    mesh = block(order, (2, 2, 3))
+    E = mesh.number_of_elements
+    parts = np.array_split(np.random.default_rng(0).permutation(E)[: E - 5], len(kinds))
+    own = tuple(
+        lj.Region(elements=jnp.asarray(e), law=lj.laws.typical(kind)) for kind, e in zip(kinds, parts, strict=True)
+    )
+    by_element = replace(LIVER, mu=jnp.linspace(500.0, 900.0, E))
+    law = regions.law_of_elements(by_element, own, E)
+    x = mesh.points + 2e-4 * jax.random.normal(jax.random.key(0), mesh.points.shape)
+
+    def energy(x):
+        """Every element by the energy of its law, without subsets."""
+        F = deformation_gradient(mesh, x)
+        whole = mesh.at_points(by_element)
+        density = whole.strain_energy(whole.measures(F))
+        for region in own:
+            density = density.at[..., region.elements].set(
+                region.law.strain_energy(region.law.measures(F))[..., region.elements]
+            )
+        return jnp.sum(mesh.weights * density)
+
+    np.testing.assert_allclose(mjed.energy(mesh, law, x), energy(x), rtol=1e-13)
+    f = jax.grad(energy)(x)
+    np.testing.assert_allclose(mjed.internal_force(mesh, law, x), f, atol=1e-13 * float(jnp.abs(f).max()))
+    v = jax.random.normal(jax.random.key(1), x.shape)
+    product = np.asarray(jax.jvp(jax.grad(energy), (x,), (v,))[1])
+    K = mjed.stiffness_matrix(mesh, law, x)
+    np.testing.assert_allclose(K @ np.asarray(v).ravel(), product.ravel(), atol=1e-12 * np.abs(product).max())
+    np.testing.assert_allclose(reference.energy(mesh, law, x), energy(x), rtol=1e-13)
+
+
+def test_projected_stiffness_has_no_negative_eigenvalue():
+    mesh = block(1, (2, 2, 2))
+    E = mesh.number_of_elements
+    own = (lj.Region(elements=upper(mesh), law=lj.laws.typical("saint_venant_kirchhoff")),)
+    stable = lj.laws.typical("stable_neo_hookean")
+    law = regions.law_of_elements(stable, own, E)
+    F = unpack(jnp.eye(3)[None] + 0.6 * jax.random.normal(jax.random.key(0), (E, 3, 3)))
+    D = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
+    pairs = tuple((a, b) for a in range(3) for b in range(3))
+    S = tuple(tuple(jnp.full(E, 50.0 * (i == j)) for j in range(3)) for i in range(3))
+    K = np.array(projection.blocks([(jnp.linspace(0.5, 0.9, E), law)], S, F, D, pairs))
+    whole = K.reshape(3, 3, 3, 3, E).transpose(4, 0, 2, 1, 3).reshape(E, 9, 9)
+    values = np.linalg.eigvalsh(whole)
+    assert values.min() > -1e-10 * values.max()
+    # The scene's law alone, where it acts.
+    alone = np.array(projection.blocks([(jnp.linspace(0.5, 0.9, E), stable)], S, F, D, pairs))
+    below = np.setdiff1d(np.arange(E), np.asarray(own[0].elements))
+    np.testing.assert_allclose(K[..., below], alone[..., below], rtol=1e-12, atol=1e-9)
+
+
+def test_two_laws_in_series_carry_one_force(verified):
+    """Held at the sides, each half is stretched uniformly: equal nominal stress, and stretches that add up."""
+    mesh = block(1, (1, 1, 4))
+    sides = lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="xy")
+    bottom = lj.Fixed(nodes=mesh.node_sets["z_min"], axes="z")
+    top = lj.Displaced(nodes=mesh.node_sets["z_max"], by=jnp.array([0.0, 0.0, -0.004]), axes="z")
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LIVER,
+        region=(lj.Region(elements=upper(mesh), law=TUMOUR),),
+        fixed=(sides, bottom),
+        displaced=(top,),
+        solve=lj.Solve(steps=2, tolerance=1e-12),
+    )
+
+    def stress(law, stretch):
+        return float(law.first_piola(jnp.diag(jnp.array([1.0, 1.0, stretch])))[2, 2])
+
+    lower = scipy.optimize.brentq(lambda l: stress(LIVER, l) - stress(TUMOUR, 1.6 - l), 0.5, 1.0, xtol=1e-14)
+    result = lj.simulate(scene).check()
+    force = np.asarray(result.reactions)[-1][np.asarray(mesh.node_sets["z_max"]), 2].sum()
+    exact = 1e-4 * stress(LIVER, lower)
+    verified("two laws in series, confined compression", "root of one equation", abs(force / exact - 1), 1e-9)
+    assert force == pytest.approx(exact, rel=1e-9)
+    middle = np.isclose(np.asarray(mesh.points)[:, 2], 0.01)
+    np.testing.assert_allclose(np.asarray(result.positions)[-1][middle, 2], 0.01 * lower, rtol=1e-9)
+
+
+#: What a scene may have: its changes, its element order, and whether it is a quick one.
+SCENES = {
+    "static": ({}, 1),
+    "projected": ({"solve": lj.Solve(steps=2, robust="projected")}, 1),
+    "direct": ({"solve": lj.Solve(steps=2, linear_solver="direct")}, 1),
+    "viscous": (
+        {
+            "viscosity": lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.1]), part="isochoric"),
+            "solve": lj.Solve(kind="dynamic", dt=0.02, steps=3, integrator="newmark"),
+            "body": lj.Body(density=1060.0, gravity=(0.0, 0.0, -9.81)),
+        },
+        1,
+    ),
+    "porous": (
+        {
+            "porosity": lj.Porosity(bulk=2000.0, limit_bulk=6000.0, fluid_fraction=0.8, permeability=1e-8),
+            "solve": lj.Solve(dt=0.02, steps=2),
+        },
+        1,
+    ),
+    "mixed": ({"solve": lj.Solve(steps=2, volumetric="mixed")}, 2),
+    "quadratic viscous": (
+        {
+            "viscosity": lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.1])),
+            "solve": lj.Solve(dt=0.02, steps=2, volumetric="element"),
+        },
+        2,
+    ),
+    "float32": ({"solve": lj.Solve(steps=1, precision="float32", tolerance=1e-4)}, 1),
+}
+QUICK = ("static", "mixed")
+
+
+def pulled(name, region):
+    changes, order = SCENES[name]
+    mesh = block(order, (2, 2, 2))
+    top = lj.Displaced(nodes=mesh.node_sets["z_max"], by=jnp.array([0.001, 0.0, 0.002]))
+    scene = lj.Scene(
+        mesh=mesh,
+        law=LIVER,
+        region=(region(upper(mesh)),),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),),
+        displaced=(top,),
+        solve=lj.Solve(steps=2),
+    )
+    return replace(scene, **changes)
+
+
+@pytest.mark.parametrize("name", [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
+def test_a_law_of_its_own_is_that_with_other_numbers(name):
+    """A region's own neo-Hookean law and other numbers of the scene's give one body, whatever the scene has."""
+    other = {"mu": 2000.0, "bulk": 4000.0}
+    numbers = lj.simulate(pulled(name, lambda e: lj.Region(elements=e, law=other))).check()
+    own = lj.simulate(pulled(name, lambda e: lj.Region(elements=e, law=lj.laws.NeoHookean(**other)))).check()
+    away = 1e-5 if name == "float32" else 1e-8
+    size = np.abs(np.asarray(numbers.positions) - np.asarray(block(SCENES[name][1], (2, 2, 2)).points)).max()
+    np.testing.assert_allclose(own.positions, numbers.positions, atol=away * size)
+
+
+def test_numbers_of_a_law_of_its_own_have_names_and_derivatives():
+    scene = pulled("static", lambda e: lj.Region(elements=e, law=lj.laws.typical("mooney_rivlin")))
+    top = scene.displaced[0].nodes
+
+    def force(c10):
+        changed = with_parameters(scene, {"region.0.law.c10": c10})
+        return lj.simulate(changed).reactions[-1, top, 2].sum()
+
+    at, h = 300.0, 0.03
+    value, slope = jax.jvp(force, (at,), (1.0,))
+    assert float(slope) == pytest.approx(float(force(at + h) - force(at - h)) / (2 * h), rel=1e-5)
+    assert abs(float(slope)) * at > 0.1 * abs(float(value))
+
+
+def test_harmonic_motion_knows_the_laws():
+    def moduli(region):
+        scene = pulled("static", region)
+        solve = lj.Solve(kind="harmonic", frequencies=jnp.array([50.0]))
+        return lj.harmonic(replace(scene, solve=solve, body=lj.Body(density=1000.0)))
+
+    other = {"mu": 2000.0, "bulk": 4000.0}
+    numbers = moduli(lambda e: lj.Region(elements=e, law=other)).displacement
+    own = moduli(lambda e: lj.Region(elements=e, law=lj.laws.NeoHookean(**other))).displacement
+    np.testing.assert_allclose(own, numbers, atol=1e-10 * float(jnp.abs(numbers).max()))
+
+
+@pytest.mark.slow
+def test_the_shape_before_the_load_knows_the_laws():
+    scene = pulled("static", lambda e: lj.Region(elements=e, law=TUMOUR))
+    scene = replace(scene, displaced=(), body=lj.Body(density=1060.0, gravity=(0.0, 0.0, -9.81)))
+    scene = replace(scene, solve=lj.Solve(tolerance=1e-12))
+    found = lj.unloaded(replace(scene, points_are="loaded"))
+    back = lj.simulate(found.scene).check().positions[-1]
+    np.testing.assert_allclose(back, scene.mesh.points, atol=1e-10)
+
+
+CONTENT = {
+    "mesh": {"shape": "box", "size": [0.01, 0.01, 0.02], "cells": [2, 2, 4]},
+    "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 3000.0},
+    "fixed": [{"where": {"z_max": 0.0}}],
+    "displaced": [{"where": {"z_min": 0.02}, "by": [0.0, 0.0, 0.001]}],
+}
+OGDEN = {"name": "ogden", "mu": [600.0, 200.0], "alpha": [2.0, -3.0], "bulk": 5000.0}
+
+
+def test_scene_files_name_a_law_for_a_region():
+    scene = scene_from(CONTENT | {"region": [{"where": {"z_min": 0.01}, "law": OGDEN}]})
+    assert isinstance(scene.region[0].law, lj.laws.Ogden)
+    assert [float(a) for a in jax.tree.leaves(scene.region[0].law)] == [float(a) for a in jax.tree.leaves(TUMOUR)]
+    both = scene_from(CONTENT | {"region": [{"where": {"z_min": 0.01}, "law": [OGDEN, CONTENT["law"]]}]})
+    assert len(both.region[0].law.summands()) == 2
+
+
+@pytest.mark.parametrize(
+    "more, sentence",
+    [
+        ({"region": [{"where": {"z_min": 0.01}, "law": {"name": "ogdn"}}]}, "did you mean ogden"),
+        ({"region": [{"where": {"z_min": 0.01}, "law": {"name": "ogden", "mu": [1.0]}}]}, "needs parameter alpha"),
+        ({"region": [{"where": {"z_min": 0.01}, "law": [{"mu": 1.0}]}]}, "region.0: law needs name"),
+        (
+            {"region": [{"where": {"z_min": 0.01}, "law": OGDEN}, {"where": {"z_min": 0.0}, "law": {"mu": 1.0}}]},
+            "region.1 changes the law of elements to which region.0",
+        ),
+        (
+            {"region": [{"where": {"z_min": 0.01}, "law": OGDEN}], "solve": {"volumetric": "nodal"}},
+            "averages volumes across regions",
+        ),
+        (
+            {
+                "region": [
+                    {"where": {"z_min": 0.01}, "law": {"name": "saint_venant_kirchhoff", "mu": 1.0, "lame_lambda": 1.0}}
+                ],
+                "viscosity": {"ratios": [0.5], "relaxation_times": [1.0], "part": "isochoric"},
+                "solve": {"dt": 0.1},
+            },
+            "needs a law with an isochoric part, which SaintVenantKirchhoff has not",
+        ),
+    ],
+)
+def test_unusable_laws_of_regions_get_one_sentence(more, sentence):
+    with pytest.raises(lj.InputError, match=sentence):
+        scene_from(CONTENT | more)
+
+
+def test_elements_named_twice_and_reduced_models_are_refused():
+    scene = pulled("static", lambda e: lj.Region(elements=jnp.concatenate([e, e[:1]]), law=TUMOUR))
+    with pytest.raises(lj.InputError, match="names an element twice"):
+        lj.check_scene(scene)
+    from liverjax.reduced.model import refuse_unknown_physics
+
+    with pytest.raises(lj.InputError, match="one kind of law"):
+        refuse_unknown_physics(pulled("static", lambda e: lj.Region(elements=e, law=TUMOUR)))
+
+
+def test_numbers_out_of_bounds_have_their_place():
+    with pytest.raises(lj.InputError, match=r"region\.0\.law\.bulk"):
+        lj.check_scene(pulled("static", lambda e: lj.Region(elements=e, law=dataclasses.replace(LIVER, bulk=-1.0))))
