@@ -32,6 +32,7 @@ TABLES: dict[str, dict[str, Any]] = {
     "Vessel": {"vessel": [{"line": LINE, "radius": 2e-3, "law": SOFT}]},
     "Obstacle": {"obstacle": [PLANE]},
     "RoughObstacle": {"obstacle": [PLANE | {"friction": 0.3}]},
+    "PressedObstacle": {"obstacle": [{k: PLANE[k] for k in ("shape", "position", "axis")} | {"force": [0, 0, -1.0]}]},
 }
 
 

@@ -10,6 +10,7 @@ from liverjax.physics.attached.vessel import Vessel
 from liverjax.physics.base import Physics
 from liverjax.physics.contact.friction import RoughObstacle
 from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.inertia import Inertia
@@ -28,6 +29,7 @@ NAMED: tuple[type[Physics], ...] = (
     Vessel,
     Obstacle,
     RoughObstacle,
+    PressedObstacle,
 )
 
 

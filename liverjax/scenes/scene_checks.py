@@ -43,7 +43,8 @@ def check_choices(scene: Scene) -> None:
     rubs = [name for name, physics in _named_physics(scene) if not physics.conservative]
     if rubs and (scene.solve.linear_solver == "direct" or scene.solve.robust != "off"):
         raise InputError(
-            f"{rubs[0]} has friction, whose forces have no energy: leave linear_solver = 'direct' and robust out"
+            f"{rubs[0]} has friction or a force, for which linear_solver = 'direct' and robust have no matrix: leave "
+            "them out"
         )
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")

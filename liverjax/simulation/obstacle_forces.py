@@ -17,6 +17,7 @@ class ObstacleForces(NamedTuple):
 
     force: jax.Array  # (obstacles, T, 3) [N] of the body on the obstacle
     depth: jax.Array  # (obstacles, T) [m] largest depth of the surface in it
+    displacement: jax.Array  # (obstacles, T, 3) [m] of the obstacle: where a force has pressed it, or as it was given
 
 
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
@@ -32,19 +33,21 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
     numbers = jnp.arange(1, len(result.positions) + 1)
     found = [p.in_body(scene.mesh, scene.law) for p in scene.physics if isinstance(p, Obstacle)]
 
-    def one(obstacle: Obstacle) -> tuple[jax.Array, jax.Array]:
+    def one(obstacle: Obstacle) -> tuple[jax.Array, jax.Array, jax.Array]:
         # What sticks remembers where it was: the steps are gone through in order.
-        def at(carry: Any, given: Any) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+        def at(carry: Any, given: Any) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
             (memory, before), (k, x) = carry, given
             acting = obstacle.freeze(memory, Step(mesh, before, k, steps, dt, False, None, free))
             push = jnp.sum(acting.force(mesh, x, 1.0), axis=0)
-            depth = largest_depth(obstacle, mesh, x, obstacle.displacement(k, steps, dt))
-            return (obstacle.advance(memory, acting, End(x, deformation_gradient(mesh, x), None)), x), (push, depth)
+            place = acting.place(x, 1.0)
+            found = (push, largest_depth(obstacle, mesh, x, place), place)
+            return (obstacle.advance(memory, acting, End(x, deformation_gradient(mesh, x), None)), x), found
 
         start = obstacle.begin(Start(mesh, mesh.points, free, lambda: jnp.zeros_like(mesh.points)))
         return jax.lax.scan(at, (start, mesh.points), (numbers, jnp.asarray(result.positions)))[1]
 
     if not found:
-        return ObstacleForces(jnp.zeros((0, len(numbers), 3)), jnp.zeros((0, len(numbers))))
+        none = jnp.zeros((0, len(numbers), 3))
+        return ObstacleForces(none, none[..., 0], none)
     each = [one(obstacle) for obstacle in found]
     return ObstacleForces(*(jnp.stack(a) for a in zip(*each, strict=True)))

@@ -171,7 +171,9 @@ def _small(scene: Scene, mass: str) -> Scene:
     if scene.porosity is not None:
         raise InputError("porosity has no harmonic motion here: leave it out, or run the scene in time")
     if not all(physics.conservative for physics in scene.physics):
-        raise InputError("friction has no harmonic motion here: leave it out, or run the scene in time")
+        raise InputError(
+            "friction and pressed obstacles have no harmonic motion here: leave them out, or run the scene in time"
+        )
     if follows(scene.traction):
         raise InputError("a pressure that follows the body has no harmonic motion here: give a traction as value")
     if scene.solve.volumetric in ("nodal", "mixed"):

@@ -55,6 +55,8 @@ class Obstacle(Physics):
     )
 
     section: ClassVar[str] = "obstacle"
+    #: What the factors of a history belong to.
+    driven: ClassVar[str] = "by"
     keys: ClassVar[tuple[str, ...]] = (
         *("shape", "where", "set", "position", "axis", "radius", "half_angle", "by", "history", "stiffness"),
     )
@@ -74,7 +76,7 @@ class Obstacle(Physics):
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         triangles = selection.boundary_triangles(mesh, nodes)
         given: dict[str, Any] = {key: table[key] for key in ("radius", "half_angle", "stiffness") if key in table}
-        given |= {k: _three_numbers(table[k], f"{name} {k}") for k in ("position", "axis", "by") if k in table}
+        given |= {k: three_numbers(table[k], f"{name} {k}") for k in ("position", "axis", "by") if k in table}
         if "axis" in given:
             given["axis"] = given["axis"] / max(float(jnp.linalg.norm(given["axis"])), 1e-300)
         if "history" in table:
@@ -95,7 +97,7 @@ class Obstacle(Physics):
         if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
         history.check(self.times, self.history, name)
-        if self.history is not None and np.ndim(self.history) == 1 and self.by is None:
+        if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
             raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         first = self.displacement(0, 1, 0.0)
@@ -153,9 +155,17 @@ class Touching(NodalForce):
         """Its displacement (3,) [m] at part s of the step."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
+    def place(self, x: jax.Array, s: Any) -> jax.Array:
+        """Its displacement (3,) [m] at positions x (V, 3) of the body and part s of the step."""
+        return self.now(s)
+
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
         """Minus the pressures, shared out to the nodes of their triangles."""
-        return contact_force(self.obstacle, mesh, x, self.now(s))
+        return self.force_at(mesh, x, self.place(x, s))
+
+    def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
+        """The same with the obstacle displaced by `moved` (3,)."""
+        return contact_force(self.obstacle, mesh, x, moved)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """Half of stiffness times depth squared."""
@@ -164,7 +174,7 @@ class Touching(NodalForce):
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
         """Second derivative of the energy: along the normal, and of the normal."""
-        d, k = _distances(self.obstacle, mesh, x, self.now(s)), weighted_stiffness(self.obstacle, mesh)
+        d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
         # A surface that just touches counts as pressed: else a body that lies on a plane begins with nothing below it.
         inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
@@ -247,7 +257,12 @@ def weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     return jnp.broadcast_to(whole / _POINTS.shape[1], (_POINTS.shape[1], *whole.shape))
 
 
-def _three_numbers(value: Any, name: str) -> jax.Array:
+def three_numbers(value: Any, name: str) -> jax.Array:
+    """A vector (3,) of a scene file.
+
+    Raises:
+        InputError: anything else.
+    """
     given = np.asarray(value, object)
     try:
         vector = np.array(given, float)

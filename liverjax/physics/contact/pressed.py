@@ -1,0 +1,202 @@
+"""A rigid obstacle that a given force presses into the body, as a weight on an indenter: it finds its own place.
+
+The obstacle moves along its force alone. Its travel t follows from the balance of forces along that line,
+
+    dE/dt(x, t) = F,
+
+E the energy of the contact at positions x. Eliminated, t(x) adds -h h^T / E_tt to the stiffness of the contact, with
+h = dE/dx dt. That is one dense matrix of rank one, so the product applies it and no matrix holds it.
+"""
+
+from typing import Any, ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import history
+from liverjax.core.errors import InputError
+from liverjax.core.struct import param, replace, struct
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import End, Start, Step
+from liverjax.physics.contact.obstacle import (
+    Obstacle,
+    Touching,
+    contact_points,
+    distances,
+    point_functions,
+    three_numbers,
+    touching_nodes,
+    weighted_stiffness,
+)
+
+#: Most steps of the search for the place of the obstacle.
+_MOST_STEPS = 200
+
+
+@struct
+class PressedObstacle(Obstacle):
+    """An obstacle under a force."""
+
+    force: Any = param("N", "that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
+
+    keys: ClassVar[tuple[str, ...]] = (*(key for key in Obstacle.keys if key != "by"), "force")
+    driven: ClassVar[str] = "force"
+    #: There is an energy, but the matrix of the solver does not have all of its second derivative.
+    conservative: ClassVar[bool] = False
+
+    @classmethod
+    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> Self:
+        """From [[obstacle]] with a force."""
+        plain = super().read(mesh, {key: value for key, value in table.items() if key != "force"}, name)
+        return replace(plain, force=three_numbers(table["force"], f"{name} force"))
+
+    def check(self, mesh: TetMesh, name: str) -> None:
+        """Besides: a force, no given motion, factors as history, and a body in the way."""
+        super().check(mesh, name)
+        history.check(self.times, self.history, name, (1,))
+        if self.by is not None:
+            raise InputError(f"{name} has a force and a motion by: leave one of them out")
+        force = np.asarray(self.force, float)
+        if force.shape != (3,) or not np.all(np.isfinite(force)) or not np.any(force):
+            raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
+        if not self._meets(mesh):
+            raise InputError(f"{name} force = {force.tolist()} presses it past the body: turn it or move position")
+
+    def _meets(self, mesh: TetMesh) -> bool:
+        """Whether the obstacle comes to the surface on its way."""
+        size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        at, direction, travel = contact_points(self, mesh, mesh.points), self.direction(), 0.0
+        far = size + max(float(jnp.min(distances(self, at, jnp.zeros(3)).value)), 0.0)
+        for _ in range(_MOST_STEPS):
+            gap = float(jnp.min(distances(self, at, travel * direction).value))
+            if gap <= 1e-3 * size:
+                return True
+            travel += gap
+            if travel > 2 * far:
+                break
+        return False
+
+    def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Nothing: it gives way."""
+        return np.zeros(0, int), np.zeros((0, 3))
+
+    def at_beginning(self) -> "PressedObstacle":
+        """Under the force of time 0; without a history not yet pressed."""
+        return self if self.history is not None else replace(self, times=jnp.zeros(1), history=jnp.zeros(1))
+
+    def direction(self) -> jax.Array:
+        """Of the force (3,)."""
+        force = jnp.asarray(self.force, float)
+        return force / jnp.linalg.norm(force)
+
+    def load(self, k: Any, steps: int, dt: Any) -> jax.Array:
+        """Size () [N] of the force at the end of step k; step 0 is the beginning of the run."""
+        whole = jnp.linalg.norm(jnp.asarray(self.force, float))
+        factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
+        return jnp.maximum(whole * factor, 0.0)
+
+    def displacement(self, k: Any, steps: int, dt: Any) -> jax.Array:
+        """None is given."""
+        return jnp.zeros(3)
+
+    def begin(self, start: Start) -> jax.Array:
+        """No travel () yet."""
+        return jnp.zeros((), start.x.dtype)
+
+    def freeze(self, memory: Any, step: Step) -> "Pressing":
+        """The force at the beginning and at the end of the step, and where the obstacle was."""
+        dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
+        load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
+        return Pressing(
+            obstacle=self,
+            moved=jnp.zeros((2, 3), dtype),
+            load=load,
+            direction=self.direction().astype(dtype),
+            before=jnp.zeros((), dtype) if memory is None else memory,
+            nodes=touching_nodes(self, step.mesh),
+            functions=point_functions(step.mesh, dtype),
+            hardness=weighted_stiffness(self, step.mesh),
+        )
+
+    def advance(self, memory: jax.Array, acting: "Pressing", end: End) -> jax.Array:
+        """The travel () [m] at the end of the step."""
+        return acting.travel(acting.points(end.x), 1.0)
+
+
+@struct
+class Pressing(Touching):
+    """The obstacle during a step."""
+
+    load: Any = param("N", "size of the force at the beginning and at the end (2,)", default=None)
+    direction: Any = param("1", "of the force (3,)", default=None)
+    before: Any = param("m", "travel at the beginning ()", default=None)
+    nodes: Any = param("1", "of the triangles (n, m)", default=None)
+    functions: Any = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
+    hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
+
+    conservative: ClassVar[bool] = False  # type: ignore[misc]
+
+    def points(self, x: jax.Array) -> jax.Array:
+        """Points of contact (3, Q, m) at positions x (V, 3)."""
+        return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
+
+    def place(self, x: jax.Array, s: Any) -> jax.Array:
+        """Displacement (3,) [m] of the obstacle at positions x (V, 3) and part s of the step."""
+        return self.travel(self.points(x), s) * self.direction
+
+    def travel(self, at: jax.Array, s: Any) -> jax.Array:
+        """Travel () [m] at which the contact carries the force; NaN where no place does. Has first derivatives."""
+        load = self.load[0] + s * (self.load[1] - self.load[0])
+        found = self._found(*jax.lax.stop_gradient((at, load)))
+        held, slope, _ = self._resistance(at, found)
+        # One more step of Newton: it changes nothing but the derivative.
+        return found + (load - held) / jnp.where(slope > 0, slope, 1.0)
+
+    def _resistance(self, at: jax.Array, travel: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """dE/dt [N] and its slope [N/m] at a travel, and the least distance [m]."""
+        d = distances(self.obstacle, at, travel * self.direction)
+        depth, inside = jnp.minimum(d.value, 0.0), (d.value < 0).astype(at.dtype)
+        along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
+        bent = sum(self.direction[i] * d.bent[i][j] * self.direction[j] for i in range(3) for j in range(3))
+        slope = self.hardness * (inside * along * along + depth * bent)
+        return -jnp.sum(self.hardness * depth * along), jnp.sum(slope), jnp.min(d.value)
+
+    def _found(self, at: jax.Array, load: jax.Array) -> jax.Array:
+        """The travel by Newton's method, in steps of at most twice the depth: the force grows with the travel."""
+        own = jax.lax.stop_gradient(self)
+        first = own._resistance(at, own.before)[0]
+        enough = 16 * float(jnp.finfo(at.dtype).eps) * jnp.maximum(load, first)
+        # No depth below this carries the force, even if all points touched.
+        least = load / jnp.sum(own.hardness)
+
+        def unfinished(c: tuple) -> jax.Array:
+            _, held, steps = c
+            return (abs(held - load) > enough) & (steps < _MOST_STEPS)
+
+        def closer(c: tuple) -> tuple:
+            travel, _, steps = c
+            held, slope, gap = own._resistance(at, travel)
+            newton = (load - held) / jnp.where(slope > 0, slope, 1.0)
+            most = 2 * jnp.maximum(-gap, least)
+            step = jnp.where((gap >= 0) & (load > 0), gap + least, jnp.clip(newton, -most, most))
+            travel = travel + step
+            return travel, own._resistance(at, travel)[0], steps + 1
+
+        begin = (own.before, first, jnp.zeros((), jnp.int32))
+        travel, held, _ = jax.lax.while_loop(unfinished, closer, begin)
+        return jnp.where(abs(held - load) <= 1e3 * enough, travel, jnp.nan)
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Of the contact, less the work of the force."""
+        at = self.points(x)
+        travel = self.travel(at, 1.0)
+        depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)
+        return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
+
+    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+        """-h (h . dx) / E_tt: the obstacle gives way."""
+        travel = self.travel(self.points(x), s)
+        h = jax.jvp(lambda t: self.force_at(mesh, x, t * self.direction), (travel,), (jnp.ones_like(travel),))[1]
+        slope = self._resistance(self.points(x), travel)[1]
+        return -h * (jnp.vdot(h, dx) / jnp.where(slope > 0, slope, 1.0))

@@ -1,0 +1,165 @@
+"""Obstacles under a force: a bar by hand, the same body moved by the travel that was found, unloading, derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.contact.pressed import PressedObstacle
+from liverjax.scenes.scene_file import scene_from
+
+pytestmark = pytest.mark.quick_to_compile
+
+LAW = lj.laws.NeoHookean(mu=800.0, bulk=2400.0)
+SIDE = 0.01
+
+
+def cube(obstacle, order=1, cells=(2, 2, 2), **changes):
+    """A cube of 1 cm on a table."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), cells)
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    top = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"])
+    given = {"fixed": (lj.Fixed(nodes=mesh.node_sets["z_min"]),), "solve": lj.Solve(steps=2, tolerance=1e-10)} | changes
+    return lj.Scene(mesh=mesh, law=LAW, physics=(obstacle(jnp.asarray(top)),), **given)
+
+
+def plane(top, **numbers):
+    place = {"position": jnp.array([0.0, 0.0, SIDE]), "axis": jnp.array([0.0, 0.0, -1.0])}
+    return PressedObstacle(triangles=top, shape="plane", **place | numbers)
+
+
+def sphere(kind, top, **numbers):
+    place = {"position": jnp.array([0.4 * SIDE, 0.5 * SIDE, SIDE + 0.006]), "radius": 0.005}
+    return kind(triangles=top, shape="sphere", **place, **numbers)
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_plate_on_a_held_bar(order, verified):
+    """No motion to the side: stress F/A at one stretch, and the plate as deep in the surface as its stiffness says."""
+    F, hardness = 0.05, 1e8
+    scene = cube(lambda top: plane(top, force=jnp.array([0.0, 0.0, -F]), stiffness=hardness), order, (1, 1, 2))
+    nodes = jnp.arange(scene.mesh.number_of_nodes)
+    scene = replace(scene, fixed=(*scene.fixed, lj.Fixed(nodes=nodes, axes="xy")))
+    result = lj.simulate(scene).check()
+    found = lj.obstacle_forces(scene, result)
+
+    def stress(stretch):
+        return float(LAW.first_piola(jnp.diag(jnp.array([1.0, 1.0, stretch])))[2, 2])
+
+    stretch = scipy.optimize.brentq(lambda l: stress(l) + F / SIDE**2, 0.5, 1.0, xtol=1e-15)
+    travel = SIDE * (1 - stretch) + F / SIDE**2 / hardness
+    error = abs(float(found.displacement[0, -1, 2]) / -travel - 1)
+    verified(f"plate under a weight on a held bar, order {order}", "root of one equation", error, 1e-8)
+    assert error < 1e-8
+    np.testing.assert_allclose(found.force[0, :, 2], [F / 2, F], rtol=1e-10)
+    np.testing.assert_allclose(result.positions[-1][scene.mesh.node_sets["z_max"], 2], SIDE * stretch, rtol=1e-9)
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_ball_pressed_is_the_ball_moved_as_far(order):
+    """Beginning 1 mm above the body: the travel that a force finds has that force."""
+    force = jnp.array([0.0, 0.002, -0.02])
+    pressed = cube(lambda top: sphere(PressedObstacle, top, force=force), order)
+    at_rest = lj.simulate(pressed).check()
+    found = lj.obstacle_forces(pressed, at_rest)
+    along = np.asarray(force) / np.linalg.norm(force)
+    travel = np.asarray(found.displacement[0])
+    assert travel[-1] @ along > 1e-3
+    np.testing.assert_allclose(np.cross(travel, along), 0, atol=1e-15)
+    np.testing.assert_allclose(
+        np.asarray(found.force[0]) @ -along, np.linalg.norm(force) * np.array([0.5, 1]), rtol=1e-9
+    )
+    moved = cube(lambda top: sphere(Obstacle, top, by=jnp.asarray(travel[-1])), order)
+    np.testing.assert_allclose(lj.simulate(moved).check().positions[-1], at_rest.positions[-1], atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_load_that_goes_lets_the_body_back():
+    history = {"times": jnp.array([0.0, 0.2, 0.4]), "history": jnp.array([0.0, 1.0, 0.0])}
+    scene = cube(
+        lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -0.02]), **history),
+        solve=lj.Solve(steps=4, dt=0.1, tolerance=1e-10),
+    )
+    result = lj.simulate(scene).check()
+    found = lj.obstacle_forces(scene, result)
+    np.testing.assert_allclose(found.force[0, :, 2], [0.01, 0.02, 0.01, 0.0], atol=1e-11)
+    np.testing.assert_allclose(result.positions[-1], scene.mesh.points, atol=1e-9)
+    np.testing.assert_allclose(result.positions[0], result.positions[2], atol=1e-9)
+    assert found.displacement[0, -1, 2] > found.displacement[0, 0, 2]
+
+
+def test_the_travel_has_derivatives():
+    scene = cube(lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -0.02])), cells=(1, 1, 1))
+
+    def travel(mu):
+        own = lj.with_parameters(scene, {"law.mu": mu})
+        return lj.obstacle_forces(own, lj.simulate(own)).displacement[0, -1, 2]
+
+    value, slope = jax.jvp(travel, (800.0,), (1.0,))
+    errors = [abs(float(travel(800.0 + h) - travel(800.0 - h)) / (2 * h) / slope - 1) for h in (0.8, 0.02)]
+    assert min(errors) < 1e-6
+    assert slope > 0 > value  # stiffer: less deep
+
+
+@pytest.mark.slow
+def test_gradients_through_a_pressed_obstacle():
+    scene = cube(lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -0.02])))
+
+    def depth(log):
+        own = lj.with_parameters(scene, {"law.mu": 800.0 * jnp.exp(log)})
+        return 1e3 * jnp.min(lj.simulate(own).positions[-1, :, 2])
+
+    def top(log):
+        own = lj.with_parameters(scene, {"law.mu": 800.0 * jnp.exp(log)})
+        return 1e3 * jnp.mean(lj.simulate(own).positions[-1][scene.mesh.node_sets["z_max"], 2])
+
+    slope = float(jax.grad(top)(0.0))
+    errors = [abs(float(top(h) - top(-h)) / (2 * h) / slope - 1) for h in (1e-2, 1e-3, 1e-4)]
+    assert slope > 0 and min(errors) < 1e-6 and depth(0.0) == 0
+
+
+def test_a_body_on_which_a_plate_lies_with_inertia():
+    """A plate without mass on a body that falls back: its force is the given one at every step."""
+    scene = cube(
+        lambda top: plane(top, force=jnp.array([0.0, 0.0, -0.02])),
+        cells=(1, 1, 1),
+        body=lj.Body(density=1000.0, gravity=(0.0, 0.0, 0.0)),
+        solve=lj.Solve(kind="dynamic", dt=0.01, steps=3),
+    )
+    found = lj.obstacle_forces(scene, lj.simulate(scene).check())
+    np.testing.assert_allclose(found.force[0, :, 2], 0.02 * np.array([1, 2, 3]) / 3, rtol=1e-9)
+
+
+CONTENT = {
+    "mesh": {"shape": "box", "size": [0.01, 0.01, 0.01], "cells": [1, 1, 1]},
+    "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 2400.0},
+    "fixed": [{"where": {"z_max": 0.0}}],
+}
+BALL = {"shape": "sphere", "radius": 0.005, "position": [0.005, 0.005, 0.016], "force": [0, 0, -0.01]}
+
+
+def test_scene_files_press_an_obstacle():
+    scene = scene_from(CONTENT | {"obstacle": [BALL | {"history": [[0, 0], [1, 1]]}], "solve": {"dt": 0.5, "steps": 2}})
+    assert isinstance(scene.physics[0], PressedObstacle)
+    assert scene.physics[0].load(1, 2, 0.5) == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"force": [0, 0, 1.0]}, "presses it past the body"),
+        ({"force": [0, 0, 0]}, "not all 0"),
+        ({"force": [0, 1]}, "must be three numbers"),
+        ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has"),
+        ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has"),
+        ({"history": [[0, 0, 0, 1]]}, "history"),
+    ],
+)
+def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):
+    with pytest.raises(lj.InputError, match=words) as told:
+        scene_from(CONTENT | {"obstacle": [BALL | change], "solve": {"dt": 1.0}})
+    assert "\n" not in str(told.value)
