@@ -14,7 +14,7 @@ from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
 
-LAW = lj.laws.NeoHookean(mu=800.0, bulk=2400.0)
+LAW = lj.laws.NeoHookean(mu=800.0, bulk=4000.0)
 SIDE = 0.01
 
 
@@ -93,15 +93,17 @@ def test_a_load_that_goes_lets_the_body_back():
 
 
 def test_the_travel_has_derivatives():
-    scene = cube(lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -0.02])), cells=(1, 1, 1))
+    """All points touch, so that no quotient sees one open; the bulk modulus is not 3 mu, where hardness has a kink."""
+    tilted = {"axis": jnp.array([0.0, np.sin(0.02), -np.cos(0.02)]), "position": jnp.array([0.0, 0.0, SIDE])}
+    scene = cube(lambda top: plane(top, force=jnp.array([0.0, 0.0, -0.05]), **tilted), cells=(1, 1, 1))
 
     def travel(mu):
         own = lj.with_parameters(scene, {"law.mu": mu})
         return lj.obstacle_forces(own, lj.simulate(own)).displacement[0, -1, 2]
 
     value, slope = jax.jvp(travel, (800.0,), (1.0,))
-    errors = [abs(float(travel(800.0 + h) - travel(800.0 - h)) / (2 * h) / slope - 1) for h in (0.8, 0.02)]
-    assert min(errors) < 1e-6
+    errors = [abs(float(travel(800.0 + h) - travel(800.0 - h)) / (2 * h) / slope - 1) for h in (20.0, 2.0)]
+    assert errors[0] < 1e-2 and errors[1] < 0.02 * errors[0]
     assert slope > 0 > value  # stiffer: less deep
 
 

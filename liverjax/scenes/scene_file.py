@@ -139,14 +139,14 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 
 
 def _with_paths(content: Any, folder: Path) -> Any:
-    """With files of histories and of a reduced model relative to the folder of the scene file."""
+    """With files of histories, surfaces and of a reduced model relative to the folder of the scene file."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):
         return content
     return {
         key: str(folder / value)
-        if key in ("history", "reduced") and isinstance(value, str)
+        if key in ("history", "reduced", "surface") and isinstance(value, str)
         else _with_paths(value, folder)
         for key, value in content.items()
     }

@@ -5,6 +5,7 @@ of its element, so that it ties nothing that the elements do not tie. Its sectio
 its law acts in tension along it, at constant volume. The tissue that the wall displaces is not taken off.
 """
 
+from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
@@ -17,7 +18,8 @@ from liverjax.laws import layers
 from liverjax.laws.base import Law
 from liverjax.mesh import locate
 from liverjax.mesh.basis import functions
-from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.mesh.tetrahedra import UNITS, TetMesh
+from liverjax.physics.attached.centre_lines import CentreLines, centre_lines, read_surface
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
@@ -37,24 +39,31 @@ class Vessel(Physics):
     law: Law = param("1", "of the wall")
 
     section: ClassVar[str] = "vessel"
-    keys: ClassVar[tuple[str, ...]] = ("where", "set", "line", "radius", "wall", "law")
+    keys: ClassVar[tuple[str, ...]] = ("where", "set", "line", "surface", "unit", "radius", "wall", "law")
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Vessel":
-        """From [[vessel]]: points of a centre line, a radius (or one a point), a law."""
-        for key in ("line", "radius", "law"):
-            if key not in table:
-                raise InputError(f"{name} needs {key}: write line = [[x, y, z], …], radius in m and [vessel.law]")
+        """From [[vessel]]: points of a centre line and a radius (or one a point), or the file of a surface; a law."""
+        if ("line" in table) == ("surface" in table) or "law" not in table:
+            raise InputError(
+                f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
+            )
         if "where" in table or "set" in table:
             raise InputError(f"{name} has a place, but its line says where it is: leave the place out")
+        given = {"wall": table["wall"]} if "wall" in table else {}
+        law = layers.read_layer(table["law"], name)
+        if "surface" in table:
+            lines = _lines_of_surface(table, name)
+            return crossing(mesh, lines, law, name=name, **given)
+        if "radius" not in table or "unit" in table:
+            raise InputError(f"{name} line needs radius, both in m: give radius, and leave unit out")
         try:
             line, radius = np.array(table["line"], float), np.array(table["radius"], float)
         except (TypeError, ValueError):
             line, radius = np.empty(0), np.empty(0)
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
             raise InputError(f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each")
-        given = {"wall": table["wall"]} if "wall" in table else {}
-        return along(mesh, line, radius, law=layers.read_layer(table["law"], name), name=name, **given)
+        return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
         """Elements of the mesh, a wall within the radius, a law without directions."""
@@ -80,25 +89,61 @@ class Vessel(Physics):
         return jnp.pi * (jnp.asarray(self.radius) ** 2 - inner**2)
 
 
+def _lines_of_surface(table: dict[str, Any], name: str) -> CentreLines:
+    """Centre lines of the tubes of a file, with a radius of their own where one is given."""
+    unit, radius = table.get("unit", "m"), table.get("radius")
+    if unit not in UNITS:
+        raise InputError(f"{name} unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
+    if not isinstance(table["surface"], str):
+        raise InputError(f"{name} surface = {table['surface']!r} must name a file: write surface = 'tube.stl'")
+    lines = centre_lines(*read_surface(Path(table["surface"]), UNITS[unit], name), name)
+    if radius is None:
+        return lines
+    if isinstance(radius, bool) or not isinstance(radius, (int, float)):
+        raise InputError(f"{name} radius = {radius!r} of a surface must be one number in m: give it, or leave it out")
+    return lines._replace(radius=np.full(len(lines.radius), float(radius)))
+
+
 def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: Any) -> Vessel:
     """A vessel along a line (n, 3) [m] with one radius or one a point (n,) [m]; what lies outside is left out.
 
     Raises:
         InputError: a line outside the body.
     """
-    cut = locate.pieces(mesh, line[:-1], line[1:])
-    if not len(cut.element):
-        raise InputError(f"{name} line lies outside the body: move it, or check its unit (m)")
-    ends = []
-    for at in (cut.begin, cut.end):
-        points = line[cut.line] + at[:, None] * (line[cut.line + 1] - line[cut.line])
-        L = locate.barycentric(mesh, points)
-        ends.append(jnp.asarray(L[:, np.arange(len(points)), cut.element]))
+    cut = _cut(mesh, line[:-1], line[1:], name)
     if np.ndim(radius):
         middle = 0.5 * (cut.begin + cut.end)
         radius = jnp.asarray(radius[cut.line] + middle * (radius[cut.line + 1] - radius[cut.line]))
     else:
         radius = float(radius)
+    return _of_pieces(mesh, cut, (line[:-1], line[1:]), radius, law, **given)
+
+
+def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: Any) -> Vessel:
+    """Vessels along centre lines, as of a tree; what lies outside the body is left out.
+
+    Raises:
+        InputError: lines outside the body.
+    """
+    cut = _cut(mesh, lines.begin, lines.end, name)
+    return _of_pieces(mesh, cut, (lines.begin, lines.end), jnp.asarray(lines.radius[cut.line]), law, **given)
+
+
+def _cut(mesh: TetMesh, begin: np.ndarray, end: np.ndarray, name: str) -> locate.Pieces:
+    cut = locate.pieces(mesh, begin, end)
+    if not len(cut.element):
+        raise InputError(f"{name} lies outside the body: move it, or check its unit")
+    return cut
+
+
+def _of_pieces(
+    mesh: TetMesh, cut: locate.Pieces, lines: tuple[np.ndarray, np.ndarray], radius: Any, law: Law, **given: Any
+) -> Vessel:
+    ends = []
+    for at in (cut.begin, cut.end):
+        points = lines[0][cut.line] + at[:, None] * (lines[1][cut.line] - lines[0][cut.line])
+        L = locate.barycentric(mesh, points)
+        ends.append(jnp.asarray(L[:, np.arange(len(points)), cut.element]))
     element = jnp.asarray(cut.element, jnp.int32)
     return Vessel(element=element, enters=ends[0], leaves=ends[1], radius=radius, law=law, **given)
 

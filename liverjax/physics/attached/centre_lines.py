@@ -1,0 +1,206 @@
+"""Centre lines and radii of tubes from their surface, as a segmentation writes it: one tube, or a tree of them.
+
+Lines of equal distance along the surface, from one end, are rings about the tubes, one a branch. Their centres, joined
+across the bands between them, are the centre lines. The radius of a piece is the mean distance of its rings from it.
+Lines begin and end where the surface does.
+
+Source: level sets of geodesic distance (Verroust and Lazarus 2000, Extracting skeletal curves from 3D scattered data).
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+
+#: Distance between rings over the mean radius of the tubes.
+_BAND = 2.0
+#: Rings of fewer points go about no tube.
+_LEAST = 5
+
+
+class CentreLines(NamedTuple):
+    """Pieces of centre lines."""
+
+    begin: np.ndarray  # (m, 3) [m]
+    end: np.ndarray  # (m, 3) [m]
+    radius: np.ndarray  # (m,) [m]
+
+
+def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (n, 3) [m] and triangles (t, 3) of a surface file, corners of one place joined.
+
+    Args:
+        path: any format of meshio with triangles (STL, PLY, OBJ, VTK, …).
+        scale: unit of the file [m].
+        name: of what asks, for messages.
+
+    Raises:
+        InputError: a file that cannot be read, or without triangles.
+    """
+    import meshio
+
+    try:
+        found = meshio.read(path)
+    except (OSError, ValueError, KeyError, IndexError, SystemExit, meshio.ReadError) as error:
+        raise InputError(f"{name} surface {path} cannot be read ({error or 'unknown format'}): give an STL") from None
+    triangles = [block.data for block in found.cells if block.type == "triangle"]
+    if not triangles:
+        raise InputError(f"{name} surface {path} holds no triangles: export the surface of the tube")
+    points = scale * np.asarray(found.points, float)[:, :3]
+    size = float(np.ptp(points, axis=0).max())
+    _, first, place = np.unique(np.round(points / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
+    corners = place.ravel()[np.concatenate(triangles)]
+    flat = (corners[:, 0] == corners[:, 1]) | (corners[:, 1] == corners[:, 2]) | (corners[:, 0] == corners[:, 2])
+    return points[first], corners[~flat]
+
+
+class _Rings(NamedTuple):
+    """Rings of one surface, and the bands between them."""
+
+    points: np.ndarray  # (p, 3) where the edges cross levels
+    ring: np.ndarray  # (p,) number of the ring of each
+    below: np.ndarray  # (r,) band below each ring
+    above: np.ndarray  # (r,) band above each
+    band: np.ndarray  # (n,) band of each corner
+
+
+def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel") -> CentreLines:
+    """Centre lines of the tubes with this surface.
+
+    Args:
+        points: corners (n, 3) [m].
+        triangles: (t, 3) corners of each; tubes may be open or closed at their ends.
+        name: of what asks, for messages.
+
+    Raises:
+        InputError: a surface too short or too coarse to have a line.
+    """
+    import scipy.sparse
+    from scipy.sparse.csgraph import connected_components
+
+    edges = _edges(triangles)
+    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    graph = scipy.sparse.coo_array((lengths, edges.T), shape=(len(points),) * 2).tocsr()
+    parts, of = connected_components(graph, directed=False)
+    found = []
+    for part in range(parts):
+        own = np.flatnonzero(of == part)
+        inside = triangles[of[triangles[:, 0]] == part]
+        if len(own) < 2 * _LEAST:
+            continue
+        number = np.full(len(points), -1)
+        number[own] = np.arange(len(own))
+        here, corners = points[own], number[inside]
+        away = _from_one_end(graph, own)[own]
+        found.append(_pieces(here, _rings_of(here, corners, away)))
+    if not found or not sum(len(lines.begin) for lines in found):
+        raise InputError(f"{name} surface is too short or too coarse for a centre line: give line and radius")
+    return CentreLines(*(np.concatenate(arrays) for arrays in zip(*found, strict=True)))
+
+
+def _edges(triangles: np.ndarray) -> np.ndarray:
+    every = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    return np.unique(np.sort(every, axis=1), axis=0)
+
+
+def _from_one_end(graph: Any, own: np.ndarray) -> np.ndarray:
+    """Distance along the edges (n,) from the corner that is farthest from any other one."""
+    from scipy.sparse.csgraph import dijkstra
+
+    first = dijkstra(graph, directed=False, indices=own[0])
+    return dijkstra(graph, directed=False, indices=own[np.argmax(first[own])])
+
+
+def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
+    """Distance between rings: by the area of the surface over its length; no edge crosses two of them."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    longest = max(np.ptp(away[triangles], axis=1).max(), 1e-300)
+    return float(max(_BAND * area / (2 * np.pi * away.max()), 1.01 * longest))
+
+
+def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _Rings:
+    """Where edges cross the levels, in the middle of each spacing."""
+    import scipy.sparse
+    from scipy.sparse.csgraph import connected_components
+
+    level = np.floor(away / _spacing(points, triangles, away) + 0.5).astype(int)
+    spacing, edges, n = _spacing(points, triangles, away), _edges(triangles), len(points)
+    same = edges[level[edges[:, 0]] == level[edges[:, 1]]]
+    band = connected_components(scipy.sparse.coo_array((np.ones(len(same)), same.T), shape=(n, n)), directed=False)[1]
+    crossing = edges[level[edges[:, 0]] != level[edges[:, 1]]]
+    swap = level[crossing[:, 0]] > level[crossing[:, 1]]
+    crossing[swap] = crossing[swap][:, ::-1]
+    low, high = crossing.T
+    part = ((level[low] + 0.5) * spacing - away[low]) / (away[high] - away[low])
+    at = points[low] + part[:, None] * (points[high] - points[low])
+    # The two crossing edges of a triangle are neighbours on a ring.
+    key = np.minimum(low, high) * n + np.maximum(low, high)
+    order = np.argsort(key)
+    sides = np.stack([np.sort(triangles[:, pair], axis=1) @ [n, 1] for pair in ([0, 1], [1, 2], [2, 0])], axis=1)
+    place = np.clip(np.searchsorted(key[order], sides), 0, len(key) - 1)
+    known = key[order][place] == sides
+    place = np.where(known, order[place], -1)
+    cut = place[known.sum(axis=1) == 2]
+    pairs = cut[cut >= 0].reshape(-1, 2)
+    touching = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(key),) * 2)
+    count, ring = connected_components(touching, directed=False)
+    first = np.zeros(count, int)
+    first[ring] = np.arange(len(ring))
+    return _Rings(at, ring, band[low[first]], band[high[first]], band)
+
+
+def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
+    """Lines between the centres of rings that bound one band; from the last ring of a branch to its end."""
+    count = np.bincount(r.ring)
+    centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
+    r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
+    lines = []
+    for a in real:
+        for b in real[r.below[real] == r.above[a]]:
+            lines.append((centre[a], centre[b], np.isin(r.ring, (a, b))))
+    for a in real:
+        for own, others in ((r.above[a], r.below[real]), (r.below[a], r.above[real])):
+            if own in others:
+                continue
+            last = points[r.band == own] - centre[a]
+            along = _outwards(centre, r, real, a, own)
+            reach = (last @ along).max()
+            if reach > 0:
+                lines.append((centre[a], centre[a] + reach * along, r.ring == a))
+    radius = [_distance(r.points[own], begin, end) for begin, end, own in lines]
+    begin, end = (np.array([line[k] for line in lines]).reshape(-1, 3) for k in (0, 1))
+    return CentreLines(begin, end, np.array(radius))
+
+
+def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
+    """Without the last ring of each branch, which may go about a corner of the end: its bands become one."""
+    keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
+    sides = np.concatenate([below[real], above[real]])
+    for a in real:
+        for tip, inner in ((below[a], above[a]), (above[a], below[a])):
+            if np.sum(sides == tip) == 1 and np.sum(sides == inner) == 2:
+                keep.discard(int(a))
+                band[band == tip] = inner
+    return r._replace(band=band), np.array(sorted(keep), int)
+
+
+def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
+    """Direction (3,) of the line at its last ring a: on from the ring before, or the normal of the ring alone."""
+    inner = r.below[a] if own == r.above[a] else r.above[a]
+    before = [b for b in real if b != a and inner in (r.below[b], r.above[b])]
+    if before:
+        along = centre[a] - centre[before[0]]
+    else:
+        ring = r.points[r.ring == a] - centre[a]
+        along = np.linalg.svd(ring)[2][2]
+    return along / np.linalg.norm(along)
+
+
+def _distance(points: np.ndarray, begin: np.ndarray, end: np.ndarray) -> float:
+    """Mean distance of points (n, 3) from the line through two points."""
+    along = (end - begin) / np.linalg.norm(end - begin)
+    away = points - begin
+    return float(np.mean(np.linalg.norm(away - np.outer(away @ along, along), axis=1)))
