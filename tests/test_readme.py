@@ -15,6 +15,7 @@ import fitting.__main__
 import liverjax as lj
 import liverjax.__main__
 from experiments.pages import porosity, write
+from fitting.rigs.described import read_described
 from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
@@ -97,13 +98,26 @@ def test_the_front_page_is_short():
         assert len([line for line in use.splitlines() if line.strip()]) <= 10
 
 
-@pytest.mark.parametrize("block", blocks("toml"))
+#: Scene files, and descriptions of tests in rigs.
+SCENES, TESTS = ([b for b in blocks("toml") if b.values[0].startswith("test =") is it] for it in (False, True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", TESTS)
+def test_descriptions_are_read_as_printed(block, tmp_path):
+    (tmp_path / "test.toml").write_text(block)
+    rows = "\n".join(f"{k},1e-5,{0.01 / k}" for k in range(1, 9))
+    (tmp_path / tomllib.loads(block)["data"]).write_text(f"time_s,displacement_m,force_N\n{rows}\n")
+    assert read_described(tmp_path / "test.toml").used.sum() == 8
+
+
+@pytest.mark.parametrize("block", SCENES)
 def test_scene_files_load_as_printed(block):
     scene_from(tomllib.loads(BODY) | tomllib.loads(block))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", blocks("toml"))
+@pytest.mark.parametrize("block", SCENES)
 def test_scene_files_run_as_printed(block):
     lj.simulate(scene_from(tomllib.loads(BODY) | tomllib.loads(block))).check()
 

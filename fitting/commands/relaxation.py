@@ -3,9 +3,13 @@
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fitting.commands.exit_codes import EXIT_CODES
 from liverjax.core.errors import InputError
+
+if TYPE_CHECKING:
+    from fitting.readers.time_tests import TimeTest
 
 COLUMNS = """The file has a column of time and one of these: relaxation_modulus_Pa (creep: creep_compliance_1/Pa);
 strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns the test is computed as it
@@ -21,7 +25,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
         epilog=COLUMNS + EXIT_CODES,
     )
     command.set_defaults(kind=kind)
-    command.add_argument("file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text")
+    command.add_argument(
+        "file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text; or TOML that describes a test in a rig"
+    )
     command.add_argument(
         "--modes", type=_modes_in_time, default="auto", help="number of relaxation modes, or auto (default)"
     )
@@ -52,6 +58,23 @@ def check_samples(count: int | None) -> None:
         raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
 
 
+def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
+    """The test that a TOML file describes, which says all of it."""
+    from fitting.rigs.described import read_described
+
+    for name in ("radius", "height", "ramp", "min_time"):
+        if getattr(options, name):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} belongs into {options.file}, which describes the test: leave the option out")
+    test = read_described(options.file)
+    if test.kind != options.kind:
+        raise InputError(
+            f"{options.file} is a {test.kind} test: call python -m fitting {test.kind}, or give drive = "
+            f"'{'displacement' if options.kind == 'relaxation' else 'force'}' in the file"
+        )
+    return test
+
+
 def run(options: argparse.Namespace) -> int:
     """Fit the test; 1 if the fit did not converge."""
     from fitting.fits import time_tests as fits
@@ -66,7 +89,10 @@ def run(options: argparse.Namespace) -> int:
     check_samples(options.samples)
     out = options.out or Path(options.kind)
     sample = reader.Sample(options.radius, options.height)
-    test = reader.read_time_test(options.file, options.kind, sample, options.ramp, options.min_time)
+    if options.file.suffix.lower() == ".toml":
+        test = _in_its_rig(options)
+    else:
+        test = reader.read_time_test(options.file, options.kind, sample, options.ramp, options.min_time)
     for note in test.notes:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))

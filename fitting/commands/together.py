@@ -50,9 +50,14 @@ def _read_one_sweep(options: argparse.Namespace, path: Path) -> "Measured":
 
 
 def read_any(options: argparse.Namespace, path: Path) -> "Measured":
-    """Shear waves, a test in time, or another sweep."""
+    """A test in a rig, shear waves, a test in time, or another sweep."""
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion
+
+    if path.suffix.lower() == ".toml":
+        from fitting.rigs.described import read_described
+
+        return read_described(path)
 
     if dispersion.names_velocities(path):
         return dispersion.read_dispersion(path, options.density)

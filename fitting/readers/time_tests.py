@@ -59,8 +59,8 @@ FORMS = (
 )
 
 
-#: Relative error at which a floor of the noise begins to count.
-RELATIVE = 0.03
+#: Relative error at which a floor of the noise begins to count; of a test in cycles, part of the largest answer.
+RELATIVE, CYCLIC = 0.03, 0.1
 
 
 class TimeTest(NamedTuple):
@@ -80,7 +80,19 @@ class TimeTest(NamedTuple):
         answer = self.answer[self.used]
         smooth = np.abs(np.diff(answer, 3))  # three differences of independent noise have 20 times its variance
         noise = float(np.median(smooth)) / 0.6745 / np.sqrt(20) if len(smooth) else 0.0
-        return np.hypot(answer, noise / RELATIVE)
+        floor = max(noise / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
+        return np.hypot(answer, floor)
+
+    @property
+    def cyclic(self) -> bool:
+        """Whether what is driven falls by more than half of its largest value and rises again: answers pass 0."""
+        driven = np.abs(self.driven)
+        half = 0.5 * driven.max()
+        fallen = np.maximum.accumulate(driven) - driven > half
+        if not fallen.any():
+            return False
+        after = driven[int(np.argmax(fallen)) :]
+        return bool(np.max(after - np.minimum.accumulate(after)) > half)
 
     @property
     def resolved(self) -> tuple[float, float]:
@@ -111,12 +123,8 @@ def read_time_test(
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
     """
-    columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    columns, notes = read_columns(path)
     time = columns["time"]
-    if np.any(np.diff(time) <= 0) or time[0] < 0:
-        k = int(np.argmax(np.diff(time) <= 0)) + 1
-        order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
-        raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
     if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own_table(kind)):
         raise InputError(
@@ -131,13 +139,52 @@ def read_time_test(
         strain, stress, told = _as_shear(str(path), form, columns, sample)
         notes += told
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-        time, driven, answer = _from_rest(time, driven, answer)
+        return of_columns(kind, time, driven, answer, (str(path), notes), start)
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
+
+
+def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns of a test by quantity, in SI units, at rising times from 0 s or later; then notes.
+
+    Raises:
+        InputError: one sentence naming file, column or line, value and remedy.
+    """
+    columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    time = columns["time"]
+    if np.any(np.diff(time) <= 0) or time[0] < 0:
+        k = int(np.argmax(np.diff(time) <= 0)) + 1
+        order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
+        raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
+    return columns, notes
+
+
+def of_columns(
+    kind: str,
+    time: np.ndarray,
+    driven: np.ndarray,
+    answer: np.ndarray,
+    source: tuple[str, list[str]],
+    start: float = 0.0,
+) -> TimeTest:
+    """A test of strain and stress that begins at rest.
+
+    Args:
+        kind: "relaxation" or "creep".
+        time: (n,) [s], rising.
+        driven, answer: (n,) strain and stress [Pa], of creep stress and strain.
+        source: name of the file, and notes.
+        start: answers before this time [s] are not fitted.
+
+    Raises:
+        InputError: nothing driven, few answers, signs that do not go together.
+    """
+    time, driven, answer = _from_rest(time, driven, answer)
+    return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], tuple(source[1])), start)
 
 
 def kind_of(path: str | os.PathLike) -> str:
     """ "relaxation" or "creep": by the modulus or compliance, or by which of two columns is held, the other moving."""
-    columns, _ = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
+    columns, _ = read_columns(path)
     form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
     if len(form) == 1:
         return "relaxation" if form == ("modulus",) else "creep"

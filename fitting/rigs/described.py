@@ -1,0 +1,213 @@
+"""A test in time through a rig, described by a small TOML file: force and displacement of a sample that is not sheared.
+
+The force that an elastic sample of unit shear modulus takes at a displacement d is f(d): of glued samples by finite
+elements, corrected by their estimated error, of indenters by the exact solution of a bonded layer. The viscous sample's
+force is that of linear viscoelasticity with f(d) in the place of the strain,
+
+    F(t) = integral of G(t - s) d f(d(s)),
+
+exact while strains are small and bulk relaxes as shear does or is far stiffer; for an indenter, while its contact grows
+(Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain it is Fung's quasi-linear form.
+"""
+
+import tomllib
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fitting.readers.time_tests import TimeTest, of_columns, read_columns
+from fitting.rigs import glued, thin_layer
+from liverjax.core.errors import InputError
+from liverjax.core.names import hint
+from liverjax.laws import NeoHookean
+
+#: Lengths that each test needs, in metres; the cone has an angle.
+TESTS: dict[str, tuple[str, ...]] = {
+    "tension": ("radius", "height"),
+    "compression": ("radius", "height"),
+    "glued_punch": ("radius", "height", "punch"),
+    "sphere": ("radius", "thickness"),
+    "cone": ("half_angle", "thickness"),
+    "punch": ("radius", "thickness"),
+}
+_OTHER = ("test", "data", "drive", "poisson", "min_time")
+#: What is driven -> kind of the test.
+_KINDS = {"displacement": "relaxation", "force": "creep"}
+#: Poisson's ratio without a word of it: glued samples have K/mu = 1000, layers keep their volume.
+_GLUED, _LAYER = 0.4995, 0.5
+#: Displacements, over the largest one, at which glued samples are computed.
+_GRID = (0.05, 0.5, 1.0)
+#: Rows that an indenter's test is filled up to.
+_MOST_ROWS = 2000
+#: Departure from a straight line that is worth a note.
+_CURVED = 0.02
+
+
+class Described(NamedTuple):
+    """What a description says."""
+
+    test: str
+    data: Path
+    sizes: dict[str, float]
+    poisson: float
+    drive: str  # displacement or force
+    min_time: float
+
+
+def read_described(path: str | Path) -> TimeTest:
+    """The test of a description, as shear: strain f(d)/S, stress F/S, with S such that small strains are d over a size.
+
+    Args:
+        path: TOML with test, data (a table of time, displacement and force), the sizes that the test needs in metres,
+            and if wanted drive, poisson, min_time.
+
+    Raises:
+        InputError: one sentence naming file, key, value and remedy.
+    """
+    path = Path(path)
+    described = _description(path)
+    columns, notes = read_columns(described.data)
+    for name in ("displacement", "force"):
+        if name not in columns:
+            raise InputError(
+                f"{described.data}: a test of {path.name} needs columns of time, displacement and force; the file has "
+                f"{', '.join(columns)}"
+            )
+    d, force = columns["displacement"], columns["force"]
+    if described.test == "compression":
+        notes.append("displacement and force are taken as positive where the sample is pressed")
+    sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
+    largest = float(np.max(sign * d))
+    if not largest > 0:
+        raise InputError(f"{described.data}: the displacement is zero throughout; give a test that moves")
+    curve, size, told = _elastic(described, largest, str(path))
+    section = curve(largest * 1e-3) / (1e-3 * largest / size)
+    if described.test in ("sphere", "cone"):
+        section = curve(largest) / (largest / size)
+    time = columns["time"]
+    if described.test in ("sphere", "cone"):
+        time, d, force = _with_more_between(time, d, force)
+    strain, stress = curve_of(curve, sign * d) / section, sign * force / section
+    kind = _KINDS[described.drive]
+    driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
+    notes = [*notes, *told]
+    return of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
+
+
+def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Rows between the measured ones, without a force: d is straight between two rows, and f(d) is not."""
+    if time[0] > 0:
+        time, d, force = (np.append(0.0, v) for v in (time, d, force))
+    parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))
+    place = np.arange((len(time) - 1) * parts + 1) / parts
+    rows = np.arange(len(time))
+    more = np.full(len(place), np.nan)
+    more[::parts] = force
+    return np.interp(place, rows, time), np.interp(place, rows, d), more
+
+
+def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
+    """f at displacements (n,) [m], before contact 0."""
+    grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
+    values = np.array([0.0, *(curve(each) for each in grid[1:])])
+    below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
+    return np.interp(np.maximum(d, 0.0), grid, values) + below
+
+
+def _description(path: Path) -> Described:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); give a description of a test") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML ({error}); mend that line") from None
+    test = table.get("test")
+    if test not in TESTS:
+        raise InputError(f"{path}: test = {test!r} is not known: {hint(str(test), TESTS)}")
+    needed, known = TESTS[test], (*_OTHER, *TESTS[test])
+    for key in table:
+        if key not in known:
+            raise InputError(f"{path}: {test} has no key {key!r}: {hint(key, known)}")
+    for key in ("data", *needed):
+        if key not in table:
+            raise InputError(f"{path}: {test} needs {key}: give it{'' if key == 'data' else ' in metres'}")
+    sizes = {key: _number_of(path, key, table[key]) for key in needed}
+    bad = next((key for key, value in sizes.items() if not 0 < value < (90 if key == "half_angle" else 1)), None)
+    if bad:
+        raise InputError(f"{path}: {bad} = {sizes[bad]:g} cannot be that of a sample: give metres (degrees of a cone)")
+    own = _LAYER if "thickness" in needed else _GLUED
+    poisson = _number_of(path, "poisson", table.get("poisson", own))
+    if not 0 <= poisson <= own:
+        raise InputError(f"{path}: poisson = {poisson:g} must be from 0 to {own:g}: leave it out for a soft tissue")
+    if not isinstance(table["data"], str):
+        raise InputError(f"{path}: data = {table['data']!r} must name a file: write data = 'test.csv'")
+    drive = table.get("drive", "displacement")
+    if drive not in _KINDS:
+        raise InputError(f"{path}: drive = {drive!r} is not known: use displacement or force")
+    first = _number_of(path, "min_time", table.get("min_time", 0.0))
+    return Described(test, path.parent / table["data"], sizes, poisson, drive, first)
+
+
+def _number_of(path: Path, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise InputError(f"{path}: {key} = {value!r} is not a number: give one")
+    return float(value)
+
+
+def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
+    """f(d) [m^2] per unit shear modulus, the length that makes d a strain, and notes."""
+    sizes = described.sizes
+    if "thickness" not in sizes:
+        return _glued_curve(described, largest, path)
+    indenter = thin_layer.Indenter(
+        shape=described.test,
+        thickness=sizes["thickness"],
+        poisson=described.poisson,
+        radius=sizes.get("radius", 0.0),
+        half_angle=sizes.get("half_angle", 45.0),
+    )
+    layer, per_shear = thin_layer.Layer(indenter), 2 * (1 + described.poisson)
+    layer.force(np.array([largest]))  # refuses depths that its table does not reach
+    said = "the contact begins where displacement is 0, without adhesion, and grows until the largest displacement"
+    return (lambda d: per_shear * float(layer.force(np.array([d]))[0])), sizes["thickness"], [said]
+
+
+def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
+    """By finite elements, with what the mesh leaves out put right."""
+    sizes, way = described.sizes, 1.0 if described.test == "tension" else -1.0
+    radius, height = sizes["radius"], sizes["height"]
+    if largest >= 0.5 * height:
+        raise InputError(
+            f"{path}: the displacement reaches {largest:g} m, more than half of the height {height:g} m: mend height "
+            "or the displacement's unit"
+        )
+    at = largest * np.array(_GRID)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        if described.test == "glued_punch":
+            rig = glued.indentation(radius, height, sizes["punch"], 1.0, at)
+        else:
+            rig = glued.tension(radius, height, 1.0, way * at / height)
+        nu = described.poisson
+        law = NeoHookean(mu=1e3, bulk=1e3 * 2 * (1 + nu) / (3 * (1 - 2 * nu)))
+        force, codes = glued.read(rig, law, None)
+        left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
+    if np.any(np.asarray(codes) != 0):
+        raise InputError(f"{path}: an elastic sample does not reach {largest:g} m: mend the sizes")
+    found = np.asarray(force) / 1e3
+    left_out = np.where(np.isfinite(left_out), left_out, 0.0)
+    secant = np.abs(found + left_out) / at
+    notes = [f"{w.message}" for w in said if issubclass(w.category, UserWarning)]
+    notes.append(
+        f"the sample's stiffness per shear modulus is {secant[0]:.4g} m, of which {100 * left_out[0] / found[0]:.2g} % "
+        "put the mesh right"
+    )
+    if abs(secant[-1] / secant[0] - 1) > _CURVED:
+        notes.append(
+            f"at the largest displacement an elastic sample takes {100 * (secant[-1] / secant[0] - 1):+.0f} % of a "
+            "straight line's force; the fit lets it relax as shear does (quasi-linear)"
+        )
+    return (lambda d: d * float(np.interp(d, at, secant))), height, notes

@@ -1,0 +1,185 @@
+"""Tests described by a TOML file: against simulated samples, other integrals, cycles; refusals; the commands."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from fitting.__main__ import main
+from fitting.fits import time_tests as fits
+from fitting.methods.generalised_maxwell import Maxwell, moduli
+from fitting.readers.time_tests import Sample, TimeTest, read_time_test
+from fitting.rigs import glued, thin_layer
+from fitting.rigs.described import curve_of, read_described
+
+pytestmark = pytest.mark.quick_to_compile
+
+TRUTH = Maxwell(np.float64(800.0), np.array([0.3, 0.4]), np.array([20.0, 1.0]))
+PRONY = lj.Prony(ratios=TRUTH.ratios, relaxation_times=TRUTH.relaxation_times, part="isochoric")
+
+
+def shear(time):
+    g, tau = TRUTH.ratios, TRUTH.relaxation_times
+    return TRUTH.shear_modulus * (1 - (g * (1 - np.exp(-np.asarray(time)[..., None] / tau))).sum(axis=-1))
+
+
+def written(folder, table, columns, name="test"):
+    rows = "\n".join(",".join(f"{v:.10g}" for v in row) for row in zip(*columns, strict=True))
+    (folder / f"{name}.csv").write_text(f"time_s,displacement_m,force_N\n{rows}\n")
+    lines = [f"{key} = {value!r}" for key, value in ({"data": f"{name}.csv"} | table).items()]
+    (folder / f"{name}.toml").write_text("\n".join(lines) + "\n")
+    return folder / f"{name}.toml"
+
+
+SLOW = pytest.mark.slow
+
+
+@SLOW
+@pytest.mark.parametrize("test", ["tension", "compression", "glued_punch"])
+def test_a_simulated_sample_gives_its_numbers_back(tmp_path, test, verified):
+    """The sample is simulated in time on another mesh; held after a ramp."""
+    r, h, punch, dt = 0.01, 0.008, 0.004, 0.25
+    time = dt * np.arange(1, 81)
+    d = 2e-5 * np.minimum(time / 1.0, 1.0)
+    cells = glued.Cells(rim=0.03, edge=0.015, corners=32)
+    if test == "glued_punch":
+        rig, sizes = glued.indentation(r, h, punch, dt, d, cells), {"radius": r, "height": h, "punch": punch}
+    else:
+        rig = glued.tension(r, h, dt, (1 if test == "tension" else -1) * d / h, cells)
+        sizes = {"radius": r, "height": h}
+    force, codes = glued.read(rig, lj.laws.NeoHookean(mu=800.0, bulk=8e5), PRONY)
+    assert not np.any(np.asarray(codes))
+    file = written(tmp_path, {"test": test} | sizes, (time, d, np.abs(np.asarray(force))))
+    found = fits.fit(read_described(file), 2).model
+    error = abs(float(found.shear_modulus) / 800 - 1)
+    verified(f"{test} described by a file, against a simulation of another mesh: G0", "run in time", error, 0.01)
+    assert error < 0.01
+    np.testing.assert_allclose(found.relaxation_times, TRUTH.relaxation_times, rtol=0.03)
+    np.testing.assert_allclose(found.ratios, TRUTH.ratios, rtol=0.02)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "cone", "punch"])
+def test_an_indenter_pressed_at_constant_speed(tmp_path, shape):
+    """The force is the integral of G(t - s) df/ds, here by quadrature."""
+    sizes = {"half_angle": 70.0} if shape == "cone" else {"radius": 2e-3}
+    rig = thin_layer.Indenter(shape=shape, thickness=8e-3, poisson=0.5, **sizes)
+    layer, speed = thin_layer.Layer(rig), 1e-5
+
+    def elastic(d):
+        return 3 * float(layer.force(np.array([d]))[0])
+
+    time = np.linspace(0.25, 30, 120)
+    grid = np.linspace(0, 30, 6001)
+    f = np.array([elastic(speed * s) for s in grid])
+    force = []
+    for t in time:
+        middle = 0.5 * (grid[1:] + grid[:-1])
+        past = middle < t
+        force.append(np.sum((shear(t - middle) * np.diff(f))[past]))
+    file = written(tmp_path, {"test": shape, "thickness": 8e-3} | sizes, (time, speed * time, force))
+    test = read_described(file)
+    assert test.kind == "relaxation" and test.time[0] == 0 and test.driven[0] == 0
+    rows = np.flatnonzero(test.used)
+    answer = fits.response_in_time("relaxation", TRUTH, jnp.asarray(test.time), jnp.asarray(test.driven), rows)
+    np.testing.assert_allclose(answer, test.answer[rows], rtol=2e-3, atol=2e-4 * np.nanmax(test.answer))
+    assert len(rows) == len(time)
+
+
+def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
+    """Tension of R = H = 10 mm, mu 800, K 16000, by 1 um: 1.07390e-4 N (axisymmetric, 64 x 64 graded, DOLFINx)."""
+    time, poisson = np.arange(1.0, 7.0), (3 * 20 - 2) / (2 * (3 * 20 + 1))
+    table = {"test": "tension", "radius": 0.01, "height": 0.01, "poisson": poisson}
+    test = read_described(written(tmp_path, table, (time, 0 * time + 1e-6, 0 * time + 1.07390e-4)))
+    np.testing.assert_allclose(test.answer[test.used] / test.driven[test.used], 800, rtol=0.005)
+
+
+def test_the_elastic_curve_before_contact_is_straight():
+    values = curve_of(lambda d: 2 * d + d**2, np.array([-0.1, 0.0, 0.5, 1.0]))
+    np.testing.assert_allclose(values, [-0.2, 0.0, 1.25, 3.0], atol=1e-3)
+
+
+def test_cycles_between_plates_give_the_numbers_back(tmp_path):
+    """Cyclic compression of a cylinder between slippery plates: G = E / 3, answers pass through 0."""
+    time = np.arange(0.05, 40, 0.05)
+    r, h, fine = 0.01, 0.01, np.arange(0, 40.001, 0.005)
+    d = 1e-4 * np.sin(np.pi * fine / 8) ** 2
+    middle, steps = 0.5 * (fine[1:] + fine[:-1]), np.diff(d)
+    force = np.array([np.sum((shear(t - middle) * steps)[middle < t]) for t in time]) * 3 * np.pi * r**2 / h
+    force += 0.01 * force.max() * np.random.default_rng(0).standard_normal(len(force))
+    rows = "\n".join(f"{a},{b},{c}" for a, b, c in zip(time, np.interp(time, fine, d), force, strict=True))
+    (tmp_path / "cycles.csv").write_text(f"time_s,displacement_m,force_N\n{rows}\n")
+    test = read_time_test(tmp_path / "cycles.csv", "relaxation", Sample(r, h))
+    assert test.cyclic
+    found = fits.fit(test, 2)
+    assert float(found.model.shear_modulus) == pytest.approx(800, rel=0.02)
+    # The longest time is told by what the cycles sink to: with its error.
+    errors = found.uncertainty.standard_errors
+    exact = np.array([800, *TRUTH.ratios, *TRUTH.relaxation_times])
+    assert np.all(np.abs(found.uncertainty.values - exact) < 4 * errors)
+
+
+def test_a_step_that_is_taken_back_is_no_cycle():
+    held = np.array([0.0, 1, 1, 1, 0, 0, 0])
+    test = TimeTest("creep", np.arange(7.0), held, held, np.arange(7) > 0)
+    assert not test.cyclic and test._replace(driven=np.array([0.0, 1, 0, 1, 0, 1, 0])).cyclic
+
+
+def test_the_commands_take_a_description(tmp_path):
+    layer = thin_layer.Layer(thin_layer.Indenter(shape="sphere", thickness=8e-3, poisson=0.5, radius=2e-3))
+    time = np.geomspace(0.1, 100, 40)
+    force = 3 * layer.force(np.array([1e-4]))[0] * shear(time)
+    ramp = np.concatenate([[1e-6], time]), np.concatenate([[1e-4], np.full(40, 1e-4)]), np.append(force[0], force)
+    file = written(tmp_path, {"test": "sphere", "thickness": 8e-3, "radius": 2e-3}, ramp)
+    assert main(["relaxation", str(file), "--out", str(tmp_path / "one")]) == 0
+    found = (tmp_path / "one" / "fit.json").read_text()
+    assert "contact begins where displacement is 0" in found
+    omega = np.geomspace(0.05, 50, 20)
+    G = moduli(TRUTH, omega)
+    rows = "\n".join(f"{w},{a},{b}" for w, a, b in zip(omega, *G, strict=True))
+    (tmp_path / "sweep.csv").write_text(f"angular_frequency_rad/s,storage_modulus_Pa,loss_modulus_Pa\n{rows}\n")
+    out = tmp_path / "both"
+    assert main([str(tmp_path / "sweep.csv"), "--with", str(file), "--modes", "2", "--out", str(out)]) == 0
+    tests = json.loads((out / "fit.json").read_text())["tests"]
+    assert [t["test"] for t in tests] == ["sweep", "relaxation"]
+    assert main(["creep", str(file), "--out", str(tmp_path / "no")]) == 2
+    assert main(["relaxation", str(file), "--radius", "0.01", "--out", str(tmp_path / "no")]) == 2
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"test": "bending"}, "test = 'bending' is not known"),
+        ({"test": "sphere"}, "sphere has no key 'height'"),
+        ({"height": None}, "tension needs height: give it in metres"),
+        ({"radius": "wide"}, "radius = 'wide' is not a number"),
+        ({"radius": 10.0}, "radius = 10 cannot be that of a sample"),
+        ({"radus": 0.01}, "did you mean radius"),
+        ({"poisson": 0.5}, "must be from 0 to 0.4995"),
+        ({"drive": "torque"}, "use displacement or force"),
+        ({"height": 1e-4}, "more than half of the height"),
+        ({"data": 3}, "must name a file"),
+        ({"data": "none.csv"}, "none.csv"),
+        ({"data": "shear.csv"}, "needs columns of time, displacement and force"),
+        ({"data": "still.csv"}, "displacement is zero throughout"),
+    ],
+)
+def test_descriptions_that_cannot_be_used_get_one_sentence(tmp_path, change, words):
+    table = {"test": "tension", "radius": 0.01, "height": 0.01} | change
+    (tmp_path / "shear.csv").write_text("time_s,strain,stress_Pa\n" + "\n".join(f"{k},1,{9 - k}" for k in range(1, 8)))
+    still = "\n".join(f"{k},0,{9 - k}" for k in range(1, 8))
+    (tmp_path / "still.csv").write_text(f"time_s,displacement_m,force_N\n{still}\n")
+    time = np.arange(1.0, 9.0)
+    file = written(tmp_path, {k: v for k, v in table.items() if v is not None}, (time, 0 * time + 1e-4, 1 / time))
+    with pytest.raises(lj.InputError, match=words) as told:
+        read_described(file)
+    assert "\n" not in str(told.value)
+
+
+def test_a_file_that_is_no_toml_gets_one_sentence(tmp_path):
+    (tmp_path / "bad.toml").write_text("test = tension\n")
+    with pytest.raises(lj.InputError, match="is no TOML"):
+        read_described(tmp_path / "bad.toml")
+    with pytest.raises(lj.InputError, match="cannot be read"):
+        read_described(tmp_path / "none.toml")
