@@ -77,18 +77,19 @@ def test_a_pressed_cube_sinks_by_pressure_over_stiffness(order):
     assert np.allclose(slope, 50.0 / 1e12, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("ratio", "volumetric", "limit"),
-    [(3.0, "element", 0.01), (1e3, "mixed", 0.02)],
-)
+@pytest.mark.parametrize(("ratio", "volumetric", "depth"), [(3.0, "element", 5e-5), (1e3, "mixed", 2e-5)])
 @pytest.mark.slow
-def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, volumetric, limit):
-    """A contact as wide as a tenth of the sphere, 1 % of the layer deep: half a thousand quadratic elements."""
+def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, volumetric, depth, verified):
+    """Half a thousand quadratic elements, the contact as wide as 6 to 10 % of the sphere.
+
+    At K/mu = 1000 and a depth of 5e-5 the force is 1.7 % below that of small strains on every mesh. That is finite
+    strain, which falls with the depth.
+    """
     from fitting.rigs.thin_layer import Indenter, Layer
     from liverjax.mesh import cylinders
     from liverjax.physics.sliding_support import SlidingSupport
 
-    R, h, depth, mu = 5e-3, 10e-3, 5e-5, 800.0
+    R, h, mu = 5e-3, 10e-3, 800.0
     a = np.sqrt(R * depth)
     radii = cylinders.graded(h, {0.0: a / 3, a: a / 6, h: h / 4}, h / 4, cylinders.GROWTH)
     heights = cylinders.graded(h, {0.0: h / 4, h: a / 6}, h / 4, cylinders.GROWTH)
@@ -112,7 +113,9 @@ def test_a_sphere_on_a_layer_takes_the_force_of_its_integral_equation(ratio, vol
     poisson = (3 * ratio - 2) / (2 * (3 * ratio + 1))
     layer = Layer(Indenter(shape="sphere", radius=R, thickness=h, poisson=poisson))
     exact = 2 * mu * (1 + poisson) * float(layer.force(np.array([depth]))[0])
-    assert np.isclose(parts * float(found.force[0, -1, 2]), exact, rtol=limit)
+    error = abs(parts * float(found.force[0, -1, 2]) / exact - 1)
+    verified(f"sphere on a layer, K/mu = {ratio:g}", "integral equation", error, 0.01)
+    assert error < 0.01
     assert found.depth[0, -1] < 2e-3 * depth
 
 
@@ -181,6 +184,19 @@ def test_gradients_through_closing_contact():
             for h in (1e-3, 1e-4, 1e-5)
         ]
         assert min(errors) < 1e-6
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_forces_on_obstacles_know_regions_and_precision(precision):
+    """The contact's own stiffness follows from the stiffest law of the body, as in the run: forces balance."""
+    scene = lying(steps=1, precision=precision, tolerance=1e-8 if precision == "float64" else 1e-4)
+    stiff = lj.Region(elements=jnp.arange(8), law={"mu": 8e4})
+    plane = replace(scene.physics[0], stiffness=None)
+    scene = replace(scene, region=(stiff,), physics=(plane,))
+    result = lj.simulate(scene).check()
+    found = lj.obstacle_forces(scene, result)
+    tolerance = 1e-6 if precision == "float64" else 1e-2
+    assert np.isclose(found.force[0, -1, 2], -50.0 * SIDE**2, rtol=tolerance)
 
 
 def test_a_scene_without_obstacles_has_none_in_its_program():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from liverjax.physics.base import End, Free, Start, Step
 from liverjax.physics.contact.obstacle import Obstacle, largest_depth
 from liverjax.scenes.scene import Scene
-from liverjax.simulation.run import Result, unloaded
+from liverjax.simulation.run import Result, prepared
 from liverjax.tensors.matrices import deformation_gradient
 
 
@@ -27,7 +27,7 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
         scene: as it was run.
         result: `Result` of `liverjax.simulate` from the reference positions, all steps stored.
     """
-    scene = unloaded(scene).scene if scene.points_are == "loaded" else scene
+    scene = prepared(scene)  # as it was run: numbers of regions by element, in its precision
     steps, dt = scene.solve.steps, 0.0 if scene.solve.dt is None else scene.solve.dt
     mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
     numbers = jnp.arange(1, len(result.positions) + 1)
