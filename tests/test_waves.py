@@ -339,17 +339,19 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
 
 
 def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
-    three = np.array([60.0, 80.0, 100.0])
-    content = {
-        "frequencies_Hz": three.tolist(),
-        "whole": {k: [1.0, 2.0, 3.0] for k in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")},
-        "regions": None,
-    }
-    field = plane_waves((5, 5, 5))._replace(frequencies=three)
-    waves_report._sweeps(tmp_path, elastography.Organ(field, None, None, None, DENSITY), content)
-    sweep = rheometer.read_sweep(tmp_path / "sweep_whole.csv")
-    np.testing.assert_allclose(sweep.angular_frequency, 2 * np.pi * three)
-    np.testing.assert_allclose(sweep.storage_sd, [1.0, 2.0, 3.0])
+    hertz = np.array([40.0, 60.0, 80.0, 100.0])
+    G = 2000 + 1500 * (2j * np.pi * hertz / 400) ** 0.4  # a spring beside a springpot
+    part = {"storage_Pa": G.real, "loss_Pa": G.imag, "error_storage_Pa": 1e-3 * G.real, "error_loss_Pa": 1e-3 * G.imag}
+    whole = {name: values.tolist() for name, values in part.items()}
+    content = {"frequencies_Hz": hertz.tolist(), "whole": whole, "regions": None}
+    field = plane_waves((5, 5, 5))._replace(frequencies=hertz)
+    files = waves_report._sweeps(tmp_path, elastography.Organ(field, None, None, None, DENSITY), content)
+    sweep = rheometer.read_sweep(files["whole"])
+    np.testing.assert_allclose(sweep.angular_frequency, 2 * np.pi * hertz)
+    np.testing.assert_allclose(sweep.storage_sd, part["error_storage_Pa"])
+    found = waves_report._springpots(files)["whole"]
+    assert found["mean_relative_error"] < 1e-3 and any(abs(v - 0.4) < 0.05 for v in found["numbers"].values()), found
+    assert waves_report._springpots({}) is None
 
 
 @pytest.mark.parametrize(

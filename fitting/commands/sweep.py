@@ -11,6 +11,7 @@ from fitting.commands.relaxation import check_samples
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
+from liverjax.core.plotting import import_meanwhile
 
 if TYPE_CHECKING:
     from fitting.fits.posterior import Posterior
@@ -138,6 +139,7 @@ def run(options: argparse.Namespace) -> int:
     sweep = rheometer.without_inertia(sweep, options.radius, options.height)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
+    import_meanwhile()
     fits, sweep = _fits(options, sweep)
     profile = None
     if options.profile:

@@ -50,7 +50,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "versions": versions(),
     }
     content = numbers(content)
-    _sweeps(out, organ, content)
+    content["springpots"] = _springpots(_sweeps(out, organ, content))
     (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
     _write_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
@@ -95,10 +95,33 @@ def _complex_parts(*values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarr
     return [v.real for v in values], [v.imag for v in values]
 
 
-def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> None:
+def _springpots(sweeps: dict[str, Path]) -> dict[str, Any] | None:
+    """The springpot model of lowest criterion of each sweep, with its numbers; None where there are none."""
+    if not sweeps:
+        return None
+    from fitting.fits import models
+    from fitting.readers import rheometer
+
+    found = {}
+    for name, file in sweeps.items():
+        sweep = rheometer.read_sweep(file)
+        tried = models.fractional(sweep)
+        fit = min([f for f in tried if models.identifiable(f, sweep)] or tried, key=models.information_criterion)
+        u = fit.uncertainty
+        found[name] = {
+            "model": fit.kind.name,
+            "numbers": {k: float(v) for k, v in zip(u.names, u.values, strict=True)},
+            "standard_errors": numbers({k: float(v) for k, v in zip(u.names, u.standard_errors, strict=True)}),
+            "mean_relative_error": float(np.mean(fit.relative_errors(sweep))),
+        }
+    return found
+
+
+def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> dict[str, Path]:
     """A frequency sweep of the whole and of every region, for ``python -m fitting``, where frequencies are enough."""
     if len(organ.field.frequencies) < FEWEST:
-        return
+        return {}
+    files = {}
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
         columns = [
             content["frequencies_Hz"],
@@ -109,7 +132,9 @@ def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> None:
         ]
         rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
         rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
-        (out / f"sweep_{name}.csv").write_text("\n".join(rows) + "\n")
+        files[name] = out / f"sweep_{name}.csv"
+        files[name].write_text("\n".join(rows) + "\n")
+    return files
 
 
 def _by_label(organ: Organ, found: Found) -> dict[str, Any] | None:
@@ -194,6 +219,11 @@ def table(content: dict[str, Any]) -> str:
                 f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
                 f"{own['chi2_per_component'][f]:7.2f}   {pair}"
             )
+    for name, own in (content["springpots"] or {}).items():
+        said = ", ".join(
+            f"{k} = {v:.4g} ± {own['standard_errors'][k] or np.nan:.2g}" for k, v in own["numbers"].items()
+        )
+        rows.append(f"{name:12s}{own['model']} over all frequencies: {said}")
     if content["map"]:
         m = content["map"]
         rows.append(

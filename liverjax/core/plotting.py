@@ -1,5 +1,6 @@
 """Pictures: colours, and a Matplotlib that draws to files."""
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,11 @@ def pyplot() -> Any:
     import matplotlib.pyplot
 
     return matplotlib.pyplot
+
+
+def import_meanwhile() -> None:
+    """Begin to import pyplot beside a computation that leaves Python alone: it takes a second."""
+    threading.Thread(target=pyplot, daemon=True).start()
 
 
 def save(figure: Any, file: Path) -> None:
