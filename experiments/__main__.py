@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 
 def module(script: str) -> str:
     """The module of a script, by its name."""
-    (file,) = HERE.glob(f"*/{script}.py")
+    (file,) = (found for found in HERE.glob(f"*/{script}.py") if found.parent.name != "pages")
     return f"experiments.{file.parent.name}.{script}"
 
 

@@ -1,6 +1,7 @@
 """What the front page and the guides print is what the code does."""
 
 import argparse
+import importlib.util
 import re
 import shlex
 import subprocess
@@ -14,7 +15,8 @@ sys.path.insert(0, str(ROOT))
 import fitting.__main__
 import liverjax as lj
 import liverjax.__main__
-from experiments.pages import porosity, write
+from experiments import __main__ as experiments
+from experiments.pages import overview, porosity, write
 from fitting.rigs.described import read_described
 from liverjax.scenes.scene_file import scene_from
 
@@ -55,6 +57,10 @@ def blocks(language: str) -> list:
     ]
     assert found
     return found
+
+
+def test_every_experiment_of_the_overview_is_one_script():
+    assert all(importlib.util.find_spec(experiments.module(name)) for name in overview.ROWS)
 
 
 @pytest.mark.parametrize("page", write.PAGES, ids=lambda page: page.name)

@@ -330,6 +330,7 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     with h5py.File(tmp_path / "out" / "waves.h5") as file:
         G, sd = file["modulus"][:], file["sd"][:]
         assert G.shape == (2, 7, 7, 9) and file["draws_of_exponent"].shape == (3, 7, 7, 9)
+        assert np.all(np.isfinite(G.imag) == np.isfinite(G.real))
         # Independent of each other they are not: a third beyond one deviation would be too many or too few by chance.
         assert np.mean(np.abs(G[0].real - 3000) < 3 * sd[0]) > 0.97
     assert command.main([*ask, "--resume"]) == 0

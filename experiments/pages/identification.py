@@ -90,6 +90,19 @@ def plate() -> str:
     return "\n".join(rows)
 
 
+def liver_waves_came_out() -> str:
+    """The sentence of the overview."""
+    (data,) = load("liver_waves")
+    said = []
+    for r in data["rows"]:
+        true, own = complex(*r["true_Pa"]), complex(*r["regions_Pa"])
+        drawn = complex(*r["map_median_Pa"])
+        said.append(
+            f"{r['name']} {percent(abs(own / true - 1))} off by regions, {percent(abs(drawn / true - 1))} by the map"
+        )
+    return f"complex moduli at {percent(data['noise'])} of noise: {'; '.join(said)}"
+
+
 def plate_came_out() -> str:
     """The sentence of the overview."""
     (data,) = load("elastography")

@@ -459,6 +459,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         identification.plate_came_out,
         "names elastography as a way to measure the liver in a patient",
     ),
+    "liver_waves": (
+        "a lesion in the liver phantom from waves of 60 Hz (synthetic): found, and how far off?",
+        identification.liver_waves_came_out,
+        "names elastography as a way to measure the liver in a patient",
+    ),
     "stability_rigs": ("error of tension, indentation and creep against run time: mesh, elements", rigs.came_out, ""),
     "reduced": (
         "a reduced model of the viscous liver: error, stated error and time a step",

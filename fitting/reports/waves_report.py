@@ -236,7 +236,8 @@ def table(content: dict[str, Any]) -> str:
 
 def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
     """Values at the voxels (nx, ny, nz), NaN outside, from those of the corners (P,)."""
-    out = np.full(organ.field.mask.shape, np.nan, corners.dtype)
+    nothing = complex(np.nan, np.nan) if np.iscomplexobj(corners) else np.nan
+    out = np.full(organ.field.mask.shape, nothing, corners.dtype)
     out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)
     return out
 
@@ -287,5 +288,7 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
         )
         ax.set(title=title, xlabel=f"{'xyz'[across[0]]} [mm]", ylabel=f"{'xyz'[across[1]]} [mm]")
         ax.title.set_fontsize(9)
+        if not np.isfinite(shown).any():  # the organ is thinner than the differences of the direct inversion are wide
+            ax.text(0.5, 0.5, "no voxel is far enough\nfrom an edge", ha="center", transform=ax.transAxes, fontsize=8)
         fig.colorbar(picture, ax=ax, shrink=0.8)
     return fig
