@@ -87,6 +87,7 @@ def test_an_indenter_pressed_at_constant_speed(tmp_path, shape):
     assert len(rows) == len(time)
 
 
+@pytest.mark.slow
 def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
     """Tension of R = H = 10 mm, mu 800, K 16000, by 1 um: 1.07390e-4 N (axisymmetric, 64 x 64 graded, DOLFINx)."""
     time, poisson = np.arange(1.0, 7.0), (3 * 20 - 2) / (2 * (3 * 20 + 1))

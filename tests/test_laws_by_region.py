@@ -164,7 +164,7 @@ SCENES = {
     ),
     "float32": ({"solve": lj.Solve(steps=1, precision="float32", tolerance=1e-4)}, 1),
 }
-QUICK = ("static", "mixed")
+QUICK = ("static",)
 
 
 def pulled(name, region):
@@ -193,6 +193,7 @@ def test_a_law_of_its_own_is_that_with_other_numbers(name):
     np.testing.assert_allclose(own.positions, numbers.positions, atol=away * size)
 
 
+@pytest.mark.slow
 def test_numbers_of_a_law_of_its_own_have_names_and_derivatives():
     scene = pulled("static", lambda e: lj.Region(elements=e, law=lj.laws.typical("mooney_rivlin")))
     top = scene.displaced[0].nodes

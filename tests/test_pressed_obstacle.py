@@ -92,6 +92,7 @@ def test_a_load_that_goes_lets_the_body_back():
     assert found.displacement[0, -1, 2] > found.displacement[0, 0, 2]
 
 
+@pytest.mark.slow
 def test_the_travel_has_derivatives():
     """All points touch, so that no quotient sees one open; the bulk modulus is not 3 mu, where hardness has a kink."""
     tilted = {"axis": jnp.array([0.0, np.sin(0.02), -np.cos(0.02)]), "position": jnp.array([0.0, 0.0, SIDE])}
@@ -124,6 +125,7 @@ def test_gradients_through_a_pressed_obstacle():
     assert slope > 0 and min(errors) < 1e-6 and depth(0.0) == 0
 
 
+@pytest.mark.slow
 def test_a_body_on_which_a_plate_lies_with_inertia():
     """A plate without mass on a body that falls back: its force is the given one at every step."""
     scene = cube(
