@@ -73,6 +73,28 @@ def test_tubes_apart_have_lines_apart():
     assert np.linalg.norm(found.end - found.begin, axis=1).sum() == pytest.approx(2 * LENGTH, rel=0.01)
 
 
+def test_a_ring_closes():
+    """Two branches leave the first band and meet at the far side."""
+    around = 0.02 * np.stack([np.cos(a := np.linspace(0, 2 * np.pi, 61)[:-1]), np.sin(a), 0 * a], axis=1)
+    corners = 16
+    points = np.concatenate([_ring(x, corners) for x in around])
+    here = np.arange(len(points)).reshape(len(around), corners)
+    after, up = np.roll(here, -1, axis=1), np.roll(here, -1, axis=0)
+    both = np.roll(after, -1, axis=0)
+    triangles = np.concatenate(
+        [np.stack([q.ravel() for q in three], 1) for three in ((here, after, up), (after, both, up))]
+    )
+    found = centre_lines(points, triangles)
+    assert np.linalg.norm(found.end - found.begin, axis=1).sum() == pytest.approx(0.04 * np.pi, rel=0.1)
+    assert np.median(found.radius) == pytest.approx(RADIUS, rel=0.05)
+
+
+def _ring(x, corners):
+    """Corners about a point of a circle about the origin."""
+    out, a = x / np.linalg.norm(x), np.linspace(0, 2 * np.pi, corners, endpoint=False)[:, None]
+    return x + RADIUS * (np.cos(a) * out + np.sin(a) * np.array([0.0, 0.0, 1.0]))
+
+
 def test_a_fork_has_three_branches():
     measure = pytest.importorskip("skimage.measure", reason="the surface of a fork needs scikit-image")
     h = 5e-4

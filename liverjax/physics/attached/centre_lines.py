@@ -161,9 +161,13 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
     for a in real:
         for b in real[r.below[real] == r.above[a]]:
             lines.append((centre[a], centre[b], np.isin(r.ring, (a, b))))
-    for a in real:
-        for own, others in ((r.above[a], r.below[real]), (r.below[a], r.above[real])):
+        for own, side, others in ((r.above[a], r.above, r.below[real]), (r.below[a], r.below, r.above[real])):
             if own in others:
+                continue
+            beside = real[side[real] == own]
+            # Where two branches meet, or leave the first band, they are joined; else a branch ends.
+            lines += [(centre[a], centre[b], np.isin(r.ring, (a, b))) for b in beside[beside > a]]
+            if len(beside) > 1:
                 continue
             last = points[r.band == own] - centre[a]
             along = _outwards(centre, r, real, a, own)
