@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax.core.history import entry_at
 from liverjax.core.struct import param, static, struct
@@ -34,11 +35,22 @@ class Displaced:
 
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
     """1 where a degree of freedom is solved for, 0 where it is held or prescribed: (V, 3)."""
+    if not any(isinstance(condition.nodes, jax.core.Tracer) for condition in (*fixed, *displaced)):
+        return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # no small programs to compile
     mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:
             mask = mask.at[condition.nodes, AXES.index(axis)].set(0.0)
     return mask
+
+
+def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
+    """The same on the host (V, 3), for checks: True where a degree of freedom is solved for."""
+    free = np.ones(mesh.points.shape, bool)
+    for condition in (*fixed, *displaced):
+        for axis in condition.axes:
+            free[np.asarray(condition.nodes), AXES.index(axis)] = False
+    return free
 
 
 def prescribed(mesh: TetMesh, displaced: tuple, time: Any, fraction: Any) -> jax.Array:

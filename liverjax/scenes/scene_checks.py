@@ -8,8 +8,9 @@ from liverjax import laws
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
-from liverjax.physics import boundary, porosity, viscosity
+from liverjax.physics import porosity, viscosity
 from liverjax.physics.base import Physics
+from liverjax.physics.prescribed import free_places
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.volumes.mixed import check as check_mixed_law
 from liverjax.scenes import regions
@@ -181,7 +182,7 @@ def check_scene(scene: Scene) -> None:
     if solve.kind == "dynamic" and scene.body is None:
         raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
     _no_contradiction(scene)
-    if not np.any(np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, ()))):
+    if not free_places(scene.mesh, scene.fixed, ()).any():
         warnings.warn(
             "fixed holds every node along every axis, so nothing can move: a place like where = {z_min = 0} takes all "
             "nodes at and above it, {z_max = 0} those at and below",
@@ -200,7 +201,7 @@ def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:
 def _no_two_normals(scene: Scene) -> None:
     """A node may slide along one oblique plane only, and be held along none or all of the axes of its normal."""
     taken: dict[int, str] = {}
-    mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
+    mask = free_places(scene.mesh, scene.fixed, scene.displaced)
     for name, physics in _named_physics(scene):
         if not isinstance(physics, SlidingSupport) or physics.axis:
             continue
@@ -233,8 +234,7 @@ def _held(scene: Scene) -> None:
     each, n = [np.asarray(a) for a in scene.mesh.element_nodes], scene.mesh.number_of_nodes
     rows, columns = np.tile(each[0], len(each)), np.concatenate(each)
     pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
-    mask = np.asarray(boundary.free_degrees(scene.mesh, scene.fixed, scene.displaced))
-    fixed = np.argwhere(mask == 0)
+    fixed = np.argwhere(~free_places(scene.mesh, scene.fixed, scene.displaced))
     both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(physics.holds(scene.mesh) for physics in scene.physics)]
     numbers, directions = (np.concatenate(a) for a in zip(*both, strict=True))
     for piece in range(pieces):

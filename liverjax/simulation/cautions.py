@@ -1,8 +1,10 @@
 """Cautions about a run that converged: one sentence each, on the host."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
@@ -90,9 +92,12 @@ def _of_locking(scene: Scene) -> list[str]:
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:
     """Elements beyond `LEAST_J` or `MOST_J` at any step."""
-    positions, said = np.asarray(result.positions), []
-    for beyond, bound, words in ((np.less, LEAST_J, "shrank below"), (np.greater, MOST_J, "grew above")):
-        J, step = _extreme(scene.mesh, positions, beyond)
+    said = []
+    positions = jnp.asarray(result.positions)
+    found = [np.asarray(a) for a in compiled(_extremes, scene.mesh, positions)(scene.mesh, positions)]
+    kinds = ((np.less, LEAST_J, "shrank below"), (np.greater, MOST_J, "grew above"))
+    for k, (beyond, bound, words) in enumerate(kinds):
+        J, step = found[2 * k], found[2 * k + 1]
         out = beyond(J, bound)
         if not out.any():
             continue
@@ -106,12 +111,17 @@ def _of_volumes(scene: Scene, result: Result) -> list[str]:
     return said
 
 
-def _extreme(mesh: TetMesh, positions: np.ndarray, beyond: np.ufunc) -> tuple[np.ndarray, np.ndarray]:
-    """J (E,) of every element at the step where it is least or greatest, and these steps (E,), from 0."""
-    J, step = np.ones(mesh.number_of_elements), np.zeros(mesh.number_of_elements, int)
-    for k, x in enumerate(positions):
-        now = np.asarray(volume_ratios(mesh, jnp.asarray(x)))
-        now = now.min(axis=0) if beyond is np.less else now.max(axis=0)
-        further = beyond(now, J)
-        J, step = np.where(further, now, J), np.where(further, k, step)
-    return J, step
+def _extremes(mesh: TetMesh, positions: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Least J (E,) of every element and its step, from 0; then the greatest J and its step. J is 1 before a run."""
+
+    def one(carry: tuple, given: tuple) -> tuple[tuple, None]:
+        least, when_least, most, when_most = carry
+        k, x = given
+        J = volume_ratios(mesh, x)
+        low, high = jnp.min(J, axis=0), jnp.max(J, axis=0)
+        when_least, when_most = jnp.where(low < least, k, when_least), jnp.where(high > most, k, when_most)
+        return (jnp.minimum(least, low), when_least, jnp.maximum(most, high), when_most), None
+
+    rest, start = jnp.ones(mesh.number_of_elements, positions.dtype), jnp.zeros(mesh.number_of_elements, jnp.int32)
+    steps = jnp.arange(len(positions), dtype=jnp.int32)
+    return jax.lax.scan(one, (rest, start, rest, start), (steps, positions))[0]
