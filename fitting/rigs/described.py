@@ -90,7 +90,8 @@ def read_described(path: str | Path) -> TimeTest:
     time = columns["time"]
     if described.test in ("sphere", "cone"):
         time, d, force = _with_more_between(time, d, force)
-    strain, stress = curve_of(curve, sign * d) / section, sign * force / section
+    moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # nothing holds an indenter back
+    strain, stress = curve_of(curve, moved) / section, sign * force / section
     kind = _KINDS[described.drive]
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     notes = [*notes, *told]
@@ -110,7 +111,7 @@ def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tu
 
 
 def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
-    """f at displacements (n,) [m], before contact 0."""
+    """f at displacements (n,) [m]; straight on below 0."""
     grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
     values = np.array([0.0, *(curve(each) for each in grid[1:])])
     below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
