@@ -87,6 +87,21 @@ def test_an_indenter_pressed_at_constant_speed(tmp_path, shape):
     assert len(rows) == len(time)
 
 
+def test_an_indenter_under_a_held_force_creeps(tmp_path):
+    """The strain f(d)/S of creep is the force over S times the compliance: here of one mode, in closed form."""
+    layer = thin_layer.Layer(thin_layer.Indenter(shape="sphere", thickness=8e-3, poisson=0.5, radius=2e-3))
+    depths = np.linspace(0, 1e-3, 4001)
+    table, time, held = 3 * layer.force(depths), np.geomspace(0.1, 60, 40), 1e-3
+    # G = 800 (0.4 + 0.6 exp(-t/2)): J = (1 - 0.6 exp(-0.4 t/2)) / 320.
+    d = np.interp(held * (1 - 0.6 * np.exp(-0.2 * time)) / 320, table, depths)
+    sizes = {"test": "sphere", "thickness": 8e-3, "radius": 2e-3, "drive": "force"}
+    test = read_described(written(tmp_path, sizes, (np.append(0.0, time), np.append(0.0, d), np.full(41, held))))
+    assert test.kind == "creep" and np.all(np.isfinite(test.driven))
+    found = fits.fit(test, 1).model
+    assert float(found.shear_modulus) == pytest.approx(800, rel=0.02)
+    np.testing.assert_allclose([found.ratios[0], found.relaxation_times[0]], [0.6, 2.0], rtol=0.02)
+
+
 @pytest.mark.slow
 def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
     """Tension of R = H = 10 mm, mu 800, K 16000, by 1 um: 1.07390e-4 N (axisymmetric, 64 x 64 graded, DOLFINx)."""

@@ -112,17 +112,13 @@ def test_the_travel_has_derivatives():
 def test_gradients_through_a_pressed_obstacle():
     scene = cube(lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -0.02])))
 
-    def depth(log):
-        own = lj.with_parameters(scene, {"law.mu": 800.0 * jnp.exp(log)})
-        return 1e3 * jnp.min(lj.simulate(own).positions[-1, :, 2])
-
     def top(log):
         own = lj.with_parameters(scene, {"law.mu": 800.0 * jnp.exp(log)})
         return 1e3 * jnp.mean(lj.simulate(own).positions[-1][scene.mesh.node_sets["z_max"], 2])
 
     slope = float(jax.grad(top)(0.0))
     errors = [abs(float(top(h) - top(-h)) / (2 * h) / slope - 1) for h in (1e-2, 1e-3, 1e-4)]
-    assert slope > 0 and min(errors) < 1e-6 and depth(0.0) == 0
+    assert slope > 0 and min(errors) < 1e-6
 
 
 @pytest.mark.slow

@@ -88,7 +88,7 @@ def read_described(path: str | Path) -> TimeTest:
     if described.test in ("sphere", "cone"):
         section = curve(largest) / (largest / size)
     time = columns["time"]
-    if described.test in ("sphere", "cone"):
+    if described.test in ("sphere", "cone") and described.drive == "displacement":
         time, d, force = _with_more_between(time, d, force)
     moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # nothing holds an indenter back
     strain, stress = curve_of(curve, moved) / section, sign * force / section
