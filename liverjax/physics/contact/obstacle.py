@@ -66,9 +66,7 @@ class Obstacle(Physics):
         """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
         shape = table.get("shape")
         if shape not in SHAPES:
-            raise InputError(
-                f"{name} shape = {shape!r} is not known{hint(str(shape), SHAPES)}: use {', '.join(SHAPES)}"
-            )
+            raise InputError(f"{name} shape = {shape!r} is not known: {hint(str(shape), SHAPES)}")
         for key in ("position", *SHAPES[shape]):
             if key not in table:
                 raise InputError(f"{name} is a {shape} without {key}: give it")
