@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
 from liverjax.core.errors import InputError
 
@@ -28,34 +29,16 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "file", type=Path, metavar="FILE", help="CSV, TRIOS or RheoCompass text; or TOML that describes a test in a rig"
     )
-    command.add_argument(
-        "--modes", type=_modes_in_time, default="auto", help="number of relaxation modes, or auto (default)"
-    )
+    shared_options.add_modes(command)
     command.add_argument(
         "--ramp", type=float, default=0.0, metavar="S", help="seconds of the ramp, where no column has it"
     )
     command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the answers before it")
     command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="of the sample [m], for torque and force")
-    command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
-    command.add_argument(
-        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
-    )
+    shared_options.add_cards_and_samples(command)
     command.add_argument("--out", type=Path, metavar="DIR", help=f"folder of the results (default {kind})")
     return command
-
-
-def _modes_in_time(text: str) -> int | str:
-    try:
-        return text if text == "auto" else int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
-
-
-def check_samples(count: int | None) -> None:
-    """Refuse a number of draws that says nothing, or that no disk needs."""
-    if count is not None and not 100 <= count <= 100000:
-        raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
 
 
 def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
@@ -86,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and not 0 < value <= 0.2:
             raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
-    check_samples(options.samples)
+    shared_options.check_samples(options.samples)
     out = options.out or Path(options.kind)
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":
@@ -109,9 +92,7 @@ def run(options: argparse.Namespace) -> int:
 
         print(posterior_report.table(posterior))
     if options.cards:
-        from fitting.commands.sweep import write_cards
-
-        write_cards(out, found.model)
+        shared_options.write_cards(out, found.model)
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {out}/fit.json, fit.png")

@@ -3,6 +3,8 @@
 import argparse
 import sys
 
+from fitting.commands import shared_options
+
 
 def run(options: argparse.Namespace) -> int:
     """Fit all samples with one model in closed form; 1 if one of the fits did not converge."""
@@ -31,9 +33,7 @@ def run(options: argparse.Namespace) -> int:
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))
     if options.cards:
-        from fitting.commands.sweep import write_cards
-
-        write_cards(options.out, found.typical)
+        shared_options.write_cards(options.out, found.typical)
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")

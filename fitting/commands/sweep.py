@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
 from fitting.commands.progress import cost_bar
-from fitting.commands.relaxation import check_samples
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
@@ -16,7 +16,7 @@ from liverjax.core.plotting import import_meanwhile
 if TYPE_CHECKING:
     from fitting.fits.posterior import Posterior
     from fitting.fits.viscoelastic import Fit, Simulation
-    from fitting.methods.generalised_maxwell import Maxwell, Spectrum
+    from fitting.methods.generalised_maxwell import Spectrum
     from fitting.readers.rheometer import Sweep
 
 
@@ -48,7 +48,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
-    command.add_argument("--modes", type=_modes, default="auto", help="number of relaxation modes, or auto (default)")
+    shared_options.add_modes(command)
     command.add_argument(
         "--model",
         choices=("prony", "fractional", "spectrum", "auto"),
@@ -99,23 +99,11 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
         help="tests that are not fitted: how well the fit predicts them",
     )
     command.add_argument("--profile", action="store_true", help="95 %% intervals by profile likelihood as well")
-    command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
-    command.add_argument(
-        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
-    )
+    shared_options.add_cards_and_samples(command)
     command.add_argument("--report", action="store_true", help="one page with pictures and numbers too, report.pdf")
     command.add_argument(
         "--out", type=Path, default=Path("fit"), metavar="DIR", help="folder of the results (default fit)"
     )
-
-
-def _modes(text: str) -> int | str:
-    if text == "auto":
-        return text
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
 
 
 def run(options: argparse.Namespace) -> int:
@@ -155,7 +143,7 @@ def run(options: argparse.Namespace) -> int:
 
         print(posterior_report.table(posterior))
     if options.cards:
-        write_cards(options.out, fits[-1].model)
+        shared_options.write_cards(options.out, fits[-1].model)
     if options.report:
         from fitting.reports import one_page
 
@@ -179,15 +167,6 @@ def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> lis
 
     tests = [read_any(options, path) for path in options.predict]
     return [prediction.sentence(prediction.predict(fit, sweep.resolved, test)) for test in tests]
-
-
-def write_cards(out: Path, model: "Maxwell") -> None:
-    """Write material cards and say what a program cannot hold."""
-    from fitting.reports import material_cards
-
-    for sentence in material_cards.write(out / "cards", model):
-        print(f"note: {sentence}", file=sys.stderr)
-    print(f"written: {out}/cards")
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -217,7 +196,7 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--modes {options.modes} is of --model prony: leave it out for --model {options.model}")
     if options.profile and options.model != "prony":
         raise InputError(f"--profile is of --model prony; leave it out for --model {options.model}")
-    check_samples(options.samples)
+    shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
         raise InputError("--samples is of models of a few numbers; leave it out for --model spectrum")
     laws.find(options.law)

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fitting.commands import shared_options
 from liverjax.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form; 1 if the fit did not converge."""
     from tqdm import tqdm
 
-    from fitting.commands.sweep import write_cards
     from fitting.fits import together
     from fitting.reports import together_report
     from liverjax.core.files import writable
@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     together_report.write(options.out, found)
     print(together_report.table(found))
     if options.cards:
-        write_cards(options.out, found.model)
+        shared_options.write_cards(options.out, found.model)
     for sentence in found.warnings:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png")

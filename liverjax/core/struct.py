@@ -1,6 +1,7 @@
 """Frozen dataclasses that are JAX pytrees, with unit and bounds beside each parameter."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -9,6 +10,10 @@ import numpy as np
 T = TypeVar("T")
 #: One number, or an array of one for each element or sample; it may be traced.
 Number = float | np.ndarray | jax.Array
+#: Numbers as a user writes them: one, a sequence of them, or an array.
+Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
+#: Numbers of nodes, elements or triangles.
+Indices = np.ndarray | jax.Array
 
 
 def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:

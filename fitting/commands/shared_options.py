@@ -1,0 +1,48 @@
+"""What several commands ask for in the same words: a number of modes, draws of the posterior, material cards."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from liverjax.core.errors import InputError
+
+if TYPE_CHECKING:
+    from fitting.methods.generalised_maxwell import Maxwell
+
+
+def add_modes(command: argparse.ArgumentParser) -> None:
+    """Option --modes."""
+    command.add_argument(
+        "--modes", type=_whole_number_or_auto, default="auto", help="number of relaxation modes, or auto (default)"
+    )
+
+
+def add_cards_and_samples(command: argparse.ArgumentParser) -> None:
+    """Options --samples and --cards."""
+    command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")
+    command.add_argument(
+        "--cards", action="store_true", help="material cards for FEBio, Abaqus, Ansys and SOFA too, in DIR/cards"
+    )
+
+
+def _whole_number_or_auto(text: str) -> int | str:
+    try:
+        return text if text == "auto" else int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor auto") from None
+
+
+def check_samples(count: int | None) -> None:
+    """Refuse a number of draws that says nothing, or that no disk needs."""
+    if count is not None and not 100 <= count <= 100000:
+        raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
+
+
+def write_cards(out: Path, model: "Maxwell") -> None:
+    """Write material cards and say what a program cannot hold."""
+    from fitting.reports import material_cards
+
+    for sentence in material_cards.write(out / "cards", model):
+        print(f"note: {sentence}", file=sys.stderr)
+    print(f"written: {out}/cards")
