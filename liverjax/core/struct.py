@@ -12,8 +12,10 @@ T = TypeVar("T")
 Number = float | np.ndarray | jax.Array
 #: Numbers as a user writes them: one, a sequence of them, or an array.
 Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
+#: An array of the host or of the program.
+Array = np.ndarray | jax.Array
 #: Numbers of nodes, elements or triangles.
-Indices = np.ndarray | jax.Array
+Indices = Array
 
 
 def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Indices
 from liverjax.mesh.basis import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -11,7 +12,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 _EDGES = ((0, 1), (1, 2), (2, 0))
 
 
-def triangle_nodes(mesh: TetMesh, triangles: jax.Array) -> list[jax.Array]:
+def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
     """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, of quadratic meshes, middles of edges."""
     vertices = [triangles[:, a] for a in range(3)]
     if mesh.order == 1:
@@ -19,20 +20,20 @@ def triangle_nodes(mesh: TetMesh, triangles: jax.Array) -> list[jax.Array]:
     return vertices + [_middle(mesh, triangles[:, a], triangles[:, b]) for a, b in _EDGES]
 
 
-def _middle(mesh: TetMesh, a: jax.Array, b: jax.Array) -> jax.Array:
+def _middle(mesh: TetMesh, a: Indices, b: Indices) -> jax.Array:
     """Numbers (m,) of the nodes between neighbouring vertices a and b (m,)."""
     pattern = mesh.pattern
     edge = jnp.where(pattern.row_nodes[:, a] == b[None], pattern.row_edges[:, a], 0)
     return mesh.number_of_vertices + jnp.sum(edge, axis=0)
 
 
-def areas(points: jax.Array, triangles: jax.Array) -> jax.Array:
+def areas(points: jax.Array, triangles: Indices) -> jax.Array:
     """Areas times normals (m, 3) [m^2] of flat triangles."""
     corner = points[triangles]
     return 0.5 * jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
-def nodal_shares(mesh: TetMesh, triangles: jax.Array) -> list[tuple[jax.Array, float]]:
+def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:
     """Nodes (m,) of flat triangles that take part of something uniform on them, and the part of each.
 
     A third at each vertex of a linear element. The functions of the vertices of a quadratic one have no integral: a
@@ -48,7 +49,7 @@ def nodal_shares(mesh: TetMesh, triangles: jax.Array) -> list[tuple[jax.Array, f
     return found
 
 
-def pressure_forces(triangles: jax.Array, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
+def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
     """Nodal forces (V, 3) [N] of a unit pressure on the triangles at positions x (V, 3) [m]: integrals of -N n da."""
     if mesh is None or mesh.order == 1:
         corner = x[triangles]

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Indices, Number
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.attached import Attached
@@ -42,7 +43,7 @@ class Tied(Protocol):
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
         """The field (V, 3) with the rows that stand for positions x (V, 3): `placed` gives them back."""
 
-    def placed(self, field: jax.Array, s: Any) -> jax.Array:
+    def placed(self, field: jax.Array, s: Number) -> jax.Array:
         """Positions (V, 3) that a field stands for, at part s of the step."""
 
 
@@ -88,7 +89,7 @@ class Step(NamedTuple):
 
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m] at its beginning
-    k: Any  # its number, from 1
+    k: Number  # its number, from 1
     steps: int  # of the run
     dt: Any  # [s] or None: load steps without time
     inertia: bool  # loads act at once where there is inertia
@@ -164,7 +165,7 @@ class NodalForce:
     #: Whether the force has an energy; one that follows the body has none, and its stiffness is not symmetric.
     conservative: bool = True
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at part s of the step."""
         raise TypeError(f"{type(self).__name__} lacks force(mesh, x, s)")
 
@@ -176,7 +177,7 @@ class NodalForce:
         """Diagonal blocks 3 x 3 of (V,) [N/m], an entry None where it is 0; None: the force is constant."""
         return None
 
-    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached | None:
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached | None:
         """Stiffness at x of elements of its own between nodes, beside that of `stiffness`; None: it has none."""
         return None
 
@@ -184,7 +185,7 @@ class NodalForce:
         """Positions (V, 3) [m] where the body would go by itself: the first guess of Newton; None: it stays."""
         return None
 
-    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+    def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
         """Change (V, 3) [N] of a force that is not conservative, with a motion dx (V, 3) [m]."""
         return jax.jvp(lambda x: self.force(mesh, x, s), (x,), (dx,))[1]
 
@@ -201,7 +202,7 @@ class Physics:
     keys: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Physics":
+    def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> "Physics":
         """From a table of a scene file.
 
         Raises:
@@ -248,7 +249,7 @@ class Physics:
         """Node numbers (n,) and directions (n, 3) along which the body is held against rigid motion."""
         return np.zeros(0, int), np.zeros((0, 3))
 
-    def enriched(self, more: Callable[[Any], Any]) -> "Physics":
+    def enriched(self, more: Callable[[Indices], Indices]) -> "Physics":
         """The same on richer elements: `more` adds to node numbers (n,) those of the nodes between them."""
         return self
 

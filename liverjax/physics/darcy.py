@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.nodal import integrals, summed
@@ -33,8 +34,8 @@ class Flow(NamedTuple):
     low: jax.Array  # about the least eigenvalue of D^-1 A beyond the coarse space
     high: jax.Array  # no eigenvalue of D^-1 A is above it
     tolerance: Any  # of a solve, relative to its right-hand side
-    given: Any = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
-    enters: Any = None  # (V,) [m^3] what enters during the step; None: nothing does
+    given: jax.Array | None = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
+    enters: jax.Array | None = None  # (V,) [m^3] what enters during the step; None: nothing does
 
 
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, tolerance: Any) -> Flow:
@@ -63,7 +64,7 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, toleran
     return Flow(A, store, mask, slow, low, high, tolerance)
 
 
-def _least_eigenvalue(mesh: TetMesh, rate: Any, store: jax.Array, diagonal: jax.Array) -> jax.Array:
+def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: jax.Array) -> jax.Array:
     """About the least eigenvalue of D^-1 A beyond the coarse space, at rates dt kappa, one or one an element."""
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):

@@ -14,7 +14,7 @@ import numpy as np
 
 from liverjax.core import history
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Number, Numbers, param, struct
 from liverjax.mesh import selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
@@ -26,11 +26,11 @@ class ElasticSupport(Physics):
     """Springs on triangles of the surface (`normal`, `tangential`) or on nodes (`stiffness`)."""
 
     triangles: Any = param("1", "node numbers (m, 3)", lower=0, default=None)
-    normal: Any = param("Pa/m", "stiffness per area along the normal", lower=0.0, default=0.0)
-    tangential: Any = param("Pa/m", "stiffness per area along the surface", lower=0.0, default=0.0)
+    normal: Number = param("Pa/m", "stiffness per area along the normal", lower=0.0, default=0.0)
+    tangential: Number = param("Pa/m", "stiffness per area along the surface", lower=0.0, default=0.0)
     nodes: Any = param("1", "node numbers (n,)", lower=0, default=None)
-    stiffness: Any = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
-    times: Any = param("s", "times of a history (T,)", default=None)
+    stiffness: Number = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
+    times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Any = param("1", "factors of the stiffness (T,), or where the wall moves to (T, 3) [m]", default=None)
 
     section: ClassVar[str] = "support"
@@ -109,7 +109,9 @@ class Springs(NodalForce):
     """Springs during a step."""
 
     blocks: Block = param("N/m", "3 x 3 of (V,)")
-    wall: Any = param("m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None)
+    wall: jax.Array | None = param(
+        "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None
+    )
 
     def _stretch(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
         """Of the springs (V, 3) [m]."""
@@ -117,7 +119,7 @@ class Springs(NodalForce):
             return x - mesh.points
         return x - mesh.points - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[None]
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Blocks times displacement."""
         u = self._stretch(mesh, x, s).T
         return jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks], axis=-1)

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, NodalForce, Physics, Start, Step, diagonal
@@ -78,7 +78,7 @@ class Moving(NodalForce):
         """Straight on."""
         return self.x + self.dt * self.motion.velocity
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Mass times acceleration."""
         return self.mass[:, None] * self.kinematics(x)[1]
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core import history
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Number, Numbers, param, replace, static, struct
 from liverjax.mesh import surface
 from liverjax.mesh.nodal import load_volumes
 from liverjax.mesh.tetrahedra import TetMesh
@@ -23,7 +23,7 @@ class Traction:
     times: Any = param("s", "times of a history (T,)", default=None)
     history: Any = param("1", "factors of value or pressure (T,), or the value itself (T, 3) [Pa]", default=None)
 
-    def at(self, time: Any) -> "Traction":
+    def at(self, time: Number) -> "Traction":
         """The load at a time [s], without a history."""
         if self.history is None:
             return self
@@ -76,7 +76,7 @@ class Loads(Physics):
 
     density: Any = param("kg/m^3", "None: no weight", default=None)
     gravity: Any = param("m/s^2", "(3,)", default=None)
-    times: Any = param("s", "times of a history of gravity (T,)", default=None)
+    times: Numbers | None = param("s", "times of a history of gravity (T,)", default=None)
     history: Any = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
@@ -87,7 +87,7 @@ class Loads(Physics):
             return replace(end, before=begin)
         return self._loading(step, "steps" if step.dt is None else "none" if step.inertia else "first")
 
-    def at(self, time: Any) -> "Loads":
+    def at(self, time: Number) -> "Loads":
         """The loads at a time [s], without histories."""
         traction = tuple(load.at(time) for load in self.traction)
         gravity = history.value_at(self.gravity, time, self.times, self.history)

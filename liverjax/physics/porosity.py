@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Indices, Number, Numbers, param, static, struct
 from liverjax.laws.base import Law, isochoric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import integrals, interpolated
@@ -41,11 +41,11 @@ class Inlet:
     nodes: Any = param("1", "nodes of the pressure (n,)", lower=0, default=None)
     pressure: Any = param("Pa", "of the fluid at the nodes", default=None)
     triangles: Any = param("1", "surface of the flux, node numbers (m, 3)", lower=0, default=None)
-    flux: Any = param("m/s", "volume that enters per reference area and time", default=None)
-    times: Any = param("s", "times of a history (T,)", default=None)
+    flux: Number | None = param("m/s", "volume that enters per reference area and time", default=None)
+    times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Any = param("1", "factors of pressure or flux (T,)", default=None)
 
-    def at(self, value: Any, time: Any) -> Any:
+    def at(self, value: object, time: Number) -> jax.Array:
         """Pressure or flux at a time [s]."""
         return history.value_at(value, time, self.times, self.history)
 
@@ -54,13 +54,13 @@ class Inlet:
 class Porosity(Physics):
     """A sponge of bulk modulus K0 filled with a fluid that makes up the part r_w of its volume."""
 
-    bulk: Any = param("Pa", "K0, bulk modulus of the drained sponge at rest", above=0.0)
-    limit_bulk: Any = param("Pa", "K_lim, of the compressed sponge and of the pressure", above=0.0)
-    fluid_fraction: Any = param("1", "r_w", above=0.0, upper=1.0)
-    permeability: Any = param("m^4/(N s)", "kappa", lower=0.0)
-    drained: Any = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
+    bulk: Number = param("Pa", "K0, bulk modulus of the drained sponge at rest", above=0.0)
+    limit_bulk: Number = param("Pa", "K_lim, of the compressed sponge and of the pressure", above=0.0)
+    fluid_fraction: Number = param("1", "r_w", above=0.0, upper=1.0)
+    permeability: Number = param("m^4/(N s)", "kappa", lower=0.0)
+    drained: Indices | None = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
     inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
-    initial_pressure: Any = param("Pa", "of the fluid at the beginning; None: 0", default=None)
+    initial_pressure: Number | None = param("Pa", "of the fluid at the beginning; None: 0", default=None)
     scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)")
     keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy beside that of the sponge")
 
@@ -88,7 +88,7 @@ class Porosity(Physics):
         """Pressure and volumes at the end of the step."""
         return Fluid(end.pressure, determinant(end.F), memory.J if self.scheme == "lagged" else None)
 
-    def bulk_modulus(self) -> Any:
+    def bulk_modulus(self) -> Number:
         """Of the drained sponge."""
         return self.bulk
 
@@ -152,7 +152,7 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
     return f"{sponge}; the law's own volumetric energy is off"
 
 
-def volumetric_stress(porosity: Porosity, J: Any) -> Any:
+def volumetric_stress(porosity: Porosity, J: Number) -> Number:
     """sigma_Heq(J) [Pa]: Hencky's logarithm above J0, its tangent line below; finite for every J."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
@@ -160,14 +160,14 @@ def volumetric_stress(porosity: Porosity, J: Any) -> Any:
     return logarithm + K_lim * jnp.minimum(J - J0, 0.0)
 
 
-def volumetric_slope(porosity: Porosity, J: Any) -> Any:
+def volumetric_slope(porosity: Porosity, J: Number) -> jax.Array:
     """d sigma_Heq / dJ [Pa]."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     return jnp.where(J > J0, K0 / (1 + (jnp.maximum(J, J0) - 1) / r_w), K_lim)
 
 
-def volumetric_energy(porosity: Porosity, J: Any) -> Any:
+def volumetric_energy(porosity: Porosity, J: Number) -> Number:
     """The integral of sigma_Heq from 1 to J [Pa]: K0 r_w^2 (u ln u - u + 1), u = (r_w + J - 1)/r_w, and a parabola."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
@@ -183,7 +183,7 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
     return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
 
 
-def inflow(porosity: Porosity, mesh: TetMesh, time: Any, dt: Any) -> tuple[jax.Array, jax.Array]:
+def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
     """Of `darcy.Flow` with inlets, at a time [s]: given pressures (V,) [Pa], and what enters in dt (V,) [m^3]."""
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:

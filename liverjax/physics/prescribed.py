@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.history import entry_at
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, Numbers, param, static, struct
 from liverjax.mesh.selection import AXES
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -25,8 +25,8 @@ class Displaced:
     """Nodes that are moved: by `by` at the last step, proportionally before; or along a history, a factor of `by`."""
 
     nodes: Any = param("1", "node numbers (n,)", lower=0)
-    by: Any = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
-    times: Any = param("s", "times of a history (T,)", default=None)
+    by: Numbers | None = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
+    times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Any = param(
         "m", "displacements at these times (T, 3), or factors of by (T,); linear in between", default=None
     )
@@ -53,7 +53,7 @@ def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
     return free
 
 
-def prescribed(mesh: TetMesh, displaced: tuple, time: Any, fraction: Any) -> jax.Array:
+def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) -> jax.Array:
     """Displacements (V, 3) [m] of prescribed degrees of freedom, zero elsewhere.
 
     Args:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Number, Numbers, param, replace, static, struct
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 
@@ -24,8 +24,10 @@ class RigidPlate(Physics):
     """Nodes that turn about an axis as one body."""
 
     nodes: jax.Array = param("1", "node numbers (n,)", lower=0)
-    turn: Any = param("rad or N m", "angle or torque; a number, or at times of a history (T,), linear in between")
-    times: Any = param("s", "times of the history (T,), ascending; None: the turn stays as it is", default=None)
+    turn: Number = param("rad or N m", "angle or torque; a number, or at times of a history (T,), linear in between")
+    times: Numbers | None = param(
+        "s", "times of the history (T,), ascending; None: the turn stays as it is", default=None
+    )
     axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
     centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
     by: str = static(default="angle", about="what is given: angle or torque")
@@ -123,14 +125,14 @@ class Plate(NamedTuple):
         """Moment [N m] about the axis of forces f (V, 3) [N] on the plate's nodes at positions x (V, 3)."""
         return jnp.sum(self.arms(x) * f[self.plate.nodes])
 
-    def spread(self, field: jax.Array, turn: Any, lift: Any) -> jax.Array:
+    def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
         """The field (V, 3) with the plate's rows made of amplitudes of its two motions."""
         rows = turn * self._arms(self.carrier) / self.radius
         if self.plate.lifts:
             rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
         return field.at[self.plate.nodes].set(rows)
 
-    def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Any, Any]:
+    def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Number, Number]:
         """R times the turn, and sqrt(n) times the way along the axis, that a field (V, 3) has along `arms` (n, 3)."""
         rows = field[self.plate.nodes]
         turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
@@ -149,13 +151,13 @@ class Plate(NamedTuple):
         turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
-    def placed(self, field: jax.Array, s: Any) -> jax.Array:
+    def placed(self, field: jax.Array, s: Number) -> jax.Array:
         """Positions (V, 3) that a field stands for."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
 
-    def moved(self, field: jax.Array, angle: Any, lift: Any) -> jax.Array:
+    def moved(self, field: jax.Array, angle: Number, lift: Number) -> jax.Array:
         """The field (V, 3) with the plate's rows at the positions of an angle [rad] and a way along the axis [m]."""
         axis, arms = self._axis(field)[None], self._arms(self.reference)
         # x - c turns in its plane: it changes by sin(a) of its arm and by cos(a) - 1 of what is across the axis.
@@ -171,7 +173,7 @@ class Torque(NodalForce):
 
     plate: Plate = param("1", "its nodes")
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Minus the forces whose moment is the torque."""
         rows = -self.plate.given(s) * self.plate.arms(x) / self.plate.radius**2
         return jnp.zeros_like(x).at[self.plate.plate.nodes].set(rows)

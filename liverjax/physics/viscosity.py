@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from liverjax.core import bounds
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Array, Number, param, static, struct
 from liverjax.laws.base import Law, isochoric_part, volumetric_part
 from liverjax.laws.terms import invariant_terms
 from liverjax.physics.base import End, Pairs, Physics, Solid, Start, Step
@@ -138,7 +139,7 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
     return one_minus_q, jnp.where(r < 1, -jnp.expm1(-small) - series, q - jnp.exp(-large))
 
 
-def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array:
+def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
     """gamma_k / S_h at angular frequency omega [rad/s] on the steady cycle, complex, shape (N, ...).
 
     With `dt` [s] that of the recursion (the discrete formula, exact for it), without that of continuous time,
@@ -155,7 +156,7 @@ def complex_ratios(prony: Prony, omega: Any, dt: Any | None = None) -> jax.Array
     return (a + c * back) / (1 - b * back)
 
 
-def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: Any = float) -> History:
+def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: DTypeLike = float) -> History:
     """Memory of a body at rest, zero: of E points, or of the shape (Q, E)."""
     shape = (points,) if isinstance(points, int) else points
     gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
@@ -168,7 +169,7 @@ def relaxed_history(prony: Prony, stress: jax.Array) -> History:
     return History(gamma, None if prony.scheme == "backward_euler" else stress)
 
 
-def recall(prony: Prony, history: History, dt: Any) -> Recall:
+def recall(prony: Prony, history: History, dt: Array) -> Recall:
     """The constant part of the next step's stress, from the memory at its beginning."""
     a, b, c = coefficients(prony, dt)
     if a.ndim == 2:
@@ -189,7 +190,7 @@ def _recall_by_element(a: jax.Array, b: jax.Array, c: jax.Array, history: Histor
     return Recall(symmetric(tuple(past)), now if ndim == 3 else now[None])
 
 
-def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Any) -> History:
+def advance(prony: Prony, history: History, law: Law, F: Matrix, dt: Number) -> History:
     """Memory at the end of an accepted step with deformation gradient F."""
     a, b, c = coefficients(prony, dt)
     S = relaxing_stress(prony, law, F)

@@ -3,12 +3,11 @@
 What holds, moves and loads the body is the same. Positions and numbers of a node between others follow from theirs.
 """
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import replace
+from liverjax.core.struct import Indices, replace
 from liverjax.mesh import promotion
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.loads import Traction
@@ -24,7 +23,7 @@ def enriched(scene: Scene) -> Scene:
 def _quadratic_mesh(scene: Scene) -> Scene:
     mesh = promotion.quadratic(scene.mesh)
 
-    def more(nodes: Any) -> Any:
+    def more(nodes: Indices) -> jax.Array:
         return jnp.asarray(promotion.of_faces(scene.mesh, np.asarray(nodes)), jnp.int32)
 
     body = scene.body
@@ -40,9 +39,9 @@ def _quadratic_mesh(scene: Scene) -> Scene:
     )
 
 
-def _between(mesh: TetMesh, moved: Displaced, nodes: Any) -> Displaced:
+def _between(mesh: TetMesh, moved: Displaced, nodes: Indices) -> Displaced:
     """With the middles of edges moved by the mean of their ends."""
-    if moved.by is None or jnp.ndim(moved.by) == 1:
+    if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((mesh.number_of_vertices, 3), mesh.points.dtype).at[moved.nodes].set(moved.by)
     return replace(moved, nodes=nodes, by=promotion.on_middles(mesh, by.T).T[nodes])
@@ -51,7 +50,7 @@ def _between(mesh: TetMesh, moved: Displaced, nodes: Any) -> Displaced:
 def _cubic(scene: Scene) -> Scene:
     mesh = promotion.cubic(scene.mesh)
 
-    def more(nodes: Any) -> Any:
+    def more(nodes: Indices) -> jax.Array:
         return jnp.asarray(promotion.with_functions(mesh, np.asarray(nodes)), jnp.int32)
 
     # The unknowns of the new functions are no positions: where their nodes are moved, they stay 0.

@@ -3,6 +3,7 @@
 Other numbers become one number an element. A law of another kind is computed for the elements of its region alone.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 from liverjax import laws
 from liverjax.core import names
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import Indices, Numbers, param, replace, struct
 from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.tetrahedra import TetMesh
@@ -30,12 +31,12 @@ POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 class Region:
     """Elements with other numbers than those of the scene, or with another law; a later region wins where two meet."""
 
-    elements: Any = param("1", "element numbers (n,)")
+    elements: Indices = param("1", "element numbers (n,)")
     law: dict[str, Any] | Law | None = param(
         "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or a law of its own", default=None
     )
-    viscosity: dict[str, Any] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
-    porosity: dict[str, Any] | None = param(
+    viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)
+    porosity: Mapping[str, Numbers] | None = param(
         "1", "`bulk`, `limit_bulk`, `fluid_fraction`, `permeability` -> values", default=None
     )
 
@@ -83,7 +84,7 @@ def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
     return (*law.pieces(), *(region.law for region in regions if isinstance(region.law, Law)))
 
 
-def _changed(region: Region) -> dict[str, Any]:
+def _changed(region: Region) -> dict[str, object]:
     """Names and values where a region changes numbers of the scene's law."""
     return region.law if isinstance(region.law, dict) else {}
 
@@ -112,7 +113,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
     """The porosity with one number an element (E,), or (1, E) of quadratic ones, where a region has its own."""
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
             before = jnp.asarray(found.get(name, getattr(porosity, name)), float)
@@ -226,7 +227,7 @@ def check_regions(law: Law, regions: tuple[Region, ...]) -> None:
             laws.check_value(f"region.{k}: law.{name}", metadata, value)
 
 
-def _number_at(law: Law, name: str) -> Any:
+def _number_at(law: Law, name: str) -> jax.Array:
     value = names.get(law, name, _refused_name(name))
     if isinstance(value, tuple):
         raise InputError(f"region: {name} is a list of {len(value)}: name one of them, {name}.0")

@@ -1,5 +1,6 @@
 """A scene: a mesh, a law, the physics it has and no other, and what holds, moves and loads it."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 
 from liverjax.core import names
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Number, Numbers, param, replace, static, struct
 from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh, with_points
 from liverjax.physics.base import Physics
@@ -58,9 +59,9 @@ class Solve:
     robust: str = static(
         default="off", about="projected or regularised: make the energy least where a step cannot be followed"
     )
-    frequencies: Any = param("Hz", "(F,) of harmonic motion", above=0.0, default=None)
+    frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, default=None)
     reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
-    reduced_tolerance: Any = param(
+    reduced_tolerance: Number = param(
         "1", "estimated error over the largest displacement, above which the full model runs", above=0.0, default=0.01
     )
 
@@ -87,7 +88,7 @@ class Scene:
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
-def with_parameters(scene: Scene, values: dict[str, Any]) -> Scene:
+def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
     """The scene with numbers changed; values may be traced.
 
     Args:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,7 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
     return scene
 
 
-def output_of(content: dict[str, Any]) -> tuple[list[str], bool]:
+def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
     """What [output] of a scene file asks for: names of fields, and whether reactions are written as a table.
 
     Raises:
@@ -158,7 +158,7 @@ def _known(name: str, table: dict, keys: tuple) -> None:
             raise InputError(f"{name} has an unknown key {key!r}: {hint(key, keys)}")
 
 
-def _table(name: str, value: Any) -> dict:
+def _table(name: str, value: object) -> dict:
     if not isinstance(value, dict):
         raise InputError(f"{name} must be a table: write [{name}] and its keys below")
     if name in _KEYS:
@@ -175,13 +175,13 @@ def _section(content: dict, name: str, make: Any) -> Any:
     return make(_table(name, content[name])) if name in content else None
 
 
-def _number(name: str, value: Any) -> float:
+def _number(name: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise InputError(f"{name} = {value!r} is not a number: give one")
     return float(value)
 
 
-def _numbers(name: str, value: Any, length: int | None = None) -> np.ndarray:
+def _numbers(name: str, value: object, length: int | None = None) -> np.ndarray:
     if not isinstance(value, list) or (length is not None and len(value) != length):
         raise InputError(f"{name} = {value!r} must be a list of {length or 'some'} numbers: give one")
     return np.array([_number(name, v) for v in value])
@@ -231,7 +231,7 @@ def _cylinder(table: dict, scale: float) -> TetMesh:
     return shapes.cylinder(radius, height, cell_size, rim, rings.tolist(), match)
 
 
-def _law(value: Any, where: str = "[law]") -> Law:
+def _law(value: object, where: str = "[law]") -> Law:
     tables = value if isinstance(value, list) else [value]
     made = []
     for table in tables:
@@ -262,7 +262,7 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
     )
 
 
-def _law_of_region(name: str, given: Any) -> dict[str, Any] | Law:
+def _law_of_region(name: str, given: Any) -> dict[str, object] | Law:
     """A law of another kind, which has a name, or the numbers that differ."""
     if isinstance(given, list) or "name" in given:
         return _law(given, f"{name}: law")
@@ -289,7 +289,7 @@ def _prony(table: dict) -> Prony:
     return Prony(ratios=g, relaxation_times=tau, **{k: table[k] for k in ("part", "scheme") if k in table})
 
 
-def _porosity(mesh: Any, table: dict) -> Porosity:
+def _porosity(mesh: TetMesh, table: dict) -> Porosity:
     values: dict[str, Any] = {}
     for key in ("bulk", "limit_bulk", "fluid_fraction", "permeability"):
         if key not in table:
@@ -307,7 +307,7 @@ def _porosity(mesh: Any, table: dict) -> Porosity:
     return Porosity(**values, inlet=tuple(_inlet(mesh, f"porosity.inlet.{k}", t) for k, t in enumerate(given)))
 
 
-def _inlet(mesh: TetMesh, name: str, table: Any) -> Inlet:
+def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
     """A part with a given pressure of the fluid, or a flux through its surface."""
     if not isinstance(table, dict):
         raise InputError(f"{name} must be a table: write [[porosity.inlet]] and its keys below")
@@ -324,7 +324,7 @@ def _inlet(mesh: TetMesh, name: str, table: Any) -> Inlet:
     return Inlet(triangles=jnp.asarray(triangles, jnp.int32), flux=flux, **times)
 
 
-def _drained(mesh: Any, given: Any) -> jax.Array:
+def _drained(mesh: TetMesh, given: Any) -> jax.Array:
     """Nodes of one place, or of any place of a list."""
     if given == []:
         raise InputError("porosity.drained = [] names no place: give [{z_max = 0.0}], or leave it out (sealed)")
@@ -345,7 +345,7 @@ def _read_body(table: dict) -> Body:
     return Body(density=density, gravity=jnp.asarray(gravity), **_history("[body]", table))
 
 
-def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, Any]:
+def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:
     """Times and numbers of a table's history, where it has one."""
     if "history" not in table:
         return {}

@@ -8,11 +8,14 @@ Source: level sets of geodesic distance (Verroust and Lazarus 2000, Extracting s
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from liverjax.core.errors import InputError
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 #: Distance between rings over the mean radius of the tubes.
 _BAND = 2.0
@@ -105,7 +108,7 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
     return np.unique(np.sort(every, axis=1), axis=0)
 
 
-def _from_one_end(graph: Any, own: np.ndarray) -> np.ndarray:
+def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarray:
     """Distance along the edges (n,) from the corner that is farthest from any other one."""
     from scipy.sparse.csgraph import dijkstra
 

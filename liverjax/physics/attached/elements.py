@@ -6,11 +6,10 @@ function W of the metric C_kl = f_k . f_l. With T_kl = dW/dC_kl + dW/dC_lk force
     g_a = sum p_ka T_kl f_l,    K_ab = sum p_ka p_lb (T_kl I + d2W/dC_v dC_w (dC_v/df_k) (dC_w/df_l)).
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce
 from liverjax.solvers.attached import Attached
@@ -35,7 +34,7 @@ class Elements(NodalForce):
         """What is taken off the tangent vectors (d, 3, Q, m): of ends that are no nodes; None: nothing is."""
         return None
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Gradient of the energy."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])
@@ -49,7 +48,7 @@ class Elements(NodalForce):
         f = self._vectors(self.tangents(mesh), x[self.nodes(mesh)])
         return jnp.sum(self.energies(mesh, _metric(f)))
 
-    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
         """Second derivatives of the energy."""
         p, nodes = self.tangents(mesh), self.nodes(mesh)
         f = self._vectors(p, x[nodes])

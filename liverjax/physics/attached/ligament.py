@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Array, Indices, Number, Numbers, param, struct
 from liverjax.mesh import locate, selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
@@ -23,11 +23,11 @@ from liverjax.physics.base import Physics, Step
 class Ligament(Physics):
     """Fibres (m) that each pull at nodes of the body, and may end outside it."""
 
-    nodes: Any = param("1", "node numbers (n, m)", lower=0)
-    weights: Any = param("1", "of these nodes in the fibre's vector (n, m): they add up to 0, or to 1 with a wall")
-    to: Any = param("m", "where fibres end outside the body (3,); None: in it", default=None)
-    stiffness: Any = param("N/m", "of all fibres together", above=0.0)
-    pre_tension: Any = param("N", "of all fibres together, in the reference shape", lower=0.0, default=None)
+    nodes: Indices = param("1", "node numbers (n, m)", lower=0)
+    weights: Array = param("1", "of these nodes in the fibre's vector (n, m): they add up to 0, or to 1 with a wall")
+    to: Numbers | None = param("m", "where fibres end outside the body (3,); None: in it", default=None)
+    stiffness: Number = param("N/m", "of all fibres together", above=0.0)
+    pre_tension: Number | None = param("N", "of all fibres together, in the reference shape", lower=0.0, default=None)
     rest_length: Any = param("m", "of each fibre", above=0.0, default=None)
 
     section: ClassVar[str] = "ligament"
@@ -105,7 +105,7 @@ def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: 
     return Ligament(nodes=jnp.asarray(both, jnp.int32), weights=jnp.asarray(weights), **given)
 
 
-def _vector(value: Any, name: str) -> np.ndarray:
+def _vector(value: object, name: str) -> np.ndarray:
     try:
         vector = np.array(value, float)
     except (TypeError, ValueError):
@@ -120,7 +120,7 @@ class Fibres(Elements):
     """A ligament during a step."""
 
     at: Any = param("1", "node numbers (n, m)")
-    weights: Any = param("1", "in the fibre's vector (n, m)")
+    weights: Array = param("1", "in the fibre's vector (n, m)")
     to: Any = param("m", "end outside the body (3,), or None")
     rest: Any = param("m", "rest lengths (m,)")
     spring: Any = param("N/m", "stiffness of one fibre")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Indices, Number, param, struct
 from liverjax.laws import layers
 from liverjax.laws.base import Law
 from liverjax.mesh import selection, surface
@@ -28,8 +28,8 @@ from liverjax.physics.base import Physics, Step
 class Membrane(Physics):
     """A thin layer on triangles of the surface, without tension in the reference shape."""
 
-    triangles: Any = param("1", "node numbers (m, 3)", lower=0)
-    thickness: Any = param("m", "of the layer: one number, or one a triangle (m,)", above=0.0)
+    triangles: Indices = param("1", "node numbers (m, 3)", lower=0)
+    thickness: Number = param("m", "of the layer: one number, or one a triangle (m,)", above=0.0)
     law: Law = param("1", "of the layer; a number of it may be one a triangle (m,)")
 
     section: ClassVar[str] = "membrane"
@@ -74,7 +74,7 @@ class Stretched(Elements):
     triangles: Any = param("1", "node numbers (m, 3)")
     thickness: Any = param("m", "of the layer")
     law: Law = param("1", "isochoric, or whole where the stretch of the thickness is solved for")
-    solved: Any = param("1", "not None: the stretch of the thickness is solved for", default=None)
+    solved: object = param("1", "not None: the stretch of the thickness is solved for", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
         """Of triangles with 3 nodes, or with 6."""

@@ -5,6 +5,7 @@ of its element, so that it ties nothing that the elements do not tie. Its sectio
 its law acts in tension along it, at constant volume. The tissue that the wall displaces is not taken off.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Indices, Number, param, struct
 from liverjax.laws import layers
 from liverjax.laws.base import Law
 from liverjax.mesh import locate
@@ -31,18 +32,18 @@ _GAUSS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3)
 class Vessel(Physics):
     """Pieces (m) of a centre line, each in one element."""
 
-    element: Any = param("1", "element numbers (m,)", lower=0)
-    enters: Any = param("1", "barycentric coordinates where a piece begins (4, m)")
-    leaves: Any = param("1", "and where it ends (4, m)")
-    radius: Any = param("m", "outer radius, one number or one a piece (m,)", above=0.0)
-    wall: Any = param("m", "thickness of the wall; None: the section is a disc", above=0.0, default=None)
+    element: Indices = param("1", "element numbers (m,)", lower=0)
+    enters: jax.Array = param("1", "barycentric coordinates where a piece begins (4, m)")
+    leaves: jax.Array = param("1", "and where it ends (4, m)")
+    radius: Number = param("m", "outer radius, one number or one a piece (m,)", above=0.0)
+    wall: Number | None = param("m", "thickness of the wall; None: the section is a disc", above=0.0, default=None)
     law: Law = param("1", "of the wall")
 
     section: ClassVar[str] = "vessel"
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "line", "surface", "unit", "radius", "wall", "law")
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Vessel":
+    def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> "Vessel":
         """From [[vessel]]: points of a centre line and a radius (or one a point), or the file of a surface; a law."""
         if ("line" in table) == ("surface" in table) or "law" not in table:
             raise InputError(
@@ -83,13 +84,13 @@ class Vessel(Physics):
         law = self.law.isochoric_part() or self.law
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)
 
-    def area(self) -> Any:
+    def area(self) -> jax.Array:
         """Of the section [m^2]."""
         inner = 0.0 if self.wall is None else self.radius - self.wall
         return jnp.pi * (jnp.asarray(self.radius) ** 2 - inner**2)
 
 
-def _lines_of_surface(table: dict[str, Any], name: str) -> CentreLines:
+def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
     """Centre lines of the tubes of a file, with a radius of their own where one is given."""
     unit, radius = table.get("unit", "m"), table.get("radius")
     if unit not in UNITS:
@@ -104,7 +105,7 @@ def _lines_of_surface(table: dict[str, Any], name: str) -> CentreLines:
     return lines._replace(radius=np.full(len(lines.radius), float(radius)))
 
 
-def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: Any) -> Vessel:
+def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: object) -> Vessel:
     """A vessel along a line (n, 3) [m] with one radius or one a point (n,) [m]; what lies outside is left out.
 
     Raises:
@@ -119,7 +120,7 @@ def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "v
     return _of_pieces(mesh, cut, (line[:-1], line[1:]), radius, law, **given)
 
 
-def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: Any) -> Vessel:
+def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: object) -> Vessel:
     """Vessels along centre lines, as of a tree; what lies outside the body is left out.
 
     Raises:
@@ -137,7 +138,7 @@ def _cut(mesh: TetMesh, begin: np.ndarray, end: np.ndarray, name: str) -> locate
 
 
 def _of_pieces(
-    mesh: TetMesh, cut: locate.Pieces, lines: tuple[np.ndarray, np.ndarray], radius: Any, law: Law, **given: Any
+    mesh: TetMesh, cut: locate.Pieces, lines: tuple[np.ndarray, np.ndarray], radius: Number, law: Law, **given: Any
 ) -> Vessel:
     ends = []
     for at in (cut.begin, cut.end):
@@ -152,10 +153,10 @@ def _of_pieces(
 class Bars(Elements):
     """A vessel during a step."""
 
-    element: Any = param("1", "element numbers (m,)")
-    enters: Any = param("1", "barycentric (4, m)")
-    leaves: Any = param("1", "barycentric (4, m)")
-    section_area: Any = param("m^2", "one number, or one a piece (m,)")
+    element: Indices = param("1", "element numbers (m,)")
+    enters: jax.Array = param("1", "barycentric (4, m)")
+    leaves: jax.Array = param("1", "barycentric (4, m)")
+    section_area: jax.Array = param("m^2", "one number, or one a piece (m,)")
     law: Law = param("1", "of the wall")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:

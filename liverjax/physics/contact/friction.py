@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Start, Step
 from liverjax.physics.contact.obstacle import (
@@ -38,13 +38,13 @@ from liverjax.solvers.attached import Attached
 class RoughObstacle(Obstacle):
     """An obstacle that holds the surface back along its own."""
 
-    friction: Any = param("1", "Coulomb's coefficient, mu", lower=0.0, upper=10.0, default=0.0)
+    friction: Number = param("1", "Coulomb's coefficient, mu", lower=0.0, upper=10.0, default=0.0)
 
     keys: ClassVar[tuple[str, ...]] = (*Obstacle.keys, "friction")
     conservative: ClassVar[bool] = False
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> Self:
+    def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> Self:
         """From [[obstacle]] with a friction."""
         plain = super().read(mesh, table, name)
         return replace(plain, friction=table["friction"])
@@ -81,7 +81,7 @@ class RoughObstacle(Obstacle):
 class Rubbing(Touching):
     """The obstacle during a step."""
 
-    friction: Any = param("1", "mu", default=0.0)
+    friction: Number = param("1", "mu", default=0.0)
     slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
     past: Any = param("m", "points of contact then, as seen from the obstacle (3, Q, m)", default=None)
     nodes: Any = param("1", "of the triangles (n, m)", default=None)
@@ -93,7 +93,7 @@ class Rubbing(Touching):
         """Points of contact (3, Q, m) at positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
-    def slip_at(self, at: jax.Array, s: Any) -> jax.Array:
+    def slip_at(self, at: jax.Array, s: Number) -> jax.Array:
         """Elastic slip (3, Q, m) [m] of points (3, Q, m) at part s of the step."""
         moved = self.now(s)
         d = distances(self.obstacle, at, moved)
@@ -104,12 +104,12 @@ class Rubbing(Touching):
         size = jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Pressures, and the shear that holds back."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
-    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
         """Derivative of the force, all of it."""
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
@@ -122,6 +122,6 @@ class Rubbing(Touching):
         H = weighted_stiffness(self.obstacle, mesh)[None, None] * jnp.where(guessed[None, None], sticks, H)
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, H))
 
-    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+    def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
         """Nothing more: `attached` has it."""
         return jnp.zeros_like(dx)

@@ -15,11 +15,12 @@ from typing import Any, ClassVar, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from liverjax.core import history
 from liverjax.core.errors import InputError
 from liverjax.core.names import hint
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
 from liverjax.mesh import selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
@@ -39,17 +40,17 @@ _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 class Obstacle(Physics):
     """One rigid shape that stands still, moves `by` a vector within the run, or follows a history."""
 
-    triangles: Any = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
+    triangles: jax.Array = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
     shape: str = static(default="plane", about="plane, sphere, cylinder or cone")
-    position: Any = param(
+    position: Numbers = param(
         "m", "point of the plane or of the cylinder's axis, centre, tip (3,)", default=(0.0, 0.0, 0.0)
     )
     axis: Any = param("1", "normal to the free side; axis; from the cone's tip inwards (3,)", default=(0.0, 0.0, 1.0))
-    radius: Any = param("m", "of sphere and cylinder; of a cone's rounded tip", lower=0.0, default=0.0)
-    half_angle: Any = param("deg", "of the cone, between axis and side", above=0.0, default=45.0)
-    by: Any = param("m", "displacement (3,), reached at the last step", default=None)
-    times: Any = param("s", "times of a history (T,)", default=None)
-    history: Any = param("m", "displacements at these times (T, 3), or factors of by (T,)", default=None)
+    radius: Number = param("m", "of sphere and cylinder; of a cone's rounded tip", lower=0.0, default=0.0)
+    half_angle: Number = param("deg", "of the cone, between axis and side", above=0.0, default=45.0)
+    by: Numbers | None = param("m", "displacement (3,), reached at the last step", default=None)
+    times: Numbers | None = param("s", "times of a history (T,)", default=None)
+    history: Numbers | None = param("m", "displacements at these times (T, 3), or factors of by (T,)", default=None)
     stiffness: Any = param(
         "Pa/m", "pressure over depth, one or one a triangle (m,); None: by the body's own", above=0.0, default=None
     )
@@ -128,7 +129,7 @@ class Obstacle(Physics):
         """Where a history has it at time 0; else not yet displaced."""
         return replace(self, by=None) if self.history is None else self
 
-    def displacement(self, k: Any, steps: int, dt: Any) -> jax.Array:
+    def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
         """(3,) [m] at the end of step k; step 0 is the beginning of the run."""
         zero = jnp.zeros(3)
         if self.history is not None:
@@ -147,17 +148,17 @@ class Touching(NodalForce):
     """The obstacle during a step."""
 
     obstacle: Obstacle = param("1", "shape and stiffness")
-    moved: Any = param("m", "its displacement at the beginning and at the end (2, 3)")
+    moved: jax.Array = param("m", "its displacement at the beginning and at the end (2, 3)")
 
-    def now(self, s: Any) -> jax.Array:
+    def now(self, s: Number) -> jax.Array:
         """Its displacement (3,) [m] at part s of the step."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
 
-    def place(self, x: jax.Array, s: Any) -> jax.Array:
+    def place(self, x: jax.Array, s: Number) -> jax.Array:
         """Its displacement (3,) [m] at positions x (V, 3) of the body and part s of the step."""
         return self.now(s)
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Minus the pressures, shared out to the nodes of their triangles."""
         return self.force_at(mesh, x, self.place(x, s))
 
@@ -170,7 +171,7 @@ class Touching(NodalForce):
         depth = jnp.minimum(_distances(self.obstacle, mesh, x, self.now(1.0)).value, 0.0)
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
-    def attached(self, mesh: TetMesh, x: jax.Array, s: Any) -> Attached:
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
         """Second derivative of the energy: along the normal, and of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
@@ -215,7 +216,7 @@ def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
 
 
-def point_functions(mesh: TetMesh, dtype: Any) -> jax.Array:
+def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
     """Of a triangle's nodes at its points (n, Q)."""
     return jnp.asarray(surface.triangle_functions(mesh, _POINTS), dtype)
 
@@ -255,7 +256,7 @@ def weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     return jnp.broadcast_to(whole / _POINTS.shape[1], (_POINTS.shape[1], *whole.shape))
 
 
-def three_numbers(value: Any, name: str) -> jax.Array:
+def three_numbers(value: object, name: str) -> jax.Array:
     """A vector (3,) of a scene file.
 
     Raises:

@@ -8,6 +8,7 @@ E the energy of the contact at positions x. Eliminated, t(x) adds -h h^T / E_tt 
 h = dE/dx dt. That is one dense matrix of rank one, so the product applies it and no matrix holds it.
 """
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 import jax
@@ -16,7 +17,7 @@ import numpy as np
 
 from liverjax.core import history
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import Number, Numbers, param, replace, struct
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Start, Step
 from liverjax.physics.contact.obstacle import (
@@ -38,7 +39,7 @@ _MOST_STEPS = 200
 class PressedObstacle(Obstacle):
     """An obstacle under a force."""
 
-    force: Any = param("N", "that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
+    force: Numbers = param("N", "that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
 
     keys: ClassVar[tuple[str, ...]] = (*(key for key in Obstacle.keys if key != "by"), "force")
     driven: ClassVar[str] = "force"
@@ -46,7 +47,7 @@ class PressedObstacle(Obstacle):
     conservative: ClassVar[bool] = False
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> Self:
+    def read(cls, mesh: TetMesh, table: Mapping[str, object], name: str) -> Self:
         """From [[obstacle]] with a force."""
         plain = super().read(mesh, {key: value for key, value in table.items() if key != "force"}, name)
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
@@ -90,13 +91,13 @@ class PressedObstacle(Obstacle):
         force = jnp.asarray(self.force, float)
         return force / jnp.linalg.norm(force)
 
-    def load(self, k: Any, steps: int, dt: Any) -> jax.Array:
+    def load(self, k: Number, steps: int, dt: Number) -> jax.Array:
         """Size () [N] of the force at the end of step k; step 0 is the beginning of the run."""
         whole = jnp.linalg.norm(jnp.asarray(self.force, float))
         factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
         return jnp.maximum(whole * factor, 0.0)
 
-    def displacement(self, k: Any, steps: int, dt: Any) -> jax.Array:
+    def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
         """None is given."""
         return jnp.zeros(3)
 
@@ -132,7 +133,7 @@ class Pressing(Touching):
     direction: Any = param("1", "of the force (3,)", default=None)
     before: Any = param("m", "travel at the beginning ()", default=None)
     nodes: Any = param("1", "of the triangles (n, m)", default=None)
-    functions: Any = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
+    functions: jax.Array | None = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
 
     conservative: ClassVar[bool] = False  # type: ignore[misc]
@@ -194,7 +195,7 @@ class Pressing(Touching):
         depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)
         return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
 
-    def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
+    def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
         """-h (h . dx) / E_tt: the obstacle gives way."""
         travel = self.travel(self.points(x), s)
         h = jax.jvp(lambda t: self.force_at(mesh, x, t * self.direction), (travel,), (jnp.ones_like(travel),))[1]

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Array, Number
+
 #: What a scene may name, and the numbers that each needs.
 SHAPES: dict[str, tuple[str, ...]] = {
     "plane": ("axis",),
@@ -26,7 +28,7 @@ class Distance(NamedTuple):
     bent: list[list[jax.Array]]  # 3 x 3 of (…) [1/m]: second derivative
 
 
-def distance(shape: str, y: list[jax.Array], axis: Any, radius: Any, half_angle: Any) -> Distance:
+def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_angle: Number) -> Distance:
     """Signed distance of points y (3 of any shape) [m] from the shape.
 
     Args:
@@ -47,13 +49,13 @@ def distance(shape: str, y: list[jax.Array], axis: Any, radius: Any, half_angle:
     return _cone(y, axis, radius, half_angle)
 
 
-def _normal_to(y: list[jax.Array], axis: Any) -> list[jax.Array]:
+def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
     """The part of y normal to the axis."""
     along = sum(a * c for a, c in zip(axis, y, strict=True))
     return [c - along * a for a, c in zip(axis, y, strict=True)]
 
 
-def _round(y: list[jax.Array], radius: Any, axis: Any = None) -> Distance:
+def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
     """From a point, or from an axis that y is normal to."""
     # On the centre itself no direction is nearest: any will do, without a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
@@ -63,7 +65,7 @@ def _round(y: list[jax.Array], radius: Any, axis: Any = None) -> Distance:
     return Distance(r - radius, n, bent)
 
 
-def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Any) -> Distance:
+def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Number) -> Distance:
     """From its side, or from its tip where that is nearest; with a round tip, from a sharp cone further in."""
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]

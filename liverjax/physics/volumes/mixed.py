@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import gathered, integrals, interpolated
@@ -85,9 +85,9 @@ class MixedVolume(Physics):
 class Mixed(VolumeStress):
     """Pressures as unknowns during a step."""
 
-    part: Any = param("Pa", "gamma, which stays with the displacements")
+    part: Number = param("Pa", "gamma, which stays with the displacements")
     rest: Any = param("Pa", "K - gamma, carried by the pressures")
-    shear: Any = param("Pa", "shear modulus")
+    shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
     unit: Any = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
     kind: str = static(about="of the volumetric energy")
