@@ -8,7 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core import status
 from liverjax.core.struct import replace
-from liverjax.simulation import checkpoints, gradients
+from liverjax.simulation import gradient_checkpoints, gradients
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -259,5 +259,5 @@ def test_unknown_modes_and_names_are_refused():
 def test_segments_cover_all_steps():
     for steps in range(1, 40):
         for kept in range(1, steps):
-            count, length, rest = checkpoints.lengths(steps, kept)
+            count, length, rest = gradient_checkpoints.lengths(steps, kept)
             assert count * length + rest == steps and count + (rest > 0) <= kept

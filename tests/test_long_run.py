@@ -15,7 +15,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core import programs
-from liverjax.jobs import parts
+from liverjax.jobs import resumable_parts
 from liverjax.scenes import scene_file
 
 pytestmark = pytest.mark.quick_to_compile
@@ -81,7 +81,7 @@ def _numbers(file: Path) -> dict[str, np.ndarray]:
 
 def _stop_after(monkeypatch, count: int) -> None:
     """Ctrl-C at the write of part `count`, from 0."""
-    write, written = parts.write, []
+    write, written = resumable_parts.write, []
 
     def until(file, content):
         if len(written) == count:
@@ -89,7 +89,7 @@ def _stop_after(monkeypatch, count: int) -> None:
         write(file, content)
         written.append(file)
 
-    monkeypatch.setattr(parts, "write", until)
+    monkeypatch.setattr(resumable_parts, "write", until)
 
 
 def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch, capsys):
@@ -143,9 +143,9 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
 @pytest.mark.slow
 def test_a_killed_process_loses_no_finished_part(scene, tmp_path):
     command = [sys.executable, "-m", "liverjax", "simulate", str(scene), "--every", "1", "--out", str(tmp_path)]
-    folder = parts.beside(tmp_path / "result.h5")
+    folder = resumable_parts.beside(tmp_path / "result.h5")
     process = subprocess.Popen(command)
-    while not parts.part(folder, 0).exists():
+    while not resumable_parts.part(folder, 0).exists():
         time.sleep(0.01)
         assert process.poll() is None or (tmp_path / "result.h5").exists()
     os.kill(process.pid, signal.SIGKILL)

@@ -11,7 +11,7 @@ from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
 from fitting.fits import models, viscoelastic
-from fitting.methods import conversion, generalised_maxwell, relaxation_spectrum, springpots
+from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep, read_sweep
 from liverjax import InputError
@@ -81,7 +81,7 @@ def test_conversions_stay_within_a_percent_of_the_formula(fractional_fits, name)
     fine = np.geomspace(OMEGA[0], OMEGA[-1], 487)  # five times finer than where it was matched
     G, ours = FORMULAS[name](1j * fine, *TRUTHS[name]), prony_moduli(f.model, fine)
     found = max(np.abs(ours.real / G.real - 1).max(), np.abs(ours.imag / G.imag - 1).max())
-    assert stated < conversion.ALLOWED and found < 1.02 * stated + 1e-5  # between points it may be a little more
+    assert stated < as_prony_modes.ALLOWED and found < 1.02 * stated + 1e-5  # between points it may be a little more
     if name in ("springpot", "fractional_maxwell", "fractional_parallel"):  # fluids: nothing stays
         assert np.isclose(f.model.ratios.sum(), 1, rtol=1e-12)
 
@@ -99,7 +99,7 @@ def test_converted_modes_relax_as_the_mittag_leffler_function(fractional_fits):
         exact = e + m * mittag_leffler(-(mpmath.mpf(t / tau) ** a))
         G0, g, times = f.model
         ours = float(G0 * (1 - np.sum(g * (1 - np.exp(-t / times)))))
-        assert abs(ours / exact - 1) < conversion.ALLOWED, t
+        assert abs(ours / exact - 1) < as_prony_modes.ALLOWED, t
 
 
 def scipy_best(s: Sweep, name: str, count: int, seed: int = 0) -> float:

@@ -16,7 +16,7 @@ from liverjax.physics import boundary
 from liverjax.physics.inertia import Motion
 from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.step import step
-from liverjax.solvers import continuation
+from liverjax.solvers import step_cutting
 from liverjax.solvers.krylov import conjugate_gradients
 from liverjax.solvers.problem import Problem, StepOptions
 
@@ -72,7 +72,7 @@ def test_patch_test_is_exact(verified):
 
     method = Problem(residual, lambda q, s, *_: q, solved, lambda _: lambda r: r)
     options = StepOptions(tolerance=1e-13)
-    q, statistics, _ = jax.jit(lambda q: continuation.solve(method, q, options))((mask * start).ravel())
+    q, statistics, _ = jax.jit(lambda q: step_cutting.solve(method, q, options))((mask * start).ravel())
     assert int(statistics.status) == status.CONVERGED
     assert np.abs(np.asarray(q).reshape(-1, 3)[inner] - x[inner]).max() < 1e-11 * 0.1
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core import status
-from liverjax.solvers import continuation, newton
+from liverjax.solvers import newton, step_cutting
 from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
 from liverjax.solvers.problem import Problem, StepOptions
 
@@ -107,10 +107,10 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
     options = StepOptions(max_halvings=0)
     cuts = []
     for guess in (None, jnp.array([-1.0])):  # a guess that is out of the domain costs no cut
-        q, s, kept = jax.jit(lambda q, g=guess: continuation.solve(method, q, options, g))(jnp.ones(1))
+        q, s, kept = jax.jit(lambda q, g=guess: step_cutting.solve(method, q, options, g))(jnp.ones(1))
         assert s.status == status.CONVERGED and bool(kept.made)
         assert np.allclose(q, np.exp(-5), rtol=1e-7)
         cuts.append(int(s.cuts))
     assert cuts[0] == cuts[1] >= 3
-    q, s, _ = jax.jit(lambda q: continuation.solve(method, q, options._replace(max_cuts=2)))(jnp.ones(1))
+    q, s, _ = jax.jit(lambda q: step_cutting.solve(method, q, options._replace(max_cuts=2)))(jnp.ones(1))
     assert s.status != status.CONVERGED and np.isfinite(q)

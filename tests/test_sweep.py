@@ -17,7 +17,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.commands.sweep import OUTPUTS
 from liverjax.core import status
-from liverjax.jobs import design, parts, sweep
+from liverjax.jobs import design, resumable_parts, sweep
 from liverjax.simulation.batch import strategy_for
 
 pytestmark = pytest.mark.quick_to_compile
@@ -197,7 +197,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
     table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
     out = files / "rows.h5"
     sweep.run(table, out, process=(0, 2))
-    with parts.locked(out.with_name("rows.h5.parts") / "lock_0"):
+    with resumable_parts.locked(out.with_name("rows.h5.parts") / "lock_0"):
         assert main(command(files, "--resume")) == 2
     assert "in use by another process" in capsys.readouterr().err
     (files / "rows.csv").write_text(TABLE.replace("700", "701"))

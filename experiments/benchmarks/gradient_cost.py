@@ -22,7 +22,7 @@ from experiments.common import plt, save
 from experiments.liver import models, with_solve
 from liverjax.core.plotting import BLUE, GREEN, ORANGE
 from liverjax.core.struct import replace
-from liverjax.simulation import checkpoints, gradients
+from liverjax.simulation import gradient_checkpoints, gradients
 
 
 def small() -> lj.Scene:
@@ -81,7 +81,7 @@ def measure(model: str, steps: int, store: str) -> dict:
         "tetrahedra": scene.mesh.number_of_elements,
         "steps": steps,
         "store": store,
-        "states_kept": checkpoints.number_kept(kept, steps),
+        "states_kept": gradient_checkpoints.number_kept(kept, steps),
         "forward_s": forward_s,
         "gradient_s": gradient_s,
         "ratio": gradient_s / forward_s,

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.rheometer import MODULUS_UNITS
-from fitting.readers.sweep_columns import FREQUENCY_UNITS, is_angular
+from fitting.readers.sweep_columns import is_angular
 from fitting.readers.sweep_tables import Table, tables_of
 from fitting.readers.text_tables import text_of
+from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN = 4, 10.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
-from fitting.methods import conversion, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import Solution, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import Sweep
@@ -46,7 +46,7 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
         return model.values(springpots.full(model, u), reference)
 
     made = _conversion(sweep, lambda omega: at(found.u, omega), model.solid)
-    kind = Kind(model.name, lambda u: conversion.modes(made, at(u, made.omega)), model.names, model.units, values)
+    kind = Kind(model.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), model.names, model.units, values)
     return _finished(viscoelastic.fitted(sweep, found, kind, *seconds, {}), made)
 
 
@@ -77,7 +77,7 @@ def spectrum_fit(sweep: Sweep) -> Fit:
     names = ("equilibrium_modulus",) * solid + tuple(f"strengths[{k}]" for k in range(len(found.times)))
     kind = Kind(
         name="spectrum",
-        maxwell=lambda u: conversion.modes(made, complex_moduli(matched, u)),
+        maxwell=lambda u: as_prony_modes.modes(made, complex_moduli(matched, u)),
         names=names,
         units=("Pa",) * len(names),
         values=jnp.exp,
@@ -97,14 +97,14 @@ def spectrum_fit(sweep: Sweep) -> Fit:
     return _finished(viscoelastic.fitted(sweep, solution, kind, 0.0, 0.0, {"spectrum": details}), made)
 
 
-def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> conversion.Conversion:
-    return conversion.convert(moduli, sweep.angular_frequency[0], sweep.angular_frequency[-1], solid)
+def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conversion:
+    return as_prony_modes.convert(moduli, sweep.angular_frequency[0], sweep.angular_frequency[-1], solid)
 
 
-def _finished(fit: Fit, made: conversion.Conversion) -> Fit:
+def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
     """Add the error of the conversion, and the sentences about the model."""
     sentences = [_cut_off(fit)] if fit.kind.name != "fractional_zener" and fit.kind.effective is None else []
-    if made.error > conversion.ALLOWED:
+    if made.error > as_prony_modes.ALLOWED:
         sentences.append(
             f"{fit.modes} Prony modes follow the model {fit.kind.name} to {100 * made.error:.2g} % only; simulate a "
             "narrower band with --max-frequency"

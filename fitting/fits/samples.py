@@ -7,7 +7,7 @@ import numpy as np
 
 from fitting.fits import edges, models, viscoelastic
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
-from fitting.methods import conversion, generalised_maxwell, springpots, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.population import Population, population
 from fitting.readers.rheometer import Sweep
@@ -125,5 +125,5 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
     def formula(omega):
         return model.formula(1j * omega, *values)
 
-    made = conversion.convert(formula, low, high, model.solid)
-    return conversion.modes(made, formula(made.omega))
+    made = as_prony_modes.convert(formula, low, high, model.solid)
+    return as_prony_modes.modes(made, formula(made.omega))

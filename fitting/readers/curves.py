@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers import workbook
+from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
 
-#: Pascal in the units that a column may name.
-UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 _INDICES = [f"{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 
 
@@ -115,7 +114,7 @@ def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str,
     for name in row:
         match = re.fullmatch(pattern + r"(?:[_ ]*[\[(]?(Pa|kPa|MPa)[\])]?)?", name)
         if match:
-            return name, UNITS[match[1] or unit], match[1] is not None
+            return name, STRESS_UNITS[match[1] or unit], match[1] is not None
     return None
 
 

@@ -7,14 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.text_tables import find_delimiter, split_cells, text_of, to_number
+from fitting.readers.units import INDENTATION_UNITS
 from liverjax.core.errors import InputError
 
-#: First words of the two columns, and what their units are in m and N.
+#: First words of the two columns.
 _WORDS = {"depth": ("depth", "displacement", "indentation"), "force": ("force", "load")}
-_UNITS = {
-    "depth": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
-    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "nN": 1e-9},
-}
 _FEWEST = 6
 
 
@@ -65,8 +62,8 @@ def _place_and_factor(cells: list[str], quantity: str) -> tuple[int, float] | No
     """Column and factor to SI of the heading that names a quantity with its unit."""
     for j, cell in enumerate(cells):
         words = [w for w in re.split(r"[\s_()\[\]#\"]+", cell) if w]
-        if len(words) > 1 and words[0].lower() in _WORDS[quantity] and words[-1] in _UNITS[quantity]:
-            return j, _UNITS[quantity][words[-1]]
+        if len(words) > 1 and words[0].lower() in _WORDS[quantity] and words[-1] in INDENTATION_UNITS[quantity]:
+            return j, INDENTATION_UNITS[quantity][words[-1]]
     return None
 
 

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fitting.readers.units import RAW_TORQUE_UNITS
+
 #: Relative standard deviation of an instrument's inertia: how far calibrations of one instrument lie apart.
 UNCERTAINTY = 0.03
 #: What a heading begins with and the quantity; where several name one quantity, the first of this list is taken.
@@ -26,14 +28,6 @@ HEADINGS = (
     ("strain amplitude", "strain"),
     ("strain", "strain"),
 )
-_TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}
-UNITS = {
-    "torque": _TORQUE,
-    "sample_torque": _TORQUE,
-    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6},
-    "phase": {"°": np.pi / 180, "deg": np.pi / 180, "rad": 1.0},
-    "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "": 1.0},
-}
 
 
 class SampleShare(NamedTuple):
@@ -60,8 +54,8 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
         word, quantity = HEADINGS[rank]
         rest = re.sub(r"^[\s_\[(]+|[\s\])]+$", "", name[len(word) :])
         unit = _plain_unit(rest or (units[k] if k < len(units) else ""))
-        if unit in UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
-            found[quantity] = (rank, k, UNITS[quantity][unit])
+        if unit in RAW_TORQUE_UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
+            found[quantity] = (rank, k, RAW_TORQUE_UNITS[quantity][unit])
     return {quantity: (k, factor) for quantity, (_, k, factor) in found.items()}
 
 

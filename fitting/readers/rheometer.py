@@ -15,11 +15,12 @@ from fitting.readers.frequency_sweep import FEWEST, Sweep
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
-from fitting.readers.sweep_columns import FREQUENCY_UNITS, MODULUS_UNITS, Column, is_angular, is_tensile, known_unit
+from fitting.readers.sweep_columns import Column, is_angular, is_tensile, known_unit
 from fitting.readers.sweep_tables import Table, choose_table, tables_of
 from fitting.readers.text_tables import split_line as split_line
 from fitting.readers.text_tables import text_of
 from fitting.readers.text_tables import to_number as to_number
+from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS
 from liverjax.core.errors import InputError
 
 #: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.

@@ -3,11 +3,8 @@
 import re
 from typing import NamedTuple
 
-import numpy as np
+from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS
 
-#: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
-MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
-FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1", "rad_s-1", "1/s", "s-1"), 1.0)
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
 #: First words of the columns; those with an E are of tension or bending.
 STORAGE, LOSS = ("storage", "g'", "gp", "e'", "ep"), ("loss", "g''", "gpp", "e''", "epp")

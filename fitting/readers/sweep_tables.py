@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers import raw_torque
-from fitting.readers.sweep_columns import MODULUS_UNITS, NEEDED, Column, header_columns
+from fitting.readers.sweep_columns import NEEDED, Column, header_columns
 from fitting.readers.text_tables import find_delimiter, split_cells, to_number
+from fitting.readers.units import MODULUS_UNITS
 from liverjax.core.errors import InputError
 
 

@@ -10,23 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.sweep_columns import MODULUS_UNITS
 from fitting.readers.text_tables import split_line, text_of, to_number
+from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
 
-_PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
-#: Units of every quantity, in SI; the first is taken where none is given.
-UNITS = {
-    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3},
-    "modulus": {"Pa": 1.0} | MODULUS_UNITS,
-    "compliance": {"1/Pa": 1.0} | _PER_PA,
-    "strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},
-    "stress": {"Pa": 1.0} | MODULUS_UNITS,
-    "torque": {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6},
-    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
-    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
-    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
-}
 #: Words that begin a heading, and the quantity; the longer ones come first.
 WORDS = (
     ("relaxation modulus", "modulus"),
@@ -235,7 +222,7 @@ def _plain_heading(unit: str) -> str:
 
 
 def _known_column(quantity: str, unit: str) -> bool:
-    return _plain_heading(unit) in UNITS[quantity]
+    return _plain_heading(unit) in TIME_TEST_UNITS[quantity]
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
@@ -267,11 +254,13 @@ def _in_si(path, found, rows, units):
     for j, (quantity, (_, unit)) in enumerate(found.items()):
         unit = units.get(quantity) or unit
         if unit is None:
-            unit = next(iter(UNITS[quantity]))
+            unit = next(iter(TIME_TEST_UNITS[quantity]))
             notes.append(f"the column of {quantity} states no unit; {unit} is taken")
         if not _known_column(quantity, unit):
-            raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(UNITS[quantity])}")
-        columns[quantity] = rows[:, j] * UNITS[quantity][_plain_heading(unit)]
+            raise InputError(
+                f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(TIME_TEST_UNITS[quantity])}"
+            )
+        columns[quantity] = rows[:, j] * TIME_TEST_UNITS[quantity][_plain_heading(unit)]
     good = np.all(np.isfinite(rows), axis=1)
     if not good.all():
         notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a number in them is not finite")

@@ -20,8 +20,8 @@ import numpy as np
 
 from fitting.readers.time_tests import TimeTest, of_columns, read_columns
 from fitting.rigs import glued, thin_layer
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.laws import NeoHookean
 
 #: Lengths that each test needs, in metres; the cone has an angle.

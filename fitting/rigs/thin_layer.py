@@ -5,7 +5,7 @@ what a half-space would do, for every wave number xi. This makes one integral eq
 solved at Gauss points. The force is linear in the modulus, so one table of force over depth serves a whole fit.
 
 Sources: Lebedev and Ufliand 1958, J. Appl. Math. Mech. 22:442; Hayes et al. 1972, J. Biomech. 5:541 (the layer);
-Sneddon 1965, Int. J. Eng. Sci. 3:47 (the half-space); Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
+Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
 """
 
 from typing import NamedTuple
@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.interpolate
 
+from fitting.rigs.hertz import SHAPES, Indenter, half_space
 from liverjax.core.errors import InputError
 
-SHAPES = ("sphere", "cone", "punch")
 #: Largest contact radius over thickness that a table goes to.
 WIDEST = 8.0
 #: Beyond this, 1 - K(eta), which falls as eta^2 exp(-2 eta), is below 1e-13.
@@ -76,32 +76,12 @@ def punch_factor(radius: float, thickness: float, poisson: float) -> float:
     return _contact(radius / thickness, poisson, "punch")[1]
 
 
-class Indenter(NamedTuple):
-    """An indenter on a layer."""
-
-    shape: str  # one of `SHAPES`
-    thickness: float  # [m]
-    poisson: float
-    radius: float = 0.0  # [m] of sphere and punch
-    half_angle: float = 45.0  # [deg] of the cone, between axis and side
-
-
 def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
     """Size of the half-space's contact over the thickness: sqrt(R d)/h of a sphere, d tan(angle)/h of a cone."""
     depth = np.maximum(depth, 0.0)
     if rig.shape == "sphere":
         return np.sqrt(rig.radius * depth) / rig.thickness
     return depth * np.tan(np.deg2rad(rig.half_angle)) / rig.thickness
-
-
-def half_space(rig: Indenter, depth: np.ndarray) -> np.ndarray:
-    """Force [N] per unit Young's modulus [Pa] at depths [m], 0 before contact; by Hertz and by Sneddon."""
-    depth, plane = np.maximum(depth, 0.0), 1 / (1 - rig.poisson**2)
-    if rig.shape == "sphere":
-        return 4 / 3 * plane * np.sqrt(rig.radius) * depth**1.5
-    if rig.shape == "cone":
-        return 2 / np.pi * plane * np.tan(np.deg2rad(rig.half_angle)) * depth**2
-    return 2 * plane * rig.radius * depth
 
 
 def check_indenter(rig: Indenter) -> None:

@@ -8,16 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.text_tables import split_line, text_of, to_number
+from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
 
-#: Units of every quantity and their factors to SI; the first is taken where none is given. 1 Np is a factor of e.
-UNITS = {
-    "frequency": {"Hz": 2 * np.pi, "kHz": 2e3 * np.pi, "rad/s": 1.0, "rad_s": 1.0},
-    "velocity": {"m/s": 1.0, "m_s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
-    "attenuation": {"1/m": 1.0, "Np/m": 1.0, "1/cm": 1e2, "Np/cm": 1e2, "1/mm": 1e3}
-    | {"dB/m": np.log(10) / 20, "dB/cm": 5 * np.log(10)},
-}
 #: Words that begin a heading, and the quantity.
 WORDS = (
     ("angular frequency", "frequency"),
@@ -126,7 +120,7 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
     factors = {}
     for quantity, (_, unit) in found.items():
         unit = unit or ("rad/s" if "angular" in lines[k].lower() and quantity == "frequency" else "")
-        known = UNITS[quantity]
+        known = WAVE_UNITS[quantity]
         if unit and unit not in known:
             raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(known)}")
         factors[quantity] = known[unit] if unit else next(iter(known.values()))

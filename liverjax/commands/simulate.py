@@ -127,7 +127,7 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: 
     import numpy as np
 
     from liverjax.core.versions import versions
-    from liverjax.jobs import output, parts
+    from liverjax.jobs import output, resumable_parts
     from liverjax.physics import porosity
     from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
 
@@ -137,8 +137,8 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: 
         print(attributes["bulk"])
     said = cautions_of_run(scene, ran.result)
     output.write_hdf5(target, scene, ran.result, attributes | {"warnings": said, "versions": versions()}, found)
-    if parts.beside(target).exists():
-        parts.remove(parts.beside(target))
+    if resumable_parts.beside(target).exists():
+        resumable_parts.remove(resumable_parts.beside(target))
     s, steps = ran.result.statistics, len(ran.result.times)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {steps} steps: "

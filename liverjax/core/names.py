@@ -1,22 +1,14 @@
-"""Dotted names, as scene files use them: `law.1.mu` leads to a number; an unknown word gets a hint."""
+"""Dotted names, as scene files use them: `law.1.mu` leads to a number."""
 
 import dataclasses
-import difflib
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
-
-
-def hint(word: str, known: Iterable[str]) -> str:
-    """The end of a sentence about an unknown word: the nearest known word, or all where none is near."""
-    words = list(known)
-    near = difflib.get_close_matches(word, words, n=1, cutoff=0.3)
-    return f"did you mean {near[0]}?" if near else f"use one of {', '.join(words)}"
 
 
 class PathStep(NamedTuple):

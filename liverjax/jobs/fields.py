@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End

@@ -17,7 +17,7 @@ import numpy as np
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.core.versions import versions
-from liverjax.jobs import parts
+from liverjax.jobs import resumable_parts
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import initial_state
 from liverjax.simulation.run import Result, prepared, simulate_part
@@ -48,7 +48,7 @@ def run(
     Args:
         scene: `Scene`.
         text: the scene file; results of another file are not continued.
-        out: file of the results, which the caller writes before it removes `parts.beside(out)`.
+        out: file of the results, which the caller writes before it removes `resumable_parts.beside(out)`.
         every: steps a part.
         resume: go on with the parts that are there.
         report: called with the number of every finished step, those found on disk too, at the end of each part: JAX
@@ -58,7 +58,7 @@ def run(
         InputError: parts that are there without `resume`, of another scene, or in use by another process.
         OSError: the disk is full; finished parts are kept.
     """
-    steps, folder = scene.solve.steps, parts.beside(out)
+    steps, folder = scene.solve.steps, resumable_parts.beside(out)
     if every < 1:
         raise InputError(f"--every {every} must be above 0: give e.g. 50")
     if folder.exists() and not resume:
@@ -66,18 +66,20 @@ def run(
     scene = prepared(scene)
     if steps <= every and not folder.exists():
         return _run_parts(scene, steps, None, report)
-    parts.make_folder(folder)
-    with parts.locked(folder / "lock_0"):
+    resumable_parts.make_folder(folder)
+    with resumable_parts.locked(folder / "lock_0"):
         # The text names files, of a mesh or a history, that may change behind it: so all numbers count as well.
-        numbers = parts.digest(*jax.tree.leaves(scene))
-        parts.same({"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json")
+        numbers = resumable_parts.digest(*jax.tree.leaves(scene))
+        resumable_parts.same(
+            {"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json"
+        )
         return _run_parts(scene, every, folder, report)
 
 
 def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[int], None] | None) -> Ran:
     """Read the parts that are in the folder; compute and write the others."""
     firsts = range(1, scene.solve.steps + 1, count)
-    files = [None if folder is None else parts.part(folder, k) for k in range(len(firsts))]
+    files = [None if folder is None else resumable_parts.part(folder, k) for k in range(len(firsts))]
     state, results, computed, run_time = initial_state(scene), [], 0, 0.0
     finished = [file is not None and file.exists() for file in files]
     begin = time.perf_counter()
@@ -93,7 +95,7 @@ def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[
             done = min(count, scene.solve.steps - first + 1)
             result, computed = jax.tree.map(lambda a, n=done: np.asarray(a)[:n], result), computed + done
             if file is not None:
-                parts.write(file, _content(result, state))
+                resumable_parts.write(file, _content(result, state))
         results.append(result)
         if report is not None:
             for step in range(len(result.times)):

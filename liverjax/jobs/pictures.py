@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.tetrahedra import tet_mesh

@@ -24,7 +24,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.versions import versions
-from liverjax.jobs import parts
+from liverjax.jobs import resumable_parts
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.scenes.scene_checks import check_numbers
@@ -108,9 +108,9 @@ def read_sweep(
     chunk = min(chunk, len(numbers))
     identity = {
         "scene": scene_file.read_text(encoding="utf-8"),
-        "numbers": parts.digest(*jax.tree.leaves(scene)),
-        "parameters": parts.digest(rows) + " " + " ".join(names),
-        "rows": parts.digest(numbers),
+        "numbers": resumable_parts.digest(*jax.tree.leaves(scene)),
+        "parameters": resumable_parts.digest(rows) + " " + " ".join(names),
+        "rows": resumable_parts.digest(numbers),
         "outputs": [*outputs, *(f"probe {p}" for p in probes)],
         "chunk": chunk,
         "versions": versions(),
@@ -174,17 +174,17 @@ def run(
         InputError: results that are there already, of another sweep, or in use by another process.
         OSError: the disk is full; finished chunks are kept.
     """
-    folder = parts.beside(out)
+    folder = resumable_parts.beside(out)
     if out.exists():
         return _already(sweep, out, resume)
     if folder.exists() and not resume and process[1] == 1:
         raise InputError(f"{folder} holds an unfinished sweep: go on with --resume, or remove it")
-    parts.make_folder(folder)
-    with parts.locked(folder / f"lock_{process[0]}"):
-        parts.same(sweep.identity, folder / "sweep.json")
+    resumable_parts.make_folder(folder)
+    with resumable_parts.locked(folder / f"lock_{process[0]}"):
+        resumable_parts.same(sweep.identity, folder / "sweep.json")
         program, computed = _program(sweep.outputs, sweep.probes), 0
         for k in list(_chunks(sweep))[process[0] :: process[1]]:
-            file = parts.part(folder, k)
+            file = resumable_parts.part(folder, k)
             if not file.exists():
                 _write_part(file, sweep, k, program)
                 computed += len(_of(sweep, k))
@@ -219,7 +219,7 @@ def _write_part(file: Path, sweep: Sweep, k: int, program: Callable) -> None:
     filled = np.minimum(chosen.start + np.arange(sweep.chunk), chosen[-1])
     values = {name: sweep.rows[filled, j] for j, name in enumerate(sweep.names)}
     result = program(sweep.scene, values)
-    parts.write(file, {name: np.asarray(value)[: len(chosen)] for name, value in result.items()})
+    resumable_parts.write(file, {name: np.asarray(value)[: len(chosen)] for name, value in result.items()})
 
 
 def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
@@ -237,15 +237,15 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
     """All parts as one file, by whichever process comes last."""
-    files = [parts.part(folder, k) for k in _chunks(sweep)]
+    files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
-        with parts.locked(folder / "lock_join"):
+        with resumable_parts.locked(folder / "lock_join"):
             if out.exists() or not all(f.exists() for f in files):
                 return Done(out if out.exists() else None, {}, computed)
             codes = _join(sweep, out, files)
     except (InputError, FileNotFoundError):  # another process joins them at this moment
         return Done(None, {}, computed)
-    parts.remove(folder)
+    resumable_parts.remove(folder)
     return Done(out, _failures(sweep, codes), computed)
 
 

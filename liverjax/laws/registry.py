@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core import bounds
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 from liverjax.laws.continued import Continued

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.mesh.tetrahedra import TetMesh
 
 AXES = "xyz"

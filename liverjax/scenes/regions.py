@@ -12,6 +12,7 @@ import numpy as np
 
 from liverjax import laws
 from liverjax.core import names
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Numbers, param, replace, struct
 from liverjax.laws import Law
@@ -203,7 +204,7 @@ def check_porosity(porosity: Porosity | None, regions: tuple[Region, ...]) -> No
             raise InputError(f"{name} needs a [porosity] of the scene: give one")
         for key, value in own.items():
             if key not in POROUS:
-                raise InputError(f"{name} has {key}, which cannot differ in a region: {names.hint(key, POROUS)}")
+                raise InputError(f"{name} has {key}, which cannot differ in a region: {hint(key, POROUS)}")
             if np.ndim(value):
                 raise InputError(f"{name}.{key} has {np.size(value)} numbers: give one")
         numbers = (*own.values(), *(getattr(porosity, key) for key in POROUS))

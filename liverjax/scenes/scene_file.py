@@ -12,8 +12,8 @@ import numpy as np
 
 from liverjax import laws
 from liverjax.core import history
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.files import read_mesh

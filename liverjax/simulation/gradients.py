@@ -17,11 +17,11 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.scenes.scene import Scene, with_parameters
-from liverjax.simulation import checkpoints
+from liverjax.simulation import gradient_checkpoints
 from liverjax.simulation.equations import equations, initial_state, unknowns
 from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import problem_of
-from liverjax.solvers import continuation
+from liverjax.solvers import step_cutting
 
 MODES = ("reverse", "forward")
 #: The scene's positions at the beginning, beside the dotted names of `with_parameters`.
@@ -62,7 +62,7 @@ def value_and_gradient(
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
     if not at:
         raise InputError("no parameters to differentiate by: give some, e.g. {'law.mu': 770.0}")
-    checkpoints.number_kept(store, scene.solve.steps)
+    gradient_checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
     with_parameters(scene, {name: value for name, value in values.items() if name != START})
     return _program_of_gradient(loss, store, mode)(scene, values)
@@ -95,12 +95,12 @@ _WORK = 440
 def memory(scene: Scene, store: str | int = "all") -> int:
     """Bytes that a derivative in reverse mode will keep and work with, known before anything is compiled."""
     steps = scene.solve.steps
-    kept = checkpoints.number_kept(store, steps)
+    kept = gradient_checkpoints.number_kept(store, steps)
 
     def carry(scene):
         start = initial_state(scene)
         first = equations(scene, start, jnp.ones(()))
-        return start, continuation.nothing_kept(problem_of(first), unknowns(first, start.x))
+        return start, step_cutting.nothing_kept(problem_of(first), unknowns(first, start.x))
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
     root = _bytes(scene.mesh.points)
@@ -108,7 +108,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:
         return steps * (state + root) + work
-    count, length, rest = checkpoints.lengths(steps, kept)
+    count, length, rest = gradient_checkpoints.lengths(steps, kept)
     # Beside the states, what the run returns; not all of it at once.
     return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 

@@ -15,12 +15,12 @@ from liverjax.mesh.tetrahedra import with_points
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_bounds, check_choices
-from liverjax.simulation import automatic, checkpoints
+from liverjax.simulation import automatic, gradient_checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs, unknowns
 from liverjax.simulation.mesh_error import MeshError, mesh_error_of, refuse
 from liverjax.simulation.step import problem_of, step
 from liverjax.simulation.unloaded import Unloaded, unload
-from liverjax.solvers import continuation
+from liverjax.solvers import step_cutting
 from liverjax.solvers.problem import StepStatistics
 
 
@@ -61,7 +61,7 @@ def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | No
         return (new, kept), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
     def advance(carry, k):
-        new = checkpoints.one_step(physics)(carry, k)
+        new = gradient_checkpoints.one_step(physics)(carry, k)
         if report is not None:
             jax.debug.callback(report, k)
         return new
@@ -83,11 +83,11 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
     method, q = problem_of(first), unknowns(first, start.x)
-    kept, one = continuation.nothing_kept(method, q), jnp.ones((), dtype)
+    kept, one = step_cutting.nothing_kept(method, q), jnp.ones((), dtype)
     # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
     near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
     advance = _step_by_step(scene, sizes, report, near)
-    return _result(scene, numbers, checkpoints.scan(advance, (start, kept), numbers, store))
+    return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))
 
 
 @partial(jax.jit, static_argnames="report")
@@ -96,7 +96,7 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     first = equations(scene, state, numbers[0], sizes)
-    kept = continuation.nothing_kept(problem_of(first), unknowns(first, state.x))
+    kept = step_cutting.nothing_kept(problem_of(first), unknowns(first, state.x))
     advance = _step_by_step(scene, sizes, report, None)
 
     def unless_over(carry, k):
@@ -142,7 +142,7 @@ def simulate(
         refuse(scene)
         if start is not None:
             raise InputError("mesh_error = True is for runs from the reference positions: leave start out")
-    result = _run(scene, start, report, checkpoints.number_kept(store, scene.solve.steps))
+    result = _run(scene, start, report, gradient_checkpoints.number_kept(store, scene.solve.steps))
     if not mesh_error:
         return result
     return replace(result, mesh_error=mesh_error_of(scene, result.positions, result.reactions))

@@ -14,13 +14,13 @@ from liverjax.physics.base import End, NodalForce
 from liverjax.physics.elasticity import Elastic
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, State, advanced, energy, forces, positions, residual, unknowns
-from liverjax.solvers import continuation
+from liverjax.solvers import step_cutting
 from liverjax.solvers.problem import Kept, Potential, Problem, StepOptions, StepStatistics
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 
 def problem_of(e: Equations) -> Problem:
-    """How `continuation.solve` finds the end of the step."""
+    """How `step_cutting.solve` finds the end of the step."""
     potential = None
     if e.scene.solve.robust != "off":
         potential = Potential(
@@ -79,7 +79,7 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     # Straight on where there is inertia; one step of Newton starts at x, as printed.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
-    q, statistics, kept = continuation.solve(problem_of(e), unknowns(e, x), options, guess, kept, near)
+    q, statistics, kept = step_cutting.solve(problem_of(e), unknowns(e, x), options, guess, kept, near)
     f = forces(e, q, jnp.ones((), x.dtype))
     projected = e.free.normals is not None or e.free.tied
     reactions = f.total - e.free.vectors(f.total, f.x) if projected else (1 - e.free.mask) * f.total

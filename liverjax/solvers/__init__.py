@@ -1,1 +1,1 @@
-"""Block matrices, Krylov methods, factorisation, preconditioner, Newton, continuation, minimisation."""
+"""Block matrices, Krylov methods, factorisation, preconditioner, Newton along a load, minimisation."""

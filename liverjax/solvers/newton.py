@@ -1,4 +1,7 @@
-"""Newton's method with a linear solve by conjugate gradients, differentiated implicitly at its root."""
+"""Newton's method with a line search and conjugate gradients, differentiated implicitly at its root.
+
+The steps of a scene follow their load in parts as well: `liverjax.solvers.step_cutting`.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

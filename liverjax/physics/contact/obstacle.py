@@ -18,8 +18,8 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from liverjax.core import history
+from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.names import hint
 from liverjax.core.struct import Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
 from liverjax.mesh import selection, surface

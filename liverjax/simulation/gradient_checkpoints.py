@@ -1,6 +1,6 @@
 """What reverse mode keeps of a run: the state and the root of every step, or a few states; it computes the rest again.
 
-The root of a step (its name is set in `liverjax.solvers.continuation`) is kept. The derivative evaluates forces and
+The root of a step (its name is set in `liverjax.solvers.step_cutting`) is kept. The derivative evaluates forces and
 tangent at the root again, but does not repeat Newton's iterations. If fewer states than steps are kept (Griewank and
 Walther 2008, 12), the steps between two of them run a second time.
 """
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.solvers.continuation import ROOT
+from liverjax.solvers.step_cutting import ROOT
 
 
 def number_kept(store: str | int, steps: int) -> int:

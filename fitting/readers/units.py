@@ -1,0 +1,43 @@
+"""Units that files may name, and their factors to SI (angular frequencies in rad/s)."""
+
+import numpy as np
+
+#: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
+MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
+FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1", "rad_s-1", "1/s", "s-1"), 1.0)
+#: Of the stress in curves.
+STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
+_TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}
+#: Of what an instrument writes beside the moduli.
+RAW_TORQUE_UNITS = {
+    "torque": _TORQUE,
+    "sample_torque": _TORQUE,
+    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6},
+    "phase": {"°": np.pi / 180, "deg": np.pi / 180, "rad": 1.0},
+    "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "": 1.0},
+}
+_PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
+#: Of tests in time; the first is taken where none is given.
+TIME_TEST_UNITS = {
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3},
+    "modulus": {"Pa": 1.0} | MODULUS_UNITS,
+    "compliance": {"1/Pa": 1.0} | _PER_PA,
+    "strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},
+    "stress": {"Pa": 1.0} | MODULUS_UNITS,
+    "torque": {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
+}
+#: Of indentation curves.
+INDENTATION_UNITS = {
+    "depth": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
+    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "nN": 1e-9},
+}
+#: Of shear waves; the first is taken where none is given. 1 Np is a factor of e.
+WAVE_UNITS = {
+    "frequency": {"Hz": 2 * np.pi, "kHz": 2e3 * np.pi, "rad/s": 1.0, "rad_s": 1.0},
+    "velocity": {"m/s": 1.0, "m_s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "attenuation": {"1/m": 1.0, "Np/m": 1.0, "1/cm": 1e2, "Np/cm": 1e2, "1/mm": 1e3}
+    | {"dB/m": np.log(10) / 20, "dB/cm": 5 * np.log(10)},
+}

@@ -1,0 +1,30 @@
+"""A rigid indenter on an elastic half-space: small strains, no friction, no adhesion.
+
+Sources: Hertz 1882, J. Reine Angew. Math. 92:156 (the sphere); Sneddon 1965, Int. J. Eng. Sci. 3:47 (cone and punch).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+SHAPES = ("sphere", "cone", "punch")
+
+
+class Indenter(NamedTuple):
+    """An indenter on a layer, or on a half-space, which is a layer without end."""
+
+    shape: str  # one of `SHAPES`
+    thickness: float  # [m]
+    poisson: float
+    radius: float = 0.0  # [m] of sphere and punch
+    half_angle: float = 45.0  # [deg] of the cone, between axis and side
+
+
+def half_space(rig: Indenter, depth: np.ndarray) -> np.ndarray:
+    """Force [N] per unit Young's modulus [Pa] at depths [m], 0 before contact; by Hertz and by Sneddon."""
+    depth, plane = np.maximum(depth, 0.0), 1 / (1 - rig.poisson**2)
+    if rig.shape == "sphere":
+        return 4 / 3 * plane * np.sqrt(rig.radius) * depth**1.5
+    if rig.shape == "cone":
+        return 2 / np.pi * plane * np.tan(np.deg2rad(rig.half_angle)) * depth**2
+    return 2 * plane * rig.radius * depth

@@ -1,0 +1,11 @@
+"""The hint at the end of a sentence that refuses an unknown word."""
+
+import difflib
+from collections.abc import Iterable
+
+
+def hint(word: str, known: Iterable[str]) -> str:
+    """The end of a sentence about an unknown word: the nearest known word, or all where none is near."""
+    words = list(known)
+    near = difflib.get_close_matches(word, words, n=1, cutoff=0.3)
+    return f"did you mean {near[0]}?" if near else f"use one of {', '.join(words)}"
