@@ -82,7 +82,7 @@ def check_bound(where: str, metadata: Mapping, value: Any) -> None:
 
 
 def _refuse(where: str, metadata: Mapping, value: Any, numbers: np.ndarray) -> None:
-    """The sentence of the first bound that a number of (n,) does not keep."""
+    """Refuse with a sentence on the first bound that one of the numbers (n,) breaks."""
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
         raise InputError(
@@ -114,7 +114,7 @@ def _numbers_of(where: str, metadata: Mapping, value: Any, leaves: list) -> np.n
 
 
 def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> str:
-    """Name and value, of many numbers those of the first wrong one."""
+    """Name and value; if there are many numbers, only the first wrong one."""
     if numbers.size > _FEW:
         first = int(np.argmax(wrong))
         return f"{where}, number {first + 1} of {numbers.size}, = {numbers[first]:g}"

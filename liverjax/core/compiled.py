@@ -33,7 +33,7 @@ class _Unknown(Exception):
 
 
 def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """`function` compiled for arguments like these, on one device; called with such arguments it only runs.
+    """Compile `function` for arguments like these, on one device. A call with such arguments then only runs it.
 
     Args:
         function: at the top of a module, or `functools.partial` of one whose keywords are fixed when compiled.
@@ -104,7 +104,7 @@ def _function_name(function: Callable[..., Any]) -> str:
 
 
 def _top(function: Any) -> str:
-    """Name of a function at the top of a module, which the sources tell all of; one made in another is unknown."""
+    """Name of a function at the top of a module, which the sources define. One inside another function is unknown."""
     module, name = function.__module__, function.__qualname__
     if not module.startswith(OWN) or not name.isidentifier():
         raise _Unknown
@@ -112,7 +112,7 @@ def _top(function: Any) -> str:
 
 
 def _key(function: Callable[..., Any], arguments: tuple) -> str:
-    """Digest of all that decides what the program is, but for the sources."""
+    """Digest of all that decides what the program is, except the sources."""
     fixed = function.keywords if isinstance(function, partial) else {}
     if isinstance(function, partial) and function.args:
         raise _Unknown
@@ -122,7 +122,7 @@ def _key(function: Callable[..., Any], arguments: tuple) -> str:
 
 
 def _said(thing: Any, static: bool = False) -> Any:
-    """What a program depends on: types, static values, and of all other numbers the shapes."""
+    """What a program depends on: types, static values, and the shapes of all other numbers."""
     if thing is None or isinstance(thing, (str, bool)):
         return repr(thing)
     if isinstance(thing, FunctionType) and static:

@@ -1,4 +1,4 @@
-"""Tables of time: numbers at increasing times, linear in between, the first before and the last after them.
+"""Tables of time: numbers at increasing times. Between two times a table is linear, outside them it is constant.
 
 A table with one number a time is a factor of what it belongs to; one with three is the vector itself.
 """
@@ -60,7 +60,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
 
 
 def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
-    """Refuse a history made in Python that means nothing; traced numbers pass.
+    """Refuse a history made in Python that cannot be used; traced numbers pass.
 
     Raises:
         InputError: one of times and history without the other, shapes that do not go together.
@@ -85,7 +85,7 @@ def entry_at(time: Any, times: Any, history: Any) -> jax.Array:
 
 
 def value_at(value: Any, time: Any, times: Any, history: Any) -> Any:
-    """A value at a time [s]: times the factor, or the vector in its place; as it is where there is no history."""
+    """A value at a time [s]: multiplied by the factor or replaced by the vector; constant without a history."""
     if history is None:
         return value
     now = entry_at(time, times, history)

@@ -35,19 +35,19 @@ class PathStep(NamedTuple):
 
 
 def get(thing: Any, name: str, refusal: str) -> Any:
-    """What stands at a dotted name; arguments and errors as of `walk`."""
+    """Return what stands at a dotted name. `walk` explains arguments and errors."""
     return walk(thing, name, refusal)[-1].inside()
 
 
 def put(thing: Any, name: str, value: Any, refusal: str) -> Any:
-    """A copy of `thing` with `value` (it may be traced) at a dotted name; arguments and errors as of `walk`."""
+    """Copy `thing` with `value` (it may be traced) at a dotted name. `walk` explains arguments and errors."""
     for step in reversed(walk(thing, name, refusal)):
         value = step.with_inside(value)
     return value
 
 
 def metadata(thing: Any, name: str, refusal: str) -> dict[str, Any]:
-    """Unit and bounds of the field that a dotted name leads to; arguments and errors as of `walk`."""
+    """Unit and bounds of the field that a dotted name leads to. `walk` explains arguments and errors."""
     last = next(step for step in reversed(walk(thing, name, refusal)) if dataclasses.is_dataclass(step.owner))
     return dict(last.owner.__dataclass_fields__[last.key].metadata)
 

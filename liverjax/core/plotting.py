@@ -20,7 +20,7 @@ def pyplot() -> Any:
 
 
 def import_meanwhile() -> None:
-    """Begin to import pyplot beside a computation that leaves Python alone: it takes a second."""
+    """Begin to import pyplot, which takes a second, while a computation outside of Python runs."""
     threading.Thread(target=pyplot, daemon=True).start()
 
 

@@ -31,7 +31,7 @@ def folder() -> Path | None:
 
 @contextmanager
 def kept_on_disk() -> Iterator[Path | None]:
-    """Inside it, compiled programs are read from disk and written there; gives the folder, `None` without a cache.
+    """Read and write compiled programs on disk inside this context. It gives the folder, or `None` without a cache.
 
     There is no cache if `LIVERJAX_CACHE` is "off", if the folder cannot be written, or if the user has given JAX a
     folder already (`JAX_COMPILATION_CACHE_DIR`), which stays as it is. Entries that cannot be read are compiled anew.
@@ -88,7 +88,7 @@ def _folder() -> Path | None:
 
 
 def _user_cache() -> Path:
-    """Where programs of this user keep what can be made again, as the platform has it."""
+    """The user's cache directory on this platform."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     if sys.platform == "darwin":
@@ -120,7 +120,7 @@ def _processor() -> str:
 
 
 def _forgotten(folder: Path, message: str) -> bool:
-    """Whether a warning is about the cache; the entries that it names are removed, or JAX would keep a broken one."""
+    """Whether a warning is about the cache. The broken entries that it names are removed: JAX would keep them."""
     if "persistent compilation cache" not in message:
         return False
     if "reading" in message:
@@ -131,7 +131,7 @@ def _forgotten(folder: Path, message: str) -> bool:
 
 
 def bound(root: Path, limit: int = LIMIT) -> None:
-    """Remove what was longest not used, until the programs of all releases take less than `limit` bytes."""
+    """Remove the programs that were not used for longest, until all releases together take less than `limit` bytes."""
     entries = []
     for entry in root.glob("*/*-cache"):
         try:

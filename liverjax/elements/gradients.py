@@ -1,4 +1,4 @@
-"""How the volume of an element changes with its nodes, and where it is least."""
+"""How the volume of an element changes with its nodes, and its smallest value."""
 
 import jax
 import jax.numpy as jnp

@@ -148,7 +148,7 @@ def regularised(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """The same with the chapter's regularisation in place of the projection: eigenvalues may be negative still."""
+    """The same with the chapter's regularisation in place of the projection. Eigenvalues may still be negative."""
     result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
     def with_more(weight: Any, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:

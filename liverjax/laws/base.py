@@ -1,4 +1,4 @@
-"""What a material law is: a strain energy, and its derivatives with respect to what it depends on.
+"""What a material law is: a strain energy and its derivatives.
 
 A law is a frozen pytree made with `liverjax.core.struct.struct`. It states one or more of
 
@@ -102,7 +102,7 @@ class Law:
         return 0.0 if self.bulk is None else self.bulk
 
     def check(self) -> None:
-        """Raise `InputError` where fields do not go together; for laws that have such fields."""
+        """Raise `InputError` where the values of two fields contradict each other."""
 
     # -- what a law is made of ----------------------------------------------------------------------------------------
 
@@ -119,7 +119,7 @@ class Law:
         return self
 
     def each(self, change: Callable[["Law"], "Law"]) -> "Law":
-        """The law with that of every part of the body changed."""
+        """Apply `change` to the law of every part of the body."""
         return change(self)
 
     def isochoric_part(self) -> Any:
@@ -135,7 +135,7 @@ class Law:
     # -- what a law can then do --------------------------------------------------------------------------------------
 
     def measures(self, F: Matrix) -> Invariants:
-        """What `strain_energy` takes, at the tuple matrix F."""
+        """The arguments of `strain_energy` at the tuple matrix F."""
         I = invariants(self.invariants, F)
         if "I4" in self.invariants:
             Fa = matvec(F, components(self.fibre, F[0][0]))

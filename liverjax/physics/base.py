@@ -1,4 +1,4 @@
-"""What a physics is: one frozen struct of numbers, and what acts of it during a step.
+"""What a physics is: one frozen struct of numbers, and a second struct that acts during a step.
 
 A scene has a tuple of physics. Each says what it remembers between steps, and what acts during one:
 
@@ -38,10 +38,10 @@ class Tied(Protocol):
     """Nodes that move together in a step, by a few numbers; a field of the nodes carries these numbers."""
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The part of a field (V, 3) along the free motions; forces at positions x (V, 3) work along those of x."""
+        """The part of a field (V, 3) along the free motions. Those of forces depend on the positions x (V, 3)."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """The field (V, 3) with the rows that stand for positions x (V, 3): `placed` gives them back."""
+        """Put the numbers of the motions at positions x (V, 3) into the field (V, 3). `placed` is the inverse."""
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
         """Positions (V, 3) that a field stands for, at part s of the step."""
@@ -55,7 +55,7 @@ class Free(NamedTuple):
     tied: tuple[Tied, ...] = ()  # nodes that move together
 
     def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The free part of a field (V, 3); of forces at positions x (V, 3) where nodes move together."""
+        """The free part of a field (V, 3). Forces need the positions x (V, 3) where nodes move together."""
         field = self.mask * field
         if self.normals is not None:
             field = field - jnp.sum(self.normals * field, axis=1, keepdims=True) * self.normals
@@ -76,7 +76,7 @@ class Free(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What a run begins with."""
+    """The state at the beginning of a run."""
 
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m]
@@ -85,7 +85,7 @@ class Start(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a step begins with; constant during it."""
+    """The state at the beginning of a step; constant during it."""
 
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m] at its beginning
@@ -98,7 +98,7 @@ class Step(NamedTuple):
 
 
 class End(NamedTuple):
-    """Where an accepted step ended."""
+    """The state at the end of an accepted step."""
 
     x: jax.Array  # (V, 3) [m]
     F: Matrix  # deformation gradients (E,), or (Q, E) where elements have Q points
@@ -211,18 +211,18 @@ class Physics:
         raise TypeError(f"{cls.__name__} has no table in scene files")
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse what no step can use; host side.
+        """Refuse numbers that no step can use; host side.
 
         Raises:
             InputError: one sentence that begins with `name`.
         """
 
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
-        """The same beside this law, for numbers that follow from it."""
+        """The same physics with the numbers that follow from this law."""
         return self
 
     def at_beginning(self) -> "Physics":
-        """The same as it stands before a run moves it."""
+        """The same physics at the beginning of a run, before anything moves."""
         return self
 
     def begin(self, start: Start) -> Any:
@@ -250,7 +250,7 @@ class Physics:
         return np.zeros(0, int), np.zeros((0, 3))
 
     def enriched(self, more: Callable[[Indices], Indices]) -> "Physics":
-        """The same on richer elements: `more` adds to node numbers (n,) those of the nodes between them."""
+        """The same physics on richer elements: `more` adds the nodes between the given node numbers (n,)."""
         return self
 
     def bulk_modulus(self) -> Any:
@@ -258,7 +258,7 @@ class Physics:
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """What the result shows of it beside positions and reactions: fields of the vertices (V,)."""
+        """Fields of the vertices (V,) for the result, beside positions and reactions."""
         return {}
 
 

@@ -1,4 +1,4 @@
-"""What holds, moves and loads a body, under the name that users have: `lj.boundary`."""
+"""All that holds, moves and loads a body, under one name: `lj.boundary`."""
 
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.selection import AXES, boundary_triangles, select

@@ -55,7 +55,7 @@ def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
 
 
 def _finite(e: Equations) -> Equations:
-    """The same body of stable neo-Hookean material: of the other physics, what acts at nodes alone."""
+    """The same body of stable neo-Hookean material. Of the other physics it keeps those that act at nodes."""
     law = e.scene.law
     mu = law.shear_modulus()
     own = [p.bulk_modulus() for p in e.physics if p.bulk_modulus() is not None]

@@ -91,13 +91,13 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached, ...]:
-    """Stiffness of elements between nodes that the physics bring."""
+    """Stiffness of the elements that physics put between nodes."""
     found = (a.attached(e.mesh, x, s) for a in e.nodal)
     return tuple(own if kind == "true" else attached.definite(own) for own in found if own is not None)
 
 
 def _symmetric(e: Equations, more: tuple[Attached, ...]) -> tuple[Attached, ...]:
-    """What a preconditioner takes of elements between nodes: friction has a stiffness without symmetry."""
+    """Elements between nodes for the preconditioner, made symmetric: the stiffness of friction is not."""
     return more if e.conservative else tuple(attached.symmetric_part(own) for own in more)
 
 
@@ -108,13 +108,13 @@ def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -
 
 
 def _shift(e: Equations) -> jax.Array | None:
-    """Size (V,) [N/m] of what acts on every node, or None: it keeps slow motions small."""
+    """Stiffness (V,) [N/m] that acts on every node, or None. It keeps slow motions small."""
     own = [a.stiffness() for a in e.nodal if a.everywhere]
     return own[0][0][0] if own and own[0] is not None else None
 
 
 def _coupled(e: Equations) -> VolumeStress | None:
-    """What has pressures that are unknowns beside the positions."""
+    """The physics whose pressures are unknowns beside the positions."""
     return e.volume if e.volume is not None and e.volume.coupled else None
 
 
@@ -213,7 +213,7 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> 
 
 
 def _of_vertices(e: Equations) -> Free:
-    """Where the vertices can move."""
+    """The free directions of the vertices."""
     V, (mask, normals) = e.mesh.number_of_vertices, e.free[:2]
     return Free(mask[:V], None if normals is None else normals[:V])
 
@@ -224,7 +224,7 @@ def _vertex_shift(e: Equations) -> jax.Array | None:
 
 
 def _coarse_mask(free: Free) -> jax.Array:
-    """(V, 3) 1 where coarse motions act: not at nodes that slide along no axis."""
+    """1 where coarse motions act, else 0, (V, 3). Nodes whose sliding plane is oblique take no part."""
     mask, normals = free[:2]
     return mask if normals is None else mask * jnp.all(normals == 0, axis=1, keepdims=True)
 
@@ -305,7 +305,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 def solve(
     e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Solution of K dq = b, the iterations it took (0 of a factorisation), and whether K was seen to be positive."""
+    """Solve K dq = b; return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
     if e.scene.solve.linear_solver == "direct":
         dq = _factorised(e, K, b)
         return dq, jnp.zeros((), jnp.int32), jnp.vdot(dq, b) >= 0
@@ -316,7 +316,7 @@ def solve(
 
 
 def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """The same by a factorisation, of the coupled matrix where pressures depend on motion."""
+    """The same by a factorisation. Where pressures depend on motion, it is of the coupled matrix."""
     free, load, volume = e.free.mask.T, b.reshape(3, -1), _coupled(e)
     if isinstance(K.matrix, PointMatrix):
         known = jnp.ones(0) if volume is None or volume.flow is None else volume.flow.mask

@@ -33,7 +33,7 @@ _OPTIONS = NewtonOptions(max_iterations=50, linear_tolerance=1e-2, max_halvings=
 
 
 class Unloaded(NamedTuple):
-    """A reference shape, and how well it was found."""
+    """A reference shape, its status and its residual."""
 
     scene: Scene  # with the reference shape
     status: jax.Array  # of `liverjax.core.status`; the points are NaN where it is not CONVERGED
@@ -58,7 +58,7 @@ def unload(scene: Scene) -> Unloaded:
 
 
 def resting(scene: Scene) -> Scene:
-    """The same body at rest for long under the loads of time 0."""
+    """The same body after a long rest under the loads of time 0."""
     law = scene.law
     if scene.viscosity is not None:
         left = lasting(scene.viscosity, scene.mesh.order)

@@ -28,7 +28,7 @@ class BlockMatrix(NamedTuple):
 
 
 def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
-    """Blocks of nodes and their neighbours, m x m of (W, V), from those of `PAIRS` of every element, m x m of (E,).
+    """Blocks of nodes and their neighbours, m x m of (W, V), from the element blocks of `PAIRS`, m x m of (E,).
 
     An entry that is None in every block stays None.
     """
@@ -124,7 +124,7 @@ def applied(blocks: Block, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...
 
 
 def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """A v as columns (V,), for the k columns (V,) of v: the first k columns of the blocks, all of their rows."""
+    """A v as columns (V,), for the k columns (V,) of v, with the first k columns of the blocks and all their rows."""
 
     def add(slot, total):
         near = [taken(column, A.nodes[slot]) for column in columns]

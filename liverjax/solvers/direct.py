@@ -36,7 +36,7 @@ def solve(
 def solve_points(
     mesh: TetMesh, A: PointMatrix, free: Any, b: jax.Array, normals: Any = None, attached: tuple[Attached, ...] = ()
 ) -> jax.Array:
-    """The same of quadratic elements, positions alone: b and the solution are (3, V).
+    """The same for quadratic elements; b and the solution are (3, V), positions alone.
 
     Pressures of the vertices, where A has them, are unknowns beside the positions; their row of the balance is 0.
     `free` are two masks, of positions (3, V) and of pressures.

@@ -85,7 +85,7 @@ def stabilised_biconjugate_gradients(
     tolerance: Any,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
-    """`conjugate_gradients` for an A without symmetry: BiCGSTAB (van der Vorst 1992), two products an iteration."""
+    """The same for a matrix without symmetry: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
     goal = tolerance * jnp.linalg.norm(b)
     one = jnp.ones((), b.dtype)
 
@@ -122,7 +122,7 @@ def true_residual(matvec: Callable[[jax.Array], jax.Array], b: jax.Array, x: jax
 
 
 class Known(NamedTuple):
-    """What is known of the matrix A of `differentiable_solve`."""
+    """Known properties of the matrix A of `differentiable_solve`."""
 
     symmetric: bool = True
     #: b -> solution for a symmetric A, and the true residual over |b|; None: iterations find it.

@@ -1,4 +1,4 @@
-"""Newton's problem on the energy of a step: for steps where following the load failed, or that begin inverted.
+"""Minimise the energy of a step. This serves steps that begin inverted, or whose load could not be followed.
 
 The true tangent is used where conjugate gradients find no negative curvature in it, else one without negative
 eigenvalues (`liverjax.elements.projection`); every step is shortened until the energy falls (Armijo). So the energy
@@ -79,7 +79,7 @@ def _potential(problem: Problem) -> Potential:
 
 
 def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A point without inverted elements near `start`, where one is there, and the iterations for it, of both kinds."""
+    """A point without inverted elements near `start`, if one is found, and its nonlinear and linear iterations."""
     zero, potential = jnp.zeros((), jnp.int32), _potential(problem)
     surrogate = potential.surrogate
     if surrogate is None:
@@ -127,7 +127,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
 
 
 def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usable: jax.Array) -> jax.Array:
-    """The first of 1, 1/2, 1/4, … with which the energy falls; 0 if there is none."""
+    """The first of the lengths 1, 1/2, 1/4, … that lowers the energy; 0 if none does."""
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):

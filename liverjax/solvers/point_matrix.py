@@ -34,7 +34,7 @@ class PointMatrix(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """What the preconditioner is made of."""
+    """The parts of the preconditioner."""
 
     diagonal: Block  # 3 x 3 of (V,)
     vertices: BlockMatrix  # the matrix for motions that are linear in every element
@@ -66,7 +66,7 @@ def volume_changes(mesh: TetMesh, A: PointMatrix, columns: Sequence[jax.Array]) 
 
 
 def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of pressures (V,) [Pa] of the vertices that push outwards: the transpose of the former."""
+    """Forces, columns (V,), of pressures (V,) [Pa] at the vertices: the transpose of `volume_changes`."""
     assert A.border is not None
     p = interpolated(mesh, pressures)
     return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
@@ -113,19 +113,19 @@ def _diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Matrix]) -> Block:
 
 
 def _on_vertices(mesh: TetMesh, own: Block) -> Block:
-    """What nodes add, lumped to the vertices: half of a middle's at either end."""
+    """The diagonal that nodes add, lumped to the vertices: half of a middle's share goes to either end."""
     return tuple(tuple(None if e is None else restricted(mesh, e) for e in row) for row in own)
 
 
 def restricted(mesh: TetMesh, column: jax.Array) -> jax.Array:
-    """The transpose of `prolonged`: (V,) of all nodes to the vertices."""
+    """The transpose of `prolonged`: from all nodes (V,) to the vertices."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     half = 0.5 * column[V : V + low.shape[0]]
     return given(given(column[:V], low, half), high, half)
 
 
 def prolonged(mesh: TetMesh, column: jax.Array) -> jax.Array:
-    """A field that is linear in every element: (V,) of the vertices to all nodes."""
+    """From the vertices (V,) to all nodes: a field that is linear in every element."""
     nodes = on_middles(mesh, column)
     more = mesh.number_of_nodes - len(nodes)
     return nodes if more == 0 else jnp.concatenate([nodes, jnp.zeros(more, column.dtype)])

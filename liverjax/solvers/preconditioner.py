@@ -77,7 +77,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
 def corrected(
     mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[Columns], Columns]
 ) -> Callable[[Columns], Columns]:
-    """The preconditioner `fine` of columns with the coarse solution added where it is used."""
+    """Add the coarse solution, where it is used, to the preconditioner `fine` of columns."""
     apply = correction(mesh, coarse, mask)
 
     def both(columns):

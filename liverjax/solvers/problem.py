@@ -1,4 +1,4 @@
-"""What a step's solvers are given: the problem, how hard to try, what is kept from step to step, what it took."""
+"""Input and output of a step's solvers: the problem, their limits, the tangent that is kept, and their statistics."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ class StepStatistics(NamedTuple):
 
 
 class StepOptions(NamedTuple):
-    """How hard to try; all but the tolerance is static."""
+    """Limits of a step's solver; all but the tolerance is static."""
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
     max_iterations: int = 25  # a part
@@ -32,7 +32,7 @@ class StepOptions(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """A tangent that goes from step to step: good for the next one as long as iterations converge fast with it."""
+    """The tangent of an earlier step. The next step uses it as long as its iterations converge fast."""
 
     tangent: Any
     made: jax.Array  # False: there is none yet

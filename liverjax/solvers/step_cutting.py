@@ -74,7 +74,7 @@ class _Point(NamedTuple):
 
 
 def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
-    """What the first of several steps is given."""
+    """The empty `Kept` of the first step."""
     zero = jnp.zeros((), start.dtype)
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
     no = jnp.array(False)
@@ -137,7 +137,7 @@ def solve(
 
 
 def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
-    """One linear solve from the step's beginning and no more (chapter, section 4.1.2), by the stiffness asked for."""
+    """A single linear solve from the beginning of the step (chapter, section 4.1.2), with the chosen stiffness."""
     if problem.potential is not None:
         problem = problem._replace(tangent=problem.potential.definite)
     zero, one = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
@@ -237,7 +237,7 @@ def _first_point(start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: 
 
 
 class _Verdict(NamedTuple):
-    """What the residual at a trial point means."""
+    """The decision that follows from the residual at a trial point."""
 
     accepted: jax.Array  # the point is the best of its part so far, or the beginning of one
     better: jax.Array
@@ -291,7 +291,7 @@ def _judge(
 
 
 def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point) -> _Point:
-    """One evaluation of the residual, and a direction where one is wanted."""
+    """Evaluate the residual once, and solve for a direction if it is needed."""
     trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
     s = jnp.where(c.launch, c.s_begin, c.s)
     r, force, by = problem.residual(trial, s)
@@ -352,7 +352,7 @@ def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
 def _direction(
     problem: Problem, kept: Kept, at: Any, load: jax.Array, forcing: Any, when: tuple[Any, Any]
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
-    """Solution of dr/dq dq = load to `forcing`, its iterations, the tangent it is of and whether that is positive.
+    """Solve dr/dq dq = load to `forcing`; return dq, the iterations, the tangent and whether it is positive.
 
     `when`: whether the tangent is made anew, and whether a solution is wanted.
     """

@@ -18,7 +18,7 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Invariants(NamedTuple):
-    """What a strain energy may depend on, each of shape (E,); `None` where the law does not ask for it."""
+    """The measures of strain (E,) of which a strain energy is a function; `None` where the law does not ask for one."""
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2
@@ -89,7 +89,7 @@ def right_cauchy_green(F: Matrix) -> Matrix:
 
 
 def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
-    """The invariants I1, I2 and J in `names` and no other."""
+    """Those of the invariants I1, I2 and J that are in `names`."""
     values = {}
     if "I1" in names or "I2" in names:
         values["I1"] = sum(dot(row, row) for row in F)

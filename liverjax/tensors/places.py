@@ -1,4 +1,4 @@
-"""Read and add at places that a mesh names: its node and edge numbers are within bounds, so no program looks."""
+"""Read and add at node and edge numbers of a mesh. They are within bounds, so the program does not check."""
 
 from typing import Any
 

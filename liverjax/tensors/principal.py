@@ -89,7 +89,7 @@ def stretches(F: Matrix) -> Stretches:
 
 
 def change(F: Matrix, orders: int) -> tuple:
-    """Six entries of C minus their value: zero, may be differentiated `orders` times with respect to F."""
+    """Six entries of C minus their value. They are zero and may be differentiated `orders` times by F."""
     C = right_cauchy_green(F)
     return _counted(orders, tuple(C[i][j] for i, j in SIX))
 
@@ -107,7 +107,7 @@ def _(left, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _counted_one(left: int, C: tuple) -> Any:
-    """1, to be differentiated `left` times and no more: beyond, the expansion would be wrong without a word."""
+    """The number 1, which may be differentiated `left` times. A further derivative would be wrong: it is refused."""
     return jnp.ones_like(C[0])
 
 

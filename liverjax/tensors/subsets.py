@@ -22,7 +22,7 @@ class Subsets(NamedTuple):
 
 
 def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
-    """First the elements of no group, if there are any, then each group.
+    """Subsets: first the elements of no group, if there are any, then each group.
 
     Args:
         groups: element numbers (n,) of groups that share none; they may be traced.
@@ -39,7 +39,7 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
 
 
 def in_subset(s: Subsets, k: int, numbers: T) -> T:
-    """Of a pytree, the numbers of subset k: of arrays (…, E) and (…, E, 3). What has no such axis stays."""
+    """The numbers of a pytree that belong to subset k, of arrays (…, E) and (…, E, 3). Others stay as they are."""
     E, own = s.number_of_elements, s.elements[k][0]
 
     def one(a: Any) -> Any:

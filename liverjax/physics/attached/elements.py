@@ -31,7 +31,7 @@ class Elements(NodalForce):
         raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
-        """What is taken off the tangent vectors (d, 3, Q, m): of ends that are no nodes; None: nothing is."""
+        """Part (d, 3, Q, m) to subtract from the tangent vectors, for ends that are no nodes; None: nothing."""
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -81,7 +81,7 @@ def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
-    """T from the slopes by C_11; or by C_11, C_12 and C_22."""
+    """T from the derivatives by C_11, or by C_11, C_12 and C_22."""
     if len(slopes) == 1:
         return [[2 * slopes[0]]]
     return [[2 * slopes[0], slopes[1]], [slopes[1], 2 * slopes[2]]]

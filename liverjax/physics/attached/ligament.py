@@ -53,7 +53,7 @@ class Ligament(Physics):
         return between(mesh, np.array([_vector(end, f"{name} points") for end in ends]), name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Node numbers of the mesh, a length at rest, and fibres that have a direction."""
+        """Refuse wrong node numbers, a wrong length at rest, and fibres without a direction."""
         numbers = np.asarray(self.nodes)
         if not numbers.size or numbers.max() >= mesh.number_of_nodes:
             raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
@@ -66,7 +66,7 @@ class Ligament(Physics):
             raise InputError(f"{name}.pre_tension = {self.pre_tension} N is more than it could have, {most:.3g} N")
 
     def _vectors(self, mesh: TetMesh) -> jax.Array:
-        """Of the fibres in the reference shape (m, 3)."""
+        """Vectors (m, 3) along the fibres in the reference shape."""
         f = jnp.einsum("am,ami->mi", jnp.asarray(self.weights), mesh.points[self.nodes])
         return f if self.to is None else f - jnp.asarray(self.to)[None]
 
@@ -85,7 +85,7 @@ class Ligament(Physics):
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Along the fibres to a wall."""
+        """Nodes are held along the fibres that end in a wall."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
         f = np.asarray(self._vectors(mesh))

@@ -51,7 +51,7 @@ class Membrane(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), thickness=table["thickness"], law=law)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Triangles of the mesh, one thickness or one each, and a law without directions."""
+        """Refuse triangles that are not in the mesh, a wrong number of thicknesses, and a law with directions."""
         numbers = np.asarray(self.triangles)
         if not numbers.size or numbers.max() >= mesh.number_of_vertices:
             raise InputError(f"{name} names no node or one beyond {mesh.number_of_vertices - 1}: renumber them")
@@ -77,11 +77,11 @@ class Stretched(Elements):
     solved: object = param("1", "not None: the stretch of the thickness is solved for", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Of triangles with 3 nodes, or with 6."""
+        """Nodes of the triangles: 3 each, or 6."""
         return jnp.stack(surface.triangle_nodes(mesh, self.triangles))
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """Of two unit vectors in the plane of the reference triangle."""
+        """Factors for two unit vectors in the plane of the reference triangle."""
         _, along = surface.triangle_slopes(mesh)
         r11, r12, r22 = (r[None, None] for r in self._edges(mesh))
         first, second = (jnp.asarray(a.T, r11.dtype)[:, :, None] for a in along)

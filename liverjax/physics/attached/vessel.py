@@ -67,7 +67,7 @@ class Vessel(Physics):
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Elements of the mesh, a wall within the radius, a law without directions."""
+        """Refuse elements that are not in the mesh, a wall thicker than the radius, and a law with directions."""
         numbers = np.asarray(self.element)
         if not numbers.size or numbers.max() >= mesh.number_of_elements:
             raise InputError(
@@ -85,7 +85,7 @@ class Vessel(Physics):
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)
 
     def area(self) -> jax.Array:
-        """Of the section [m^2]."""
+        """Area of the cross-section [m^2]."""
         inner = 0.0 if self.wall is None else self.radius - self.wall
         return jnp.pi * (jnp.asarray(self.radius) ** 2 - inner**2)
 
@@ -160,7 +160,7 @@ class Bars(Elements):
     law: Law = param("1", "of the wall")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Of the elements that are crossed."""
+        """Nodes of the elements that the vessel crosses."""
         count = 4 if mesh.order == 1 else 10
         return jnp.stack([nodes[self.element] for nodes in mesh.element_nodes[:count]])
 

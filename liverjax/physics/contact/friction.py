@@ -36,7 +36,7 @@ from liverjax.solvers.attached import Attached
 
 @struct
 class RoughObstacle(Obstacle):
-    """An obstacle that holds the surface back along its own."""
+    """An obstacle with friction: it resists sliding along its surface."""
 
     friction: Number = param("1", "Coulomb's coefficient, mu", lower=0.0, upper=10.0, default=0.0)
 
@@ -50,18 +50,18 @@ class RoughObstacle(Obstacle):
         return replace(plain, friction=table["friction"])
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Along all directions, where the surface touches the obstacle at the beginning."""
+        """Nodes are held in all directions where the surface touches the obstacle at the beginning."""
         nodes, normals = super().holds(mesh)
         if not np.all(np.asarray(self.friction) > 0):
             return nodes, normals
         return np.tile(nodes, 3), np.repeat(np.eye(3), len(nodes), axis=0)
 
     def begin(self, start: Start) -> jax.Array:
-        """No slip (3, Q, m) yet."""
+        """Begin without slip: zeros (3, Q, m)."""
         return jnp.zeros_like(contact_points(self, start.mesh, start.x))
 
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
-        """With the slip at the beginning of the step, and where the points are then, as seen from the obstacle."""
+        """Keep the slip at the beginning of the step, and the places of the points relative to the obstacle."""
         moved = super().freeze(memory, step).moved
         past = contact_points(self, step.mesh, step.x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
@@ -105,12 +105,12 @@ class Rubbing(Touching):
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Pressures, and the shear that holds back."""
+        """Forces of the pressures and of the friction."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Derivative of the force, all of it."""
+        """The whole derivative of the force."""
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
         H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
@@ -123,5 +123,5 @@ class Rubbing(Touching):
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, H))
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Nothing more: `attached` has it."""
+        """Nothing is left: `attached` has the whole derivative."""
         return jnp.zeros_like(dx)

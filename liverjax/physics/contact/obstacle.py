@@ -83,7 +83,7 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """A known shape, numbers that make one, triangles of the mesh, and a body that is outside at the beginning."""
+        """Refuse an unknown shape, wrong numbers or triangles, and a body that is not outside at the beginning."""
         if self.shape not in SHAPES:
             raise InputError(f"{name} shape = {self.shape!r} is not known: use {', '.join(SHAPES)}")
         numbers = np.asarray(self.triangles)
@@ -108,7 +108,7 @@ class Obstacle(Physics):
             )
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Along the normal, where the surface touches the obstacle at the beginning."""
+        """Nodes are held along the normal where the surface touches the obstacle at the beginning."""
         d = _distances(self, mesh, mesh.points, self.displacement(0, 1, 0.0))
         near = np.asarray(d.value <= 1e3 * _TOUCHING * jnp.sqrt(_triangle_areas(self, mesh))[None])
         _, touching = np.nonzero(near)
@@ -117,7 +117,7 @@ class Obstacle(Physics):
         return nodes.ravel(), np.repeat(normals, nodes.shape[1], axis=0)
 
     def in_body(self, mesh: TetMesh, law: Law) -> "Obstacle":
-        """With the stiffness that follows from the law: of a layer with K + 4/3 mu, where K counts up to 3 mu."""
+        """Take the default stiffness from the law: that of a layer with modulus K + 4/3 mu, K at most 3 mu."""
         if self.stiffness is not None:
             return self
         # A surface gives way to the side: a bulk modulus far above shear would make the contact needlessly hard.
@@ -126,7 +126,7 @@ class Obstacle(Physics):
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
 
     def at_beginning(self) -> "Obstacle":
-        """Where a history has it at time 0; else not yet displaced."""
+        """The obstacle at time 0 of its history; without one it has not moved yet."""
         return replace(self, by=None) if self.history is None else self
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
@@ -194,7 +194,7 @@ def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
-    """Forces of points (3, Q, m) [N] as the nodes have them (V, 3)."""
+    """Share the forces of points (3, Q, m) [N] out to the nodes (V, 3)."""
     own = jnp.einsum("aq,iqm->ami", point_functions(mesh, x.dtype), pushes)
     return jnp.zeros_like(x).at[touching_nodes(obstacle, mesh)].add(own)
 
@@ -212,12 +212,12 @@ def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
 
 
 def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Of the triangles (n, m), with 3 nodes each or 6."""
+    """Nodes (n, m) of the triangles, 3 or 6 each."""
     return jnp.stack(surface.triangle_nodes(mesh, obstacle.triangles))
 
 
 def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
-    """Of a triangle's nodes at its points (n, Q)."""
+    """Functions of a triangle's nodes at its points (n, Q)."""
     return jnp.asarray(surface.triangle_functions(mesh, _POINTS), dtype)
 
 
@@ -227,7 +227,7 @@ def contact_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array
 
 
 def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
-    """Of points (3, Q, m) [m] from the obstacle, `moved` (3,)."""
+    """Distances of points (3, Q, m) [m] from the obstacle, `moved` (3,)."""
     place = jnp.asarray(obstacle.position, at.dtype) + moved
     axis, angle = jnp.asarray(obstacle.axis, at.dtype), jnp.deg2rad(jnp.asarray(obstacle.half_angle, at.dtype))
     y = [at[i] - place[i] for i in range(3)]
@@ -235,17 +235,17 @@ def distances(obstacle: Obstacle, at: jax.Array, moved: jax.Array) -> Distance:
 
 
 def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> Distance:
-    """Of the points of the triangles (Q, m)."""
+    """Distances of the points of the triangles (Q, m)."""
     return distances(obstacle, contact_points(obstacle, mesh, x), moved)
 
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Whether points (Q, m) are inside, or so near that a body that lies there begins with something below it."""
+    """Whether points (Q, m) are inside, or so near that the obstacle carries a body that lies there."""
     return d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
 
 
 def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
-    """Of the triangles in the reference shape (m,) [m^2]."""
+    """Areas (m,) [m^2] of the triangles in the reference shape."""
     normal = surface.areas(mesh.points, obstacle.triangles)
     return jnp.sqrt(jnp.sum(normal * normal, axis=1))
 
