@@ -41,6 +41,7 @@ MU, TURN = 770.0, np.pi / 4
 FORMS: dict[str, tuple[int, dict]] = {
     "linear": (1, {"volumetric": "element"}),
     "linear, averaged": (1, {"volumetric": "nodal"}),
+    "linear, mixed": (1, {"volumetric": "mixed"}),
     "quadratic": (2, {"volumetric": "element"}),
     "quadratic, mixed": (2, {"volumetric": "mixed"}),
 }

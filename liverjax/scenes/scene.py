@@ -53,8 +53,8 @@ class Solve:
     )
     volumetric: str = static(
         default="element",
-        about="element; against locking nodal: averaged at nodes, or mixed: pressures of their own (quadratic "
-        "elements); auto: mixed where it can be",
+        about="element; against locking mixed: pressures of their own, or nodal: averaged at nodes; auto: mixed for "
+        "quadratic elements where it can be",
     )
     robust: str = static(
         default="off", about="projected or regularised: make the energy least where a step cannot be followed"

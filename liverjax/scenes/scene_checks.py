@@ -100,8 +100,6 @@ def _body(body: Body, nodes: int) -> None:
 
 def _mixed(scene: Scene) -> None:
     name = "[solve] volumetric = 'mixed'"
-    if scene.mesh.order != 2:
-        raise InputError(f"{name} needs quadratic elements: write order = 2 in [mesh], or take 'nodal'")
     if scene.solve.linear_solver == "direct":
         raise InputError(f"{name} iterates with a solver of its own: leave linear_solver = 'direct' out")
     if scene.solve.robust != "off":

@@ -47,6 +47,8 @@ def form_of_volumes(scene: Scene) -> str:
     name = scene.solve.volumetric
     if name != "auto":
         return name
+    if scene.mesh.order == 1:
+        return "element"
     try:
         check_choices(replace(scene, solve=replace(scene.solve, volumetric="mixed")))
     except InputError:

@@ -20,7 +20,7 @@ from liverjax.tensors.matrices import Matrix, scale
 
 
 def coupled(
-    mesh: TetMesh, K: dict, own: Any, F: Matrix, pressures: block_matrix.BlockMatrix
+    mesh: TetMesh, K: dict, own: Any, F: Matrix, pressures: block_matrix.BlockMatrix, slope: Any = 1.0
 ) -> block_matrix.BlockMatrix:
     """Derivative of forces and minus the pressure equation by (x, P): symmetric, indefinite, 4 x 4 blocks.
 
@@ -29,8 +29,9 @@ def coupled(
         own: 3 x 3 blocks of (V,) that nodes add to the diagonal, entries None where 0; or None.
         F: deformation gradient at the end of the step.
         pressures: matrix of the pressure equation.
+        slope: of what the pressures work on, by J (E,).
     """
-    q = [scale(mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
+    q = [scale(slope * mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
     bordered = {}
     for (a, b), block in K.items():
         forces = [(*block[r], -q[a][r]) for r in range(3)]
@@ -56,9 +57,7 @@ def eliminated(
     """
     *forces, balance = both
     dP = _pressures(mesh, flow, -A.diagonal[3][3], balance, exactly)
-    rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
-    pull = block_matrix.product(block_matrix.BlockMatrix(rows, diagonal, A.nodes), (dP,))
-    return tuple(f + p for f, p in zip(forces, pull, strict=True))
+    return tuple(f + p for f, p in zip(forces, pulled(mesh, A, -dP), strict=True))
 
 
 def _pressures(mesh: TetMesh, flow: Flow | None, compliance: jax.Array, balance: jax.Array, exactly: bool) -> jax.Array:
@@ -81,13 +80,26 @@ def eliminated_points(
     return tuple(f - p for f, p in zip(forces, point_matrix.pull(mesh, A, dP), strict=True))
 
 
-def with_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, both: Any) -> tuple[tuple[jax.Array, ...], jax.Array]:
+def with_pressures(
+    mesh: TetMesh, volume: Any, A: PointMatrix | block_matrix.BlockMatrix, both: Any
+) -> tuple[tuple[jax.Array, ...], jax.Array]:
     """Forces, columns (V,), and balance of unknown pressures (V,) in their unit, of a change (motion, pressures)."""
     motion, dp = both
-    forces = point_matrix.product(mesh, A, motion)
-    pulled = point_matrix.pull(mesh, A, volume.unit * dp)
+    if isinstance(A, block_matrix.BlockMatrix):
+        # The coupled matrix is of pressures that push inwards, and of minus the balance.
+        every = block_matrix.product(A, (*motion, -volume.unit * dp))
+        return every[:3], -volume.unit * every[3]
+    forces, outwards = point_matrix.product(mesh, A, motion), pulled(mesh, A, volume.unit * dp)
     balance = point_matrix.volume_changes(mesh, A, motion) - volume.compliance(mesh, volume.unit * dp)
-    return tuple(f + p for f, p in zip(forces, pulled, strict=True)), volume.unit * balance
+    return tuple(f + p for f, p in zip(forces, outwards, strict=True)), volume.unit * balance
+
+
+def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of pressures (V,) [Pa] of the vertices that push outwards."""
+    if isinstance(A, block_matrix.BlockMatrix):
+        rows, diagonal = (tuple(row[3:] for row in blocks[:3]) for blocks in (A.rows, A.diagonal))
+        return block_matrix.product(block_matrix.BlockMatrix(rows, diagonal, A.nodes), (-pressures,))
+    return point_matrix.pull(mesh, A, pressures)
 
 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Any) -> jax.Array:

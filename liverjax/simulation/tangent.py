@@ -167,14 +167,18 @@ def _assembled(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> 
     mesh, volume = e.mesh, _coupled(e)
     if mesh.order > 1:
         return _of_points(e, pressure, x, s, kind)
-    if volume is None:
+    acting = volume if e.mixed is None else e.mixed
+    if acting is None:
         A = stiffness(e, pressure, x, kind)
         diagonal = A.diagonal
     else:
         F = deformation_gradient(mesh, x)
-        K = element_blocks(e, pressure, F, kind)
-        pressures = volume.matrix(mesh, determinant(F), kind != "true")
-        A = mixed_system.coupled(mesh, K, node_blocks(e), F, pressures)
+        K, J = element_blocks(e, pressure, F, kind), determinant(F)
+        pressures = acting.matrix(mesh, J, kind != "true")
+        slope = 1.0 if e.mixed is None else e.mixed.border(J)
+        A = mixed_system.coupled(mesh, K, node_blocks(e), F, pressures, slope)
+        diagonal = tuple(row[:3] for row in A.diagonal[:3])
+    if volume is not None:
         diagonal = mixed_system.undrained_diagonal(A, 1.0 if volume.flow is None else volume.flow.mask)
     more = _attached(e, x, s, kind)
     near = _symmetric(e, more)
@@ -236,8 +240,7 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
         return block_matrix.applied(K.inverse, e.free.columns(columns))
 
     if K.vertices is None:
-        both = corrected(e.mesh, K.slow, _coarse_mask(e.free), fine)
-        return lambda r: _flat(e, both(block_matrix.columns(r)))
+        return _with_pressures(e, K, corrected(e.mesh, K.slow, _coarse_mask(e.free), fine))
     inverse, free = K.vertices, _of_vertices(e)
 
     def linear(columns: Any) -> tuple[jax.Array, ...]:
@@ -251,17 +254,22 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
         added = [point_matrix.prolonged(e.mesh, c) for c in below]
         return tuple(a + b for a, b in zip(fine(columns), added, strict=True))
 
-    if e.mixed is None or not isinstance(K.matrix, PointMatrix):
-        return lambda r: _flat(e, levels(block_matrix.columns(r)))
-    volume, A, n = e.mixed, K.matrix, 3 * e.mesh.number_of_nodes
+    return _with_pressures(e, K, levels)
+
+
+def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
+    """A preconditioner of columns (V,) as a function of flat vectors, with pressures where these are unknown."""
+    if e.mixed is None:
+        return lambda r: _flat(e, motions(block_matrix.columns(r)))
+    volume, n = e.mixed, 3 * e.mesh.number_of_nodes
     schur = volume.unit**2 * volume.schur(e.mesh)
 
     def triangular(r: jax.Array) -> jax.Array:
         """Pressures first, then the motions that they leave to the forces."""
         dp = -r[n:] / schur
-        pulled = point_matrix.pull(e.mesh, A, volume.unit * dp)
+        pulled = mixed_system.pulled(e.mesh, K.matrix, volume.unit * dp)
         left = [f - p for f, p in zip(block_matrix.columns(r[:n]), pulled, strict=True)]
-        return jnp.concatenate([_flat(e, levels(left)), dp])
+        return jnp.concatenate([_flat(e, motions(left)), dp])
 
     return triangular
 
@@ -280,7 +288,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 
     def apply(v: jax.Array) -> jax.Array:
         motion, balance = e.free.columns(block_matrix.columns(v[:n])), None
-        if e.mixed is not None and isinstance(A, PointMatrix):
+        if e.mixed is not None:
             force, balance = mixed_system.with_pressures(e.mesh, e.mixed, A, (motion, v[n:]))
         elif isinstance(A, BlockMatrix):
             force = block_matrix.product(A, motion)

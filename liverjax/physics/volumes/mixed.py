@@ -1,13 +1,18 @@
-"""Pressures of their own against volumetric locking, for quadratic elements: Taylor-Hood, P2/P1.
+"""Pressures of their own against volumetric locking: Taylor-Hood, P2/P1, of quadratic elements, P1/P1 of linear ones.
 
 With U(J) = K g(J)^2 / 2 the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
 p linear in every element and continuous. Where p has its best value, this is U with g averaged by p's functions: so
-volume changes are held on average, not at every point. The part gamma = min(mu, K/2) of the bulk modulus stays with the
-displacements, which keeps their matrix positive; the solution does not depend on it as the mesh is refined. Pressures
-are unknowns beside the positions: eliminated, Newton's method would not converge where K is large.
+volume changes are held on average, not at every point. The part gamma = min(mu, K/2) of the bulk modulus, a quarter of
+that in linear elements, stays with the displacements, which keeps their matrix positive; the solution does not depend
+on it as the mesh is refined. Pressures are unknowns beside the positions: eliminated, Newton's method would not
+converge where K is large.
+
+Linear positions cannot hold linear pressures: some pressures that change from node to node would move nothing, and they
+grow without bound where K is large. So linear elements have - (p - mean of p)^2 / (2 mu) as well, with the mean of the
+element (Bochev, Dohrmann and Gunzburger 2006): it goes with the square of the element's size.
 """
 
 from typing import Any, ClassVar
@@ -19,10 +24,13 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
-from liverjax.mesh.nodal import gathered, integrals, interpolated
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.nodal import gathered, integrals, interpolated, to_nodes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
+from liverjax.solvers.block_matrix import BlockMatrix, off_diagonal
 from liverjax.tensors.matrices import Matrix, cofactor, determinant, scale_matrix
+from liverjax.tensors.places import given, taken
 
 
 def check(law: Law, name: str = "[solve] volumetric = 'mixed'") -> None:
@@ -55,6 +63,10 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
 
 
+#: gamma over min(mu, K/2), by order. What stays with linear elements locks in them: less of it is more exact.
+_PART = {1: 0.25, 2: 1.0, 3: 1.0}
+
+
 @struct
 class MixedVolume(Physics):
     """The volumetric energy of a law, with pressures as unknowns."""
@@ -69,7 +81,7 @@ class MixedVolume(Physics):
         """The moduli, and the pressure at the beginning of the step."""
         U = volumetric_part(self.law)
         mu, bulk = self.law.shear_modulus(), self.law.bulk_modulus()
-        part = jnp.minimum(mu, bulk / 2)
+        part = _PART[step.mesh.order] * jnp.minimum(mu, bulk / 2)
         kind = next(law.volumetric for law in U.pieces()[0].summands())
         mean = jax.lax.stop_gradient(jnp.sum(jnp.broadcast_to(mu, step.mesh.weights.shape) * step.mesh.weights))
         volume = jax.lax.stop_gradient(jnp.sum(step.mesh.volumes))
@@ -124,8 +136,19 @@ class Mixed(VolumeStress):
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 
     def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of p's functions times p/(K - gamma)."""
-        return gathered(mesh, mesh.weights * interpolated(mesh, pressure) / self.rest)
+        """Integrals (V,) [m^3] of p's functions times p/(K - gamma), and what holds those of linear elements."""
+        if mesh.order > 1:
+            return gathered(mesh, mesh.weights * interpolated(mesh, pressure) / self.rest)
+        own = [taken(pressure, mesh.tetrahedra[:, a]) for a in range(4)]
+        mean = interpolated(mesh, pressure)
+        shares = [mesh.volumes * ((4 * mean + p) / self.rest + (p - mean) / self.shear) / 20 for p in own]
+        return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
+
+    def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
+        """`compliance` of linear elements as a matrix."""
+        soft, held = (jnp.broadcast_to(mesh.volumes / (20 * a), mesh.volumes.shape) for a in (self.rest, self.shear))
+        rows = off_diagonal(mesh, dict.fromkeys(PAIRS, ((soft - held / 4,),)))
+        return BlockMatrix(rows, ((to_nodes(mesh, 2 * soft + 0.75 * held),),), mesh.pattern.row_nodes)
 
     def schur(self, mesh: TetMesh) -> jax.Array:
         """Near the matrix of the pressures alone (V,) [m^3/Pa], displacements eliminated: lumped."""

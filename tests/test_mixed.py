@@ -1,0 +1,167 @@
+"""Pressures of their own, of linear and of quadratic elements: no locking, no wiggles, iterations that do not grow."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.physics.volumes import mixed
+from liverjax.simulation import tangent
+from liverjax.simulation.equations import equations, initial_state, positions, residual, unknowns
+from liverjax.simulation.run import prepared, simulate_part
+from liverjax.tensors.matrices import Invariants
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def _cook(order: int, n: int, ratio: float, kind: str = "quadratic", **solve) -> lj.Scene:
+    """Cook's membrane in plane strain, n x n cells as thick as long: thin ones slow BiCGSTAB down sixfold."""
+    flat = lj.shapes.box((1.0, 1.0, 1.0), (n, n, 1))
+    s, t, w = np.asarray(flat.points).T
+    points = np.stack([48 * s, 44 * s + t * (44 - 28 * s), 10 * w], axis=1) * 1e-3
+    mesh = lj.tet_mesh(points, flat.tetrahedra, flat.node_sets)
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    right = lj.boundary.boundary_triangles(mesh, mesh.node_sets["x_max"])
+    everywhere = jnp.arange(mesh.number_of_nodes)
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=770.0, bulk=770.0 * ratio, volumetric=kind),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]), lj.Fixed(nodes=everywhere, axes="z")),
+        traction=(lj.Traction(triangles=jnp.asarray(right), value=jnp.array([0.0, 7.7, 0.0])),),
+        solve=lj.Solve(**solve),
+    )
+
+
+def test_g_of_every_volumetric_energy_is_its_root():
+    J = jnp.array([0.3, 0.85, 0.9, 0.95, 1.0, 1.0 + 1e-9, 1.05, 1.1, 1.2, 3.0])
+    for kind in ("quadratic", "log", "simo"):
+        U = lj.laws.Volumetric(bulk=2.0, volumetric=kind).strain_energy(Invariants(J=J))
+        g = mixed.strain(kind, J)
+        # U itself cancels near 1: 1e-16 of numbers of size 1.
+        assert np.abs(g**2 - U).max() < 1e-15 + 4e-16 * np.abs(U).max()
+        assert np.all(np.sign(g) == np.sign(J - 1))
+        slope = jax.vmap(jax.grad(lambda J, kind=kind: mixed.strain(kind, J)))(J)
+        assert np.isclose(slope[4], 1.0, atol=1e-15) and np.all(slope > 0)
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_mixed_tangent_is_symmetric_and_the_derivative(order):
+    scene = _cook(order, 2, 1e3, kind="simo", volumetric="mixed")
+    e = equations(scene, initial_state(scene), 1.0)
+    rng = np.random.default_rng(0)
+    x = scene.mesh.points + 1e-4 * jnp.asarray(rng.standard_normal(scene.mesh.points.shape))
+    q = unknowns(e, x, jnp.asarray(100 * rng.standard_normal(scene.mesh.number_of_vertices)))
+    n = 3 * scene.mesh.number_of_nodes
+    v, w = (jnp.asarray(d).at[:n].multiply(e.free.mask.T.ravel()) for d in rng.standard_normal((2, len(q))))
+    _, _, pressure = residual(e, q, 1.0)
+    K = tangent.tangent(e, pressure, positions(e, q, 1.0), 1.0)
+    exact = jax.jvp(lambda q: residual(e, q, 1.0)[0], (q,), (v,))[1]
+    Kv, Kw = (tangent.product(e, K)(d) for d in (v, w))
+    assert np.abs(Kv - exact).max() < 1e-13 * np.abs(exact).max()
+    assert abs(float(w @ Kv - v @ Kw)) < 1e-13 * float(jnp.abs(w) @ jnp.abs(Kv))
+
+
+def test_mixed_elements_do_not_lock_and_iterations_do_not_grow():
+    """As K/mu grows the answer settles, and so does the number of iterations; linear elements lose two thirds."""
+    scene, locked = _cook(2, 4, 1e2, volumetric="mixed"), _cook(1, 8, 1e4)
+    rises, taken = [], []
+    for ratio in (1e2, 1e4, 1e5):
+        result = lj.simulate(lj.with_parameters(scene, {"law.bulk": 770.0 * ratio})).check()
+        rises.append(_rise(scene, result))
+        taken.append(int(result.statistics.linear_iterations.sum()))
+    # What is left of compressibility goes with mu/K.
+    assert abs(rises[1] / rises[0] - 1) < 0.03 and abs(rises[2] / rises[1] - 1) < 1e-3
+    assert taken[2] < 1.5 * taken[0]
+    assert _rise(locked, lj.simulate(locked)) < 0.4 * rises[1]
+
+
+def _ended(scene: lj.Scene, ratio: float = 1e4) -> tuple[lj.Result, np.ndarray]:
+    """The run at a K/mu, and the pressures (V,) [Pa] of its end."""
+    scene = prepared(lj.with_parameters(scene, {"law.bulk": 770.0 * ratio}))
+    result, state = simulate_part(scene, initial_state(scene), 1.0, scene.solve.steps)
+    return result.check(), np.asarray(state.memories[1])
+
+
+def test_linear_elements_with_pressures_do_not_lock_and_pressures_stay_smooth():
+    """Against quadratic ones, 4 % from converged: an error of the mesh, the same at every K/mu, not of locking."""
+    scene, fine = _cook(1, 8, 10.0, volumetric="mixed"), _cook(2, 4, 1e4, volumetric="mixed")
+    ends = [_ended(scene, ratio) for ratio in (10.0, 1e2, 1e4, 1e5)]
+    rises, most = ([f(*end) for end in ends] for f in (lambda r, p: _rise(scene, r), lambda r, p: np.abs(p).max()))
+    taken = [int(result.statistics.linear_iterations.sum()) for result, _ in ends]
+    assert abs(rises[2] / rises[1] - 1) < 0.03 and abs(rises[3] / rises[2] - 1) < 1e-3
+    assert 0.75 < rises[2] / _rise(fine, lj.simulate(fine).check()) < 1
+    assert max(taken) < 1.5 * taken[0]
+    # Pressures that move nothing grow with K: without what holds them they are four times as large at 1e5 as at 100.
+    assert most[3] < 1.1 * most[1]
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["quadratic", pytest.param("log", marks=pytest.mark.slow)])
+def test_mixed_elements_pass_the_patch_test(order, kind):
+    """A stretch of the whole surface: the same inside; its pressure and its forces are the law's."""
+    mesh = lj.shapes.box((0.03, 0.02, 0.02), (3, 2, 2))
+    inside = np.setdiff1d(np.arange(len(mesh.points)), lj.boundary.boundary_triangles(mesh))
+    askew = np.asarray(mesh.points).copy()
+    askew[inside] += 1e-3 * np.random.default_rng(3).uniform(-1, 1, (len(inside), 3))
+    mesh = lj.tet_mesh(askew, mesh.tetrahedra, mesh.node_sets)
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    F = np.eye(3) + 0.1 * np.random.default_rng(0).standard_normal((3, 3))
+    outer = np.unique(lj.boundary.boundary_triangles(mesh))
+    law = lj.laws.NeoHookean(mu=770.0, bulk=770e2, volumetric=kind)
+    moves = lj.Displaced(nodes=outer, by=mesh.points[outer] @ (F - np.eye(3)).T)
+    scene = lj.Scene(mesh=mesh, law=law, displaced=(moves,), solve=lj.Solve(volumetric="mixed"))
+    result, state = simulate_part(prepared(scene), initial_state(prepared(scene)), 1.0, 1)
+    assert np.abs(result.check().positions[-1] - np.asarray(mesh.points) @ F.T).max() < 1e-9
+    g = np.linalg.det(F) - 1 if kind == "quadratic" else np.log(np.linalg.det(F))
+    part = mixed._PART[order] * 770.0
+    assert np.allclose(state.memories[1], (770e2 - part) * g, rtol=1e-6)
+    # Through the face x = 0.03 alone goes P N A: its nodes also take what the other faces give to their edges, so the
+    # moment of all forces is compared, the integral of P over the body.
+    whole = np.einsum("ni,nj->ij", np.asarray(result.reactions[-1]), np.asarray(mesh.points))
+    assert np.allclose(whole, law.first_piola(F) * 0.03 * 0.02 * 0.02, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_estimate_sees_the_locking():
+    """It is made of elements that do not lock."""
+    locked, free = _cook(1, 8, 1e4), _cook(2, 4, 1e4, volumetric="mixed")
+    rise, stiff = _rise(free, lj.simulate(free).check()), lj.simulate(locked, mesh_error=True)
+    edge = np.asarray(locked.mesh.node_sets["x_max"])
+    value, change = stiff.mesh_error.change(lambda x, R: jnp.mean(x[-1, edge, 1] - locked.mesh.points[edge, 1]), stiff)
+    assert abs((value + change) / rise - 1) < 0.1
+
+
+def _rise(scene: lj.Scene, result: lj.Result) -> float:
+    edge = np.asarray(scene.mesh.node_sets["x_max"])
+    return float(np.mean(np.asarray(result.positions[-1] - scene.mesh.points)[edge, 1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+def test_gradients_through_pressures_of_their_own(order):
+    scene = _cook(order, 2, 1e3, volumetric="mixed", tolerance=1e-11)
+    edge = scene.mesh.node_sets["x_max"]
+
+    @jax.jit
+    def rise(mu):
+        return jnp.mean(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1, edge, 1])
+
+    slope, other = jax.grad(rise)(770.0), jax.jacfwd(rise)(770.0)
+    # Truncation falls with h^2, 1.5e-7 at the first; the tolerance of 1e-11 of the rise, over h, is 2e-7 at the last.
+    differences = [(rise(770.0 + h) - rise(770.0 - h)) / (2 * h) for h in (0.3, 0.1, 0.03)]
+    assert abs(slope - other) < 1e-8 * abs(other)
+    assert min(abs(d - slope) for d in differences) < 1e-7 * abs(slope)
+
+
+def test_mixed_refuses_what_it_cannot_be():
+    for scene, words in (
+        (_cook(2, 1, 10.0, volumetric="mixed", linear_solver="direct"), "solver of its own"),
+        (_cook(2, 1, 10.0, volumetric="mixed", robust="projected"), "no energy that a solution makes least"),
+        (replace(_cook(2, 1, 10.0, volumetric="mixed"), law=lj.laws.typical("saint_venant_kirchhoff")), "with bulk"),
+    ):
+        with pytest.raises(lj.InputError, match=words):
+            lj.check_scene(scene)
+    assert prepared(_cook(2, 1, 10.0, volumetric="auto")).solve.volumetric == "mixed"
+    assert prepared(_cook(1, 1, 10.0, volumetric="auto")).solve.volumetric == "element"
