@@ -25,7 +25,7 @@ ASKED = 24
 
 
 class Reading(NamedTuple):
-    """What turns stresses at `ASKED` shears into what a rheometer reads; the same for every law."""
+    """Matrices that turn stresses at `ASKED` shears into the readings of a rheometer; the same for every law."""
 
     shears: np.ndarray  # (K,) above 0
     F: jax.Array  # (K, 3, 3)
@@ -33,7 +33,7 @@ class Reading(NamedTuple):
 
 
 def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
-    """Of cycles of amplitudes at the rim.
+    """The reading for cycles with these amplitudes at the rim.
 
     Args:
         strains: (A,).

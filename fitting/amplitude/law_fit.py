@@ -23,7 +23,7 @@ CHANGED = 0.2
 
 
 class Memory(NamedTuple):
-    """What is left of each harmonic n: m(nw) of a Prony series; without one, 1 but for the loss of one tangent."""
+    """The factor of each harmonic n: m(nw) of a Prony series; without a series, 1 with one loss tangent."""
 
     series: Maxwell | None = None
 
@@ -37,7 +37,7 @@ class Memory(NamedTuple):
 
 
 class StrainFit(NamedTuple):
-    """A law, and what it makes of the sweep."""
+    """A law and its prediction of the sweep."""
 
     law: LawFit
     storage: np.ndarray  # (n,) [Pa]
@@ -113,14 +113,14 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """The two moduli at the shear of the rim, for what is said of a fit."""
+    """The two moduli over the shear at the rim, for the warnings of a fit."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
 
 
 def said_of(sweep: StrainSweep, best: StrainFit) -> list[str]:
-    """What a reader of the fit must know: sentences."""
+    """Warnings for a reader of the fit."""
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
     change = tangents[-1] / tangents[0] - 1

@@ -1,3 +1,3 @@
-"""What the commands' exit codes mean, for their help."""
+"""The meaning of the commands' exit codes, for their help."""
 
 EXIT_CODES = "Exit code 0: done; 1: the fit did not converge (its best point is kept, marked); 2: unusable input."

@@ -6,7 +6,7 @@ from tqdm import tqdm
 
 
 def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[[int, float], None]]:
-    """A bar on standard error, silent when that is not a terminal, and what an optimiser calls with its cost."""
+    """A bar on standard error, off when that is not a terminal, and the function to call with the cost."""
     bar = tqdm(desc=description, unit=f" {unit}", disable=None, leave=False)
 
     def told(_: int, cost: float) -> None:

@@ -42,7 +42,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
-    """The test that a TOML file describes, which says all of it."""
+    """The test that a TOML file describes; options that the file has are refused."""
     from fitting.rigs.described import read_described
 
     for name in ("radius", "height", "ramp", "min_time"):

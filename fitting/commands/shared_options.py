@@ -1,4 +1,4 @@
-"""What several commands ask for in the same words: a number of modes, draws of the posterior, material cards."""
+"""Options that several commands share: number of modes, draws of the posterior, material cards."""
 
 import argparse
 import sys
@@ -34,13 +34,13 @@ def _whole_number_or_auto(text: str) -> int | str:
 
 
 def check_samples(count: int | None) -> None:
-    """Refuse a number of draws that says nothing, or that no disk needs."""
+    """Refuse a number of draws that is too small or too large."""
     if count is not None and not 100 <= count <= 100000:
         raise InputError(f"--samples {count} is out of range: give 100 to 100000 draws of each chain, e.g. 1000")
 
 
 def write_cards(out: Path, model: "Maxwell") -> None:
-    """Write material cards and say what a program cannot hold."""
+    """Write material cards, with a note on the limits of each program."""
     from fitting.reports import material_cards
 
     for sentence in material_cards.write(out / "cards", model):

@@ -89,7 +89,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
 
 
 def _add_outputs(command: argparse.ArgumentParser) -> None:
-    """Options of what a fit says and writes beside its numbers."""
+    """Options for further output of a fit."""
     command.add_argument(
         "--predict",
         type=Path,
@@ -170,7 +170,7 @@ def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> lis
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse numbers that no sample or simulation has."""
+    """Refuse numbers that are impossible for a sample or a simulation."""
     for name in ("radius", "height"):
         value = getattr(options, name)
         if value is not None and not 0 < value <= 0.2:
@@ -203,7 +203,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
-    """Refuse a compression that no sample has, and what a fit of a compressed sample does not have."""
+    """Refuse an impossible compression, and options that do not go with a compression."""
     if options.precompression == 0:
         return
     from fitting.rigs import compression
@@ -222,7 +222,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
 
 
 def _check_samples(options: argparse.Namespace) -> None:
-    """Refuse what only one sweep can have."""
+    """Refuse options that need a single sweep."""
     for name, asked, instead in (
         ("--method torsion", options.method == "torsion", "leave it out, or give one file"),
         ("--profile", options.profile, "leave it out, or give one file"),
@@ -236,7 +236,7 @@ def _check_samples(options: argparse.Namespace) -> None:
 
 
 def _check_together(options: argparse.Namespace) -> None:
-    """Refuse what a fit of several tests does not have."""
+    """Refuse options that do not go with several tests."""
     for name, asked in (
         ("--method torsion", options.method == "torsion"),
         ("--profile", options.profile),
@@ -251,7 +251,7 @@ def _check_together(options: argparse.Namespace) -> None:
 
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
-    """The fit in closed form of the model asked for."""
+    """The fit of the chosen model in closed form."""
     from fitting.fits import models, viscoelastic
 
     prony = None

@@ -122,7 +122,7 @@ def _organ(options: argparse.Namespace, field) -> "Organ":
 
 
 def _check_waves(options: argparse.Namespace) -> None:
-    """Refuse numbers that no measurement has."""
+    """Refuse numbers that are impossible for a measurement."""
     for name in ("length", "noise"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):

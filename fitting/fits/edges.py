@@ -1,4 +1,4 @@
-"""How much the ends of the band decide: the fit repeated without its first and its last half decade."""
+"""The influence of the ends of the band: the fit is repeated without the first and without the last half decade."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
-    """The fit with what its ends decide, the structure of its residuals, and what the data say of themselves."""
+    """Add to the fit: the influence of the ends, the structure of its residuals, and the checks of the data alone."""
     details, warnings = dict(fit.details), list(fit.warnings)
     found = kramers_kronig.of_data(sweep, dense)
     told = kramers_kronig.sentences(found, sweep)
@@ -107,7 +107,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
 
 
 def _moved_most(fit: Fit, changes: dict[str, Any]) -> list[str]:
-    """A sentence on what each end decides, the worst three numbers of it."""
+    """A sentence for each end, with the three numbers that it moves most."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):
         rows = [(n, d, *known[n]) for n, d in (changes[part] or {}).items()]

@@ -94,7 +94,7 @@ def _cost_of_map(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> 
 
 
 class _Search:
-    """The course of a fit: what L-BFGS calls, and what is written to go on from."""
+    """The course of a fit: the functions for L-BFGS, and the state that is written for a resumed run."""
 
     def __init__(self, problem, name, base, p, file, progress):
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
@@ -120,7 +120,7 @@ class _Search:
         self.progress(self.k, self.chi2 / self.problem.components)
 
     def write(self) -> None:
-        """The point reached, whole or not at all."""
+        """Write the point reached, as a whole."""
         if self.file is None:
             return
         with whole(self.file) as new, h5py.File(new, "w") as f:
@@ -130,7 +130,7 @@ class _Search:
             f.attrs["count"] = self.problem.components
 
     def read(self) -> None:
-        """Go on from what an earlier run wrote.
+        """Go on from the file of an earlier run.
 
         Raises:
             InputError: no such file, or of another problem.
@@ -208,7 +208,7 @@ def estimate(
 
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
-    """One deviation after another, each from the field of the last, until chi^2 is that of the noise."""
+    """Try one deviation after another, each from the last field, until chi^2 is as large as the noise allows."""
     while True:
         begin, before = time.perf_counter(), search.evaluations
         bounds = [(-_BOUND, _BOUND)] * len(search.z)
@@ -237,7 +237,7 @@ def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
 
 
 class _Asked(NamedTuple):
-    """The runs linearised at the field that was found: products by J and its transpose, in whitened z."""
+    """The runs, linearised at the fitted field: products with J and its transpose, in whitened z."""
 
     p: smooth.Prior
     deviation: float
@@ -279,7 +279,7 @@ def _measured_directions(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray,
 def _bias_of_map(
     search: _Search, asked: _Asked, m: np.ndarray, values: np.ndarray, vectors: np.ndarray
 ) -> np.ndarray | None:
-    """What the meshes move the field m (V,): (I + J^T J)^-1 J^T of what they leave out of the residuals."""
+    """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their errors of the residuals."""
     left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, jnp.asarray(m)))
     if left_out is None or not np.all(np.isfinite(left_out)):
         return None

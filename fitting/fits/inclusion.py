@@ -29,7 +29,7 @@ def edge_width(mesh: TetMesh) -> float:
 
 
 def factor(mesh: TetMesh, centre: jax.Array, radius: Any, width: Any) -> jax.Array:
-    """How much of each element (E,) is inside: 1 within, 0 without, smooth between; a mean over its points."""
+    """The part of each element (E,) inside the sphere: 1 inside, 0 outside, smooth between; a mean over its points."""
     corners = mesh.points[mesh.tetrahedra]
     L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L
     points = jnp.einsum("kq,eki->qei", L, corners)

@@ -1,4 +1,4 @@
-"""What the instrument adds to a fit: errors that all points share, each a number of its own with a prior; its grip.
+"""Errors of the instrument in a fit, shared by all points: inertia and gap, each with a prior; and compression.
 
 The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K where I is off by delta. Fitted without a
 prior, such a term takes up whatever the model misses. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
@@ -89,7 +89,7 @@ def inertia_numbers(found: InertiaError) -> dict[str, Any]:
 
 
 def _residuals_per_error(sweep: Sweep) -> np.ndarray:
-    """What an error of 1 does to the residuals (2n,)."""
+    """Change of the residuals (2n,) by an error of 1."""
     assert sweep.inertia is not None
     return np.concatenate([sweep.inertia, np.zeros(len(sweep.inertia))]) / np.concatenate(sweep.deviations)
 
@@ -132,7 +132,7 @@ def _with_direction(fit: Fit, sweep: Sweep, error: float) -> Estimate:
 
 
 def with_gap_error(fit: Fit, relative: float) -> Fit:
-    """The fit with the error of the gap, which is that of all moduli together; ratios and times do not feel it."""
+    """The fit with the error of the gap. All moduli share this error; ratios and times do not have it."""
     modes = fit.modes
     first = np.concatenate([fit.uncertainty.values[:1], np.zeros(2 * modes)])
     own = fit.parameters

@@ -28,7 +28,7 @@ from liverjax.physics.viscosity import Prony
 
 
 class Test(NamedTuple):
-    """What was measured, and how it is predicted."""
+    """A measurement and the function that predicts it."""
 
     name: str
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
@@ -139,7 +139,7 @@ def fit(
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
-    """What the meshes leave out of the readings, over their noise (n,)."""
+    """Errors of the readings by their meshes, over the noise (n,)."""
     return np.concatenate(
         [
             np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd

@@ -132,7 +132,7 @@ def _undetermined(fit: Fit) -> list[str]:
 
 
 def _determined(fit: Fit) -> np.ndarray:
-    """Which of its numbers have an error below half their value; exponents may also be 0 or 1 (spring, dashpot)."""
+    """Whether each number has an error below half its value. Exponents may also be 0 or 1 (spring, dashpot)."""
     assert fit.parameters is not None
     values, errors = fit.parameters.values, fit.parameters.standard_errors
     bound = np.array(["exponent" in name for name in fit.kind.names]) & ((values < 1e-3) | (values > 1 - 1e-3))
@@ -140,7 +140,7 @@ def _determined(fit: Fit) -> np.ndarray:
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Converged, and the data determine every number of the model (a spectrum is held by its prior)."""
+    """Whether the fit converged and the data determine every number of the model. A spectrum has a prior."""
     if fit.parameters is None:
         return viscoelastic.identifiable(fit, sweep)
     return fit.converged and (fit.kind.effective is not None or bool(np.all(_determined(fit))))
@@ -194,7 +194,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
 
 
 def _compared(sweep: Sweep, tried: list[Fit]) -> list[dict[str, Any]]:
-    """What the choice rests on, best first."""
+    """The criterion of each model, best first."""
     best = min(information_criterion(fit) for fit in tried)
     rows = [
         {
@@ -235,7 +235,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
 
 
 def comparison(fit: Fit) -> list[str]:
-    """Lines on what the choice of a model rests on, best first; none where there was no choice."""
+    """Lines with the criterion of each model, best first; none where there was no choice."""
     rows = fit.details.get("models_compared", [])
     if len(rows) < 2:
         return []

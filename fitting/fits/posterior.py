@@ -1,4 +1,4 @@
-"""Samples of the posterior of a fit: what the data and a stated prior leave possible, not only its curvature.
+"""Samples of the posterior of a fit, from the data and a stated prior.
 
 The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. Without
 deviations its prior is 1 / s. With deviations it is 1 / s above 1: they are believed, and only ever enlarged.
@@ -53,7 +53,7 @@ class Posterior(NamedTuple):
     simulated: dict[str, float] | None = None  # of draws that were simulated: how many, and the largest difference
 
     def warnings(self) -> list[str]:
-        """Sentences where the draws are not enough."""
+        """Warnings where there are too few draws."""
         worst = int(np.argmax(self.r_hat))
         out = []
         if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
@@ -75,14 +75,14 @@ AGREED, QUIETEST = 1.01, 1e-6
 
 
 class Target(NamedTuple):
-    """A posterior density of u, and what is reported of it."""
+    """A posterior density of u, and the numbers to report."""
 
     residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors over their scales
     prior: "Modes | Springpots"
     deviations_given: bool
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
-        """Of u (W, P), up to a constant, with the size of the errors integrated out."""
+        """Log likelihood of u (W, P), up to a constant, with the size of the errors integrated out."""
         with np.errstate(all="ignore"):  # an overflow is a point without likelihood
             r = self.residuals(u)
             return log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
@@ -130,7 +130,7 @@ class Modes(NamedTuple):
     words: str = PRIORS["prony"]
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Of u (W, P), up to a constant."""
+        """Log prior of u (W, P), up to a constant."""
         with np.errstate(all="ignore"):
             model = self._model(u)
             rest = np.zeros((len(u), 0)) if self.fluid else 1 - model.ratios.sum(axis=-1, keepdims=True)
@@ -144,7 +144,7 @@ class Modes(NamedTuple):
         return np.where(inside & np.isfinite(found), found, -np.inf)
 
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
-        """u (count, parameters) of the prior."""
+        """Draw u (count, parameters) from the prior."""
         modes = parameters // 2
         share = rng.standard_exponential((count, modes + (not self.fluid)))  # their ratios are uniform on the simplex
         log_time = -np.sort(-rng.uniform(*self.times, (count, modes)), axis=1)
@@ -156,7 +156,7 @@ class Modes(NamedTuple):
         return (generalised_maxwell.natural_fluid if self.fluid else generalised_maxwell.natural)(u)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Of the reported numbers, for so many coordinates."""
+        """Names of the reported numbers, for so many coordinates."""
         first, *others = parameter_names(parameters // 2)
         return (first, *others) if self.fluid else (first, "equilibrium_modulus", *others)
 
@@ -177,23 +177,23 @@ class Springpots(NamedTuple):
 
     @property
     def _moduli(self) -> np.ndarray:
-        """Which of the free numbers are moduli; the others are logits of exponents."""
+        """Whether each free number is a modulus; the others are logits of exponents."""
         return np.array([k % 2 == 0 for k in self.model.free])
 
     def log_prior(self, u: np.ndarray) -> np.ndarray:
-        """Of u (W, P), up to a constant."""
+        """Log prior of u (W, P), up to a constant."""
         moduli, exponents = u[:, self._moduli], u[:, ~self._moduli]
         inside = np.all((moduli > self.moduli[0]) & (moduli < self.moduli[1]), axis=-1)
         slopes = -np.logaddexp(0, exponents) - np.logaddexp(0, -exponents)
         return np.where(inside, slopes.sum(axis=-1), -np.inf)
 
     def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
-        """u (count, parameters) of the prior."""
+        """Draw u (count, parameters) from the prior."""
         moduli = rng.uniform(*self.moduli, (count, parameters))
         return np.where(self._moduli, moduli, scipy.special.logit(rng.random((count, parameters))))
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Of the reported numbers."""
+        """Names of the reported numbers."""
         return self.model.names
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
@@ -219,7 +219,7 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
 
 
 def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
-    """Of a fit in closed form, of Prony modes or of a fractional model."""
+    """Sample the posterior of a fit in closed form, of Prony modes or of a fractional model."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if fit.kind.values is None:
         function = viscoelastic.residuals_of(fit.kind)
@@ -246,7 +246,7 @@ SIMULATED, DIFFERENT = 12, 0.1
 
 
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
-    """Of a fit of Prony modes through the torsion simulation.
+    """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
     The density is that of the linear rig, with its recursion in time, times what the simulation adds to it at the
     minimum (complex, one factor a frequency). Some draws are then simulated: `Posterior.simulated` has the largest

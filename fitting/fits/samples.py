@@ -25,7 +25,7 @@ class Samples(NamedTuple):
 
     @property
     def kind(self) -> Kind:
-        """Of the model that all share."""
+        """Kind of the model that all share."""
         return self.fits[0].kind
 
 
@@ -42,7 +42,7 @@ def fit(
     modes: int | str = "auto",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Samples:
-    """The model of the lowest summed criterion among those that half of the samples determine.
+    """Choose the model with the lowest sum of criteria among those that half of the samples determine.
 
     Args:
         sweeps: two or more.

@@ -1,4 +1,4 @@
-"""Few numbers of one or more scenes from measured displacements: Gauss-Newton, standard errors."""
+"""Fit a few numbers of one or more scenes to measured displacements: Gauss-Newton, with standard errors."""
 
 import time
 import warnings
@@ -19,7 +19,7 @@ from liverjax.scenes.scene import Scene, numbers_at
 
 
 class Problem(NamedTuple):
-    """Scenes of one body under different loads, and what was measured of each."""
+    """Scenes of one body under different loads, and the displacements measured in each."""
 
     scenes: tuple[Scene, ...]
     data: tuple[Displacements, ...]
@@ -90,7 +90,7 @@ def fit(
 
 
 def missing(problem: Problem, values: dict[str, Any]) -> np.ndarray:
-    """What the meshes leave out of the residuals (n,), with the scenes' numbers replaced by `values`."""
+    """Errors of the residuals (n,) by the meshes, with the scenes' numbers replaced by `values`."""
     rows = []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         scene = lj.with_parameters(scene, values)

@@ -38,7 +38,7 @@ class Candidate(NamedTuple):
 
 
 class LawFit(NamedTuple):
-    """What was found for one law."""
+    """The fit of one law."""
 
     label: str
     names: tuple[str, ...]
@@ -88,7 +88,7 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
 
 
 def _candidate(label: str, law: Law) -> Candidate:
-    """Of one law, or of several that add up."""
+    """The candidate of one law, or of several that add up."""
     parts = [s for s in laws.summands(law) if not isinstance(s, laws.Volumetric)]
     if len(parts) > 1:
         return _sum(label, [_candidate(f"{label}, summand {k}", s) for k, s in enumerate(parts)])
@@ -182,7 +182,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
 
 
 def _shear_modulus(law: Law) -> float:
-    """Of the ground state [Pa]; where a law does not state it, dP12/dF12 there."""
+    """Shear modulus of the ground state [Pa]; where a law does not state it, dP12/dF12 there."""
     try:
         return float(law.shear_modulus())
     except InputError:
@@ -270,7 +270,7 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
 
 
 def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple) -> LawFit:
-    """The best start, what it is worth, and what the user should know."""
+    """The best start, its quality, and warnings for the user."""
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
     u, J, r = (np.asarray(v[best]) for v in (found.u, found.jacobian, found.residuals))
@@ -350,7 +350,7 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
 
 
 def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[str, str]:
-    """Parameters that ran away: far from every start, whose spread is a few times their typical size."""
+    """Parameters that ended far from every start. The starts spread over a few times the typical size."""
     starts = jnp.asarray(candidate.random(np.random.default_rng(0), STARTS))
     typical = np.median(np.abs(jax.vmap(lambda u: candidate.values(u, scale))(starts)), axis=0)
     ends = {}
@@ -361,7 +361,7 @@ def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[st
 
 
 def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
-    """A sentence on every curve that none of the laws follows."""
+    """A sentence for each curve that no law follows."""
     told = []
     for curve in curves:
         best = min(fits, key=lambda f: f.curve_errors[curve.label])

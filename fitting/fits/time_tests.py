@@ -51,7 +51,7 @@ class TimeFit(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
-    """(u, time, driven, rows, answer, scales) -> (m,), of relaxation or creep, of a solid or a fluid."""
+    """A function (u, time, driven, rows, answer, scales) -> residuals (m,), for relaxation or creep."""
     natural = generalised_maxwell.natural_fluid if name == FLUID.name else generalised_maxwell.natural
 
     def residuals(u, time, driven, rows, answer, scales):
@@ -61,7 +61,7 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
 
 
 def thinned(test: TimeTest) -> np.ndarray:
-    """Rows (m,) that are fitted: all, or about `MOST` of them, spread over log time."""
+    """Rows (m,) to fit: all, or about `MOST` of them, spread over log time."""
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
@@ -73,7 +73,7 @@ def thinned(test: TimeTest) -> np.ndarray:
 
 
 def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
-    """The number of modes, and solid or fluid, of the lowest criterion among those that the test determines.
+    """Choose the number of modes, and solid or fluid: the lowest criterion among those that the test determines.
 
     Args:
         test: data.
@@ -118,7 +118,7 @@ def criterion(fit: TimeFit) -> float:
 
 
 def identifiable(fit: TimeFit, test: TimeTest) -> bool:
-    """Converged, and the test determines every mode."""
+    """Whether the fit converged and the test determines every mode."""
     return fit.converged and not uncertainty.superfluous(test, fit.uncertainty)
 
 
@@ -135,7 +135,7 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
-    """Residuals (m,) of u and of the data that come second, for Prony modes of a solid or a fluid."""
+    """Residuals (m,) at u and the data, for Prony modes of a solid or a fluid."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -145,7 +145,7 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """Points (n,) that the drive needs: where it is straight on both sides, the point between says nothing."""
+    """Points (n,) that the drive needs. A point with the same slope on both sides can be left out."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))
@@ -159,7 +159,7 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
 
 
 def response_in_time(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax.Array:
-    """What a test measures: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
+    """Predicted measurements: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
 
     Args:
         kind: "sweep", "dispersion", "relaxation" or "creep".
@@ -209,7 +209,7 @@ def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int
 
 
 def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
-    """With the table of what was tried and the sentences that a user should read."""
+    """Add the table of the fits tried, and the warnings."""
     lowest = min(map(criterion, tried))
     table: list[dict[str, Any]] = [
         {

@@ -41,7 +41,7 @@ class ResolvedBand(NamedTuple):
 
 
 class Share(NamedTuple):
-    """What one test says of the common parameters."""
+    """The contribution of one test to the common parameters."""
 
     name: str  # sweep, dispersion, relaxation or creep
     source: str
@@ -109,7 +109,7 @@ def name_of(test: Measured) -> str:
 def fit(
     tests: Sequence[Measured], modes: int | str = "auto", progress: Callable[[str], None] = lambda text: None
 ) -> Together:
-    """The number of modes of the lowest criterion among those that the tests determine together.
+    """Choose the number of modes: the lowest criterion among those that the tests determine together.
 
     Args:
         tests: two or more.
@@ -251,7 +251,7 @@ def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
 
 
 def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) -> Together:
-    """With the shares of the tests, the table of what was tried, and the sentences that a user should read."""
+    """Add the shares of the tests, the table of the fits tried, and the warnings."""
     begin = time.perf_counter()
     chosen = chosen._replace(shares=_shares(chosen))
     lowest = min(map(_criterion, tried))
@@ -287,7 +287,7 @@ def _apart(share: Share) -> str:
 
 
 def _shares(fit: Together) -> list[Share]:
-    """What each test adds: errors without it, and what it leaves by itself with as many modes.
+    """The contribution of each test: errors without it, and the misfit of a fit to this test alone with as many modes.
 
     Tests without weight are taken out by infinite deviations: the program is there already.
     """

@@ -26,7 +26,7 @@ OPTIMIZERS = ("levenberg-marquardt", "bfgs")
 
 
 class Kind(NamedTuple):
-    """What the numbers u of a fit mean: by default the Prony modes themselves."""
+    """The meaning of the numbers u of a fit; by default they are the Prony modes."""
 
     name: str = "prony"
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
@@ -194,7 +194,7 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> 
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:
-    """Converged, and nothing advises against any of its modes."""
+    """Whether the fit converged and no warning advises against one of its modes."""
     return bool(fit.converged and not uncertainty.superfluous(sweep, fit.uncertainty))
 
 
@@ -264,7 +264,7 @@ def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) 
 
 
 def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int, str]) -> list[str]:
-    """Sentences on the numbers of modes that were not chosen: one that is closer, and those that broke down."""
+    """Warnings on other numbers of modes: a closer fit that was not chosen, and fits that broke down."""
     out = []
     closer = min(tried, key=information_criterion)
     if information_criterion(closer) < information_criterion(chosen) - 10:
@@ -335,7 +335,7 @@ def simulated_residuals(
 def with_jacobian(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
-    """Residuals, their derivative by u (rows, P), and what was simulated; arguments as of `simulated_residuals`.
+    """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
 
     The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation. Gauss-Newton
     goes to the same minimum with it, in a small part of the time (experiments/benchmarks/torsion_speed.py).
@@ -386,7 +386,7 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
 
 
 def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
-    """Rig, law, angular frequencies, torques, measured moduli and deviations, as of `simulated_residuals`."""
+    """Rig, law, angular frequencies, torques, measured moduli and deviations: the data of `simulated_residuals`."""
     rig = rig_of(simulation)
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
@@ -470,7 +470,7 @@ def through_torsion(
 
 
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
-    """What mesh and time steps of the simulation move the parameters, to first order (`mesh_bias`).
+    """Change of the parameters by the simulation's mesh and time steps, to first order (`mesh_bias`).
 
     At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time. Those of
     a compressed sample without a mesh are extrapolated from a finer mesh.
@@ -500,7 +500,7 @@ FINER = 0.62
 def _of_finer_mesh(
     fit: Fit, law: laws.Law, prony: Prony, omega: jax.Array, simulation: Simulation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Complex moduli (n,) of a compressed sample: of the recursion without a mesh, and there in continuous time.
+    """Complex moduli (n,) of a compressed sample without a mesh: by the recursion, and in continuous time.
 
     The error of the mesh is taken to be of second order.
     """
@@ -516,7 +516,7 @@ def _of_finer_mesh(
 
 
 def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
-    """What the simulation was and did, for the report."""
+    """Settings and statistics of the simulation, for the report."""
     whole = simulation.part == "all"  # then the bias is the same at every frequency, and known
     return {
         "law": simulation.law,
@@ -547,7 +547,7 @@ def largest_shift(closed: Fit, simulated: Fit) -> float:
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
-    """Where the simulation moves a parameter by more than its standard error, and why."""
+    """A warning where the simulation moves a parameter by more than its standard error, with the cause."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors = simulated.uncertainty.standard_errors
     cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"

@@ -1,4 +1,4 @@
-"""Any linear viscoelastic model as Prony modes for the simulation, and how far the two are apart over the band.
+"""Convert any linear viscoelastic model to Prony modes for the simulation, with the largest error over the band.
 
 The relaxation times are fixed, equally spaced on a log axis. The strengths come from non-negative least squares of the
 relative errors of G' and G''. With the set of non-zero strengths held, they are linear in the moduli of the model, so
@@ -38,7 +38,7 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
 
 
 def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float, solid: bool) -> Conversion:
-    """The fewest modes that stay within `ALLOWED`, or the best of `MOST`.
+    """Take the fewest modes with an error below `ALLOWED`, or the best fit of `MOST` modes.
 
     Args:
         moduli: complex modulus (n,) [Pa] of angular frequencies (n,).

@@ -15,7 +15,7 @@ _GRID = 200
 
 
 class ContactFit(NamedTuple):
-    """What was found; standard errors by the noise that the residuals show."""
+    """Modulus and contact point. Their standard errors come from the noise of the residuals."""
 
     modulus: float  # E [Pa]
     contact_point: float  # d0 [m]
@@ -27,7 +27,7 @@ class ContactFit(NamedTuple):
 
     @property
     def quantile(self) -> float:
-        """Of Student's t for a 95 % interval."""
+        """Quantile of Student's t for a 95 % interval."""
         return float(scipy.special.stdtrit(len(self.residuals) - 2, 0.975))
 
 

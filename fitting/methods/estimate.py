@@ -1,4 +1,4 @@
-"""What every fit hands over: numbers, their standard errors and correlation, from the Jacobian at the minimum."""
+"""The result of every fit: numbers, their standard errors and correlation, from the Jacobian at the minimum."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -34,12 +34,12 @@ class Estimate(NamedTuple):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of the numbers (P, P)."""
+        """Covariance of the numbers (P, P)."""
         return self.root @ self.root.T
 
     @property
     def quantile(self) -> float:
-        """Of Student's t for a 95 % interval."""
+        """Quantile of Student's t for a 95 % interval."""
         return float(scipy.special.stdtrit(max(1, self.components - len(self.names)), 0.975))
 
 
@@ -129,7 +129,7 @@ LARGEST_BIAS = 0.3
 
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
-    """What meshes move the numbers (P,): J^+ of what they leave out of the data, `missing` (n,) over the noise.
+    """Change of the numbers (P,) by meshes: J^+ times their errors of the data, `missing` (n,) over the noise.
 
     To first order: good while what is missing is below a quarter, and numbers are not nearly dependent. Subtract it
     once to correct.
@@ -141,7 +141,7 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 
 def bias_sentences(estimate: Estimate) -> list[str]:
-    """Where the mesh moves a number by more than its standard error, or by so much that nothing can be said."""
+    """Warnings where the mesh moves a number by more than its standard error, or by too much for an estimate."""
     bias, values = estimate.mesh_bias, np.asarray(estimate.values)
     if bias is None:
         return []

@@ -60,7 +60,7 @@ def natural(u: Array) -> Maxwell:
 
 
 def _softmax_shares(logits: Array) -> Array:
-    """Softmax of logits (N,) and of a last one that is 0, (N + 1,)."""
+    """Softmax (N + 1,) of logits (N,) and a last logit 0."""
     xp = arrays_of(logits)
     logits = xp.concatenate([logits, xp.zeros((*logits.shape[:-1], 1), logits.dtype)], axis=-1)
     share = xp.exp(logits - xp.max(logits.real, axis=-1, keepdims=True))  # the largest is exp(0)
@@ -68,7 +68,7 @@ def _softmax_shares(logits: Array) -> Array:
 
 
 def _times_of_gaps(u: Array) -> Array:
-    """Descending relaxation times (N,) of the log of the first and the logs of the gaps between their logs."""
+    """Descending relaxation times (N,) from log(first time) and the logs of the gaps between log times."""
     xp = arrays_of(u)
     gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(xp.exp(u[..., 1:]), axis=-1)], axis=-1)
     return xp.exp(u[..., :1] - gaps)
@@ -91,13 +91,13 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 
 
 def natural_fluid(u: Array) -> Maxwell:
-    """Model without an equilibrium modulus of u (2N,): as `natural`, the last mode in place of the equilibrium part."""
+    """Model without an equilibrium modulus from u (2N,): like `natural`, with the last mode as its rest."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
 
 def fluid_residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array) -> Array:
-    """As `residuals`, of a model without an equilibrium modulus."""
+    """`residuals` of a model without an equilibrium modulus."""
     xp = arrays_of(u)
     return (xp.concatenate(moduli(natural_fluid(u), omega), axis=-1) - xp.concatenate([storage, loss])) / scales
 
@@ -115,7 +115,7 @@ def largest_number_of_modes(sweep: Sweep) -> int:
 
 
 class Spectrum(NamedTuple):
-    """The best that any number of Maxwell modes can do."""
+    """The best fit of any number of Maxwell modes."""
 
     times: np.ndarray
     strengths: np.ndarray  # [Pa], >= 0
@@ -138,7 +138,7 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
 
 
 def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
-    """x >= 0 that brings A x nearest to b, and their distance.
+    """The x >= 0 with the smallest distance of A x from b, and this distance.
 
     An active set that cycles (columns that are nearly the same, which close relaxation times give) leaves the problem
     to SciPy's bounded least squares, which always comes back with its best point.

@@ -1,4 +1,4 @@
-"""What the data say about themselves, without a model: causality, the instrument's mark, order in the residuals.
+"""Checks of the data without a model: causality, the instrument's mark, order in the residuals.
 
 Every material that relaxes has a spectrum of non-negative strengths. Term by term, with x = omega tau, its moduli obey
 
@@ -27,7 +27,7 @@ CHANCE = 0.005
 
 
 class Consistency(NamedTuple):
-    """Of a sweep without any model."""
+    """Checks of a sweep without any model."""
 
     misfit: float  # root mean square distance of the best non-negative spectrum, relative
     scatter: float  # of neighbouring points about a smooth curve, relative
@@ -49,7 +49,7 @@ def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
 
 
 def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
-    """Bounds and spectrum together; `dense` as of `generalised_maxwell.spectrum`."""
+    """Check the bounds and the spectrum; `dense` comes from `generalised_maxwell.spectrum`."""
     omega, storage, loss = _merged(sweep)
     noises = scatter(omega, storage), scatter(omega, loss)
     breaches = []
@@ -85,7 +85,7 @@ def _breach(omega, storage, loss, noise) -> str:
 
 
 def sentences(found: Consistency, sweep: Sweep) -> list[str]:
-    """What a user should know of the data, each with its remedy."""
+    """Sentences on the data for the user, each with its remedy."""
     out, last = [], sweep.angular_frequency[-1] / (2 * np.pi)
     if found.onset is not None:
         hertz = found.onset / (2 * np.pi)

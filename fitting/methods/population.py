@@ -1,4 +1,4 @@
-"""One number of several samples: its mean, its spread between samples, and what a new sample will show.
+"""One number of several samples: its mean, its spread between samples, and the interval of a new sample.
 
 The logarithm y_i of sample i has the mean mu, a spread s between samples and an error e_i: y_i ~ N(mu, s^2 + e_i^2).
 s is estimated by restricted maximum likelihood, the interval of mu after Hartung and Knapp (2001), Statistics in
@@ -13,7 +13,7 @@ import scipy.stats
 
 
 class Population(NamedTuple):
-    """Of one positive number; intervals are of 95 %."""
+    """The population of one positive number; intervals are of 95 %."""
 
     mean: float  # geometric
     spread: float  # standard deviation of the logarithms between samples
@@ -49,7 +49,7 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
 
 
 def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
-    """Variance between samples, of the largest restricted likelihood."""
+    """Variance between samples at the largest restricted likelihood."""
     top = 10 * float(np.var(y, ddof=1)) + 1e-24
 
     def minus(variance):
@@ -66,7 +66,7 @@ def _variance_between(y: np.ndarray, v: np.ndarray) -> float:
 
 
 def _weighted_mean(y: np.ndarray, v: np.ndarray, variance: float) -> tuple[float, float]:
-    """Weighted mean and its standard error from the scatter that is there, not below the one that the errors give."""
+    """Weighted mean and its standard error from the scatter, but not below that from the errors."""
     w = 1 / (v + variance)
     mean = float(np.sum(w * y) / np.sum(w))
     q = float(np.sum(w * (y - mean) ** 2) / (len(y) - 1))

@@ -1,4 +1,4 @@
-"""A smooth random field on a mesh (Matern; Lindgren, Rue and Lindstroem 2011): what is thought before any data.
+"""Matern prior: a smooth random field on a mesh (Lindgren, Rue and Lindstroem 2011).
 
 (kappa^2 - Laplace) m = white noise, kappa = 1 / length: in three dimensions a covariance sd^2 exp(-distance / length).
 With lumped mass M and stiffness L of linear tetrahedra, m = A^-1 M^(1/2) z for independent standard normal z, A =
@@ -39,7 +39,7 @@ def prior(mesh: TetMesh, length: float) -> Prior:
 
 
 def field_at_nodes(p: Prior, z: np.ndarray) -> np.ndarray:
-    """m of z, (V,) or (V, k)."""
+    """The field m from z, (V,) or (V, k)."""
     root = p.root_mass if z.ndim == 1 else p.root_mass[:, None]
     return p.scale * p.solver.solve(root * z)
 

@@ -19,7 +19,7 @@ CARRIED = 0.5
 
 
 class GridSpectrum(NamedTuple):
-    """Strengths at fixed times, and what they rest on."""
+    """Strengths at fixed times, with the weight and the criterion."""
 
     times: np.ndarray  # (K,) [s], descending; those with a strength above zero
     strengths: np.ndarray  # (K,) [Pa]

@@ -23,7 +23,7 @@ SIZE = 6
 
 
 class Fractional(NamedTuple):
-    """One case: which of the six numbers are free, what is reported, and how to get it."""
+    """One case: its free numbers of the six, the reported numbers and their formulas."""
 
     name: str
     free: tuple[int, ...]  # places in u

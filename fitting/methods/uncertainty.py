@@ -1,4 +1,4 @@
-"""How well the data determine the parameters: covariance, profile likelihood, and what to tell the user."""
+"""How well the data determine the parameters: covariance, profile likelihood, and warnings."""
 
 from collections.abc import Callable
 from functools import partial
@@ -127,7 +127,7 @@ def _decades(data: Band) -> float:
 
 
 def supported_modes(data: Band) -> int:
-    """How many modes the band has room for: about one a decade and one more, at least one."""
+    """Number of modes that the band supports: about one for each decade and one more."""
     return max(1, int(_decades(data) + 1 + 1e-9))  # a decade is a decade in spite of rounding
 
 
@@ -173,7 +173,7 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
 
 
 def cautions(sweep: Sweep, u: Estimate, found: Solution, model: str = "prony") -> list[str]:
-    """Sentences on what the data do not tell, each with the number it rests on and what to do."""
+    """Warnings on what the data do not tell, each with its number and a remedy."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]

@@ -32,12 +32,12 @@ class Curve(NamedTuple):
 
     @property
     def rises(self) -> bool:
-        """Whether the stress of a stable material rises with `driven`: it does all the work of the test."""
+        """Whether the stress of a stable material must rise with `driven`: only this component does work."""
         return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
 
     @property
     def scale(self) -> float:
-        """Root mean square of the stress [Pa]: what a relative error is relative to."""
+        """Root mean square of the stress [Pa], the scale of relative errors."""
         return float(np.sqrt(np.mean(self.stress**2)))
 
 

@@ -16,7 +16,7 @@ _FEWEST = 6
 
 
 class IndentationCurve(NamedTuple):
-    """What was measured while the indenter went in."""
+    """The measured approach of an indenter."""
 
     depth: np.ndarray  # (n,) [m] of the indenter, from anywhere, larger further in
     force: np.ndarray  # (n,) [N]

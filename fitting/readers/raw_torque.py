@@ -1,4 +1,4 @@
-"""What the instrument's inertia does to a sweep, from the raw torque and displacement that exports may have.
+"""Effect of the instrument's inertia on a sweep, from the raw torque and displacement of some exports.
 
 Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta, with K the geometry and I the inertia that
 the software has subtracted. I omega^2 / K is its share as a modulus; a part of it, `UNCERTAINTY`, is not known.
@@ -105,7 +105,7 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
 
 
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
-    """What the highest frequencies say of an inertia, if they agree within a tenth; else NaN.
+    """The inertia at the highest frequencies if they agree within a tenth; else NaN.
 
     Where inertia leads it is known best; elsewhere it is a small difference of large numbers.
     """

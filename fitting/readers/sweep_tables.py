@@ -121,7 +121,7 @@ def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
 
 
 def _title(above: list[str]) -> str:
-    """What the lines above a header call its table: TRIOS's step, RheoCompass's result, else the nearest line."""
+    """Name of a table from the lines above its header: TRIOS's step, RheoCompass's result, else the nearest line."""
     cells = [[c.strip("#\"' ") for c in line.split("\t")] for line in above]
     cells = [[c for c in row if c] for row in cells]
     for row in reversed(cells):

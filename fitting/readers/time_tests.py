@@ -63,7 +63,7 @@ class TimeTest(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """What the residuals of the used answers are divided by: the answers, and a floor for those lost in noise."""
+        """Scales of the residuals: the answers themselves, and a floor for answers that are lost in noise."""
         answer = self.answer[self.used]
         smooth = np.abs(np.diff(answer, 3))  # three differences of independent noise have 20 times its variance
         noise = float(np.median(smooth)) / 0.6745 / np.sqrt(20) if len(smooth) else 0.0
@@ -72,7 +72,7 @@ class TimeTest(NamedTuple):
 
     @property
     def cyclic(self) -> bool:
-        """Whether what is driven falls by more than half of its largest value and rises again: answers pass 0."""
+        """Whether the driven quantity falls by more than half of its largest value and rises again: answers pass 0."""
         driven = np.abs(self.driven)
         half = 0.5 * driven.max()
         fallen = np.maximum.accumulate(driven) - driven > half

@@ -1,4 +1,4 @@
-"""What a fit of a strain sweep leaves behind: fit.json, fit.png, and a table on the terminal."""
+"""Files of a fit of a strain sweep: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a fit of stress-stretch curves leaves behind: curves.json, curves.png, and a table on the terminal."""
+"""Files of a fit of stress-stretch curves: curves.json and curves.png, and a table on the terminal."""
 
 import json
 from functools import partial
@@ -22,7 +22,7 @@ _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
 def best_first(fits: list[LawFit]) -> list[LawFit]:
-    """In the order of Akaike's criterion, corrected for few points."""
+    """Sort the laws by Akaike's criterion, corrected for few points."""
     return sorted(fits, key=lambda f: f.aicc)
 
 

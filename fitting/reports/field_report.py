@@ -1,4 +1,4 @@
-"""What a fit to displacements leaves behind: field.json, and of a map field.vtu, field.h5 and field.png."""
+"""Files of a fit to displacements: field.json, and for a map field.vtu, field.h5 and field.png."""
 
 import json
 from pathlib import Path
@@ -117,7 +117,7 @@ def table_of_numbers(found: Estimate) -> str:
 
 
 def table_of_field(found: Field) -> str:
-    """What was tried and chosen, for the terminal."""
+    """The fits tried and the one chosen, for the terminal."""
     rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
     for h in found.history:
         rows.append(

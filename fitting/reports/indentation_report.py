@@ -1,4 +1,4 @@
-"""What a fit of an indentation curve leaves behind: fit.json, fit.png, and a table on the terminal."""
+"""Files of a fit of an indentation curve: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -56,7 +56,7 @@ def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) ->
 
 
 def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> list[str]:
-    """What a reader of the modulus should know."""
+    """Warnings for a reader of the modulus."""
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
         told.append(f"{fit.before} points are before contact: measure the approach too, it fixes the contact point")
@@ -94,7 +94,7 @@ def table(rig: Indenter, fit: ContactFit, content: dict[str, Any]) -> str:
 
 
 def figure(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> Any:
-    """The curve and what is left of it."""
+    """The curve and its residuals."""
     fig, (above, below) = pyplot().subplots(
         2, 1, figsize=(6, 5), sharex=True, height_ratios=(3, 1), layout="constrained"
     )

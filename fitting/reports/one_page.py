@@ -1,4 +1,4 @@
-"""A fit on one page to print or to file: pictures, numbers, what was left out and what to be careful of."""
+"""A fit on one page to print or to file: pictures, numbers, points left out, and warnings."""
 
 import textwrap
 from pathlib import Path

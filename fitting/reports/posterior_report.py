@@ -1,4 +1,4 @@
-"""What the samples of a posterior leave behind: a part of fit.json, posterior.csv, and lines on the terminal."""
+"""Files of a posterior's samples: a part of fit.json, posterior.csv, and lines on the terminal."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a fitted model says of a test that it has not seen: how far off it is, and whether its errors own up to that."""
+"""Prediction of a test that was not fitted: its error, and whether the stated errors cover it."""
 
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ class Prediction(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """What the prediction times would fit best: another sample or strain often is a factor, all else alike."""
+        """The factor by which the prediction fits best. Another sample or strain often changes all by one factor."""
         y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
         return float(p @ y / (p @ p))
 
@@ -78,12 +78,12 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
 
 
 def _scatter(residuals: np.ndarray) -> float:
-    """Standard deviation of what has no trend: third differences of independent noise have 20 times its variance."""
+    """Standard deviation of the noise: third differences of independent noise have 20 times its variance."""
     return float(np.median(np.abs(np.diff(residuals, 3)))) / 0.6745 / np.sqrt(20) if len(residuals) > 3 else 0.0
 
 
 def sentence(found: Prediction) -> str:
-    """What a user should know of it, in a line."""
+    """One line for the user."""
     share, inside = len(found.measured), int(found.inside.sum())
     name = f"{found.name} {found.source}"
     if not inside:

@@ -1,4 +1,4 @@
-"""What a fit of several samples leaves behind: fit.json, fit.png, fit.h5, and a table on the terminal."""
+"""Files of a fit of several samples: fit.json, fit.png and fit.h5, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -85,7 +85,7 @@ def _sample_entry(found: Samples, k: int) -> dict[str, Any]:
 
 
 def warnings(found: Samples) -> list[str]:
-    """What concerns the population, and of the samples' own sentences how many there are."""
+    """Warnings of the population, and how often each warning of a single sample occurs."""
     out = []
     for name, p in found.populations.items():
         own = np.array([edges.values(f)[name][0] for f in found.fits])
@@ -111,7 +111,7 @@ def warnings(found: Samples) -> list[str]:
 
 
 def table(found: Samples) -> str:
-    """The population, the samples, and what the choice of the model rests on."""
+    """The population, the samples, and the criterion of each model."""
     units = dict(zip(found.kind.names, found.kind.units, strict=True))
     rows = [
         f"{len(found.fits)} samples, {found.kind.name}",

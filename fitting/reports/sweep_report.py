@@ -1,4 +1,4 @@
-"""What a fit leaves behind: fit.json, fit.png, fit.h5, and a table on the terminal."""
+"""Files of a fit: fit.json, fit.png and fit.h5, and a table on the terminal."""
 
 import json
 import math
@@ -26,7 +26,7 @@ MARK = "* moves by more than its error without the first or the last half decade
 
 
 def numbers(values: Any) -> Any:
-    """JSON numbers; what is not finite becomes null."""
+    """JSON numbers; numbers that are not finite become null."""
     if isinstance(values, dict):
         return {k: numbers(v) for k, v in values.items()}
     if isinstance(values, (list, tuple)):
@@ -76,7 +76,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
 
 
 def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, Any] | None:
-    """By the names of `standard_errors`; null where it is not known."""
+    """Bias by the names of `standard_errors`; null where it is not known."""
     if moved is None:
         return None
     G0, ratios = u.values[0], u.values[1 : n + 1]
@@ -222,7 +222,7 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _as_measured(closed: Fit) -> Maxwell:
-    """Modes of the moduli that the instrument shows, where a compression makes them others than the sample's."""
+    """Modes as the instrument shows them: a compression makes them differ from those of the sample."""
     found = closed.details.get("precompression")
     if found is None:
         return closed.model
@@ -231,7 +231,7 @@ def _as_measured(closed: Fit) -> Maxwell:
 
 
 def _legend_above(axes: Any, columns: int) -> None:
-    """Outside of the axes, where it covers nothing."""
+    """Put the legend outside of the axes, where it covers nothing."""
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.3, fontsize=8, ncols=columns, frameon=False)
 
 
@@ -344,7 +344,7 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
 
 
 def _compression(fits: list[Fit]) -> list[str]:
-    """What was taken for a compressed sample, and the axial force that checks it."""
+    """The assumed compression of the sample, and the axial force for a check."""
     found = [fit.details["precompression"] for fit in fits if "precompression" in fit.details]
     if not found:
         return []
@@ -360,7 +360,7 @@ def _compression(fits: list[Fit]) -> list[str]:
 
 
 def _agreement(fits: list[Fit]) -> list[str]:
-    """What the simulation adds, in one line."""
+    """One line on the difference that the simulation makes."""
     if len(fits) < 2:
         return []
     shift, seconds = largest_shift(*fits), fits[-1].run_time + fits[-1].compile_time

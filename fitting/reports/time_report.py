@@ -1,4 +1,4 @@
-"""What a fit of a relaxation or creep test leaves behind: fit.json, fit.png, and a table on the terminal."""
+"""Files of a fit of a relaxation or creep test: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path
@@ -68,7 +68,7 @@ def _equilibrium_in_time(fit: TimeFit) -> float:
 
 
 def table(test: TimeTest, fit: TimeFit) -> str:
-    """Parameters ± standard error, and what the choice of the number of modes rests on."""
+    """Parameters ± standard error, and the criterion of each number of modes."""
     u, n = fit.uncertainty, fit.modes
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
     rows.append(f"G0    {u.values[0]:11.5g} ± {u.standard_errors[0]:<9.2g} Pa")

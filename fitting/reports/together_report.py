@@ -1,4 +1,4 @@
-"""What a fit of several tests leaves behind: fit.json, fit.png, and a table on the terminal."""
+"""Files of a fit of several tests: fit.json and fit.png, and a table on the terminal."""
 
 import json
 from pathlib import Path

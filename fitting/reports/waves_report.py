@@ -1,4 +1,4 @@
-"""What a fit to waves leaves behind: waves.json, waves.h5, waves.vtu and waves.png."""
+"""Files of a fit to waves: waves.json, waves.h5, waves.vtu and waves.png."""
 
 import json
 from pathlib import Path

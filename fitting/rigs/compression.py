@@ -32,7 +32,7 @@ _STEP = 0.05
 
 
 class Shares(NamedTuple):
-    """What a compressed cylinder that may slide sideways shows, over what it has at rest [1]."""
+    """Apparent moduli of a compressed cylinder that may slide sideways, over its moduli at rest [1]."""
 
     relaxing: float  # of what relaxes
     equilibrium: float  # of the equilibrium modulus
@@ -99,7 +99,7 @@ def _refuse_directions(law: Law) -> None:
 
 
 def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
-    """The rig with its sample compressed by `strain`, as it is held before it turns.
+    """The rig with its sample compressed by `strain` and held, before it turns.
 
     Args:
         rig: of the sample at rest; its height becomes that of the gap.

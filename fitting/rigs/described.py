@@ -47,7 +47,7 @@ _CURVED = 0.02
 
 
 class Described(NamedTuple):
-    """What a description says."""
+    """The content of a description."""
 
     test: str
     data: Path

@@ -49,7 +49,7 @@ class Cells(NamedTuple):
 
 @struct
 class Rig:
-    """A scene without its law, and what is read of it along z."""
+    """A scene without its law, and the reading of it along z."""
 
     scene: lj.Scene = param("1", "with a law that `read` replaces")
     nodes: Any = param("1", "node numbers (n,) that are read")
@@ -70,7 +70,7 @@ class _Sample(NamedTuple):
 
 
 def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]:
-    """What the rig shows at every step (T,) [N] or [m], and the steps' codes (T,).
+    """Readings of the rig at every step (T,) [N] or [m], and the codes of the steps (T,).
 
     Raises:
         InputError: a law with directions of its own in a sector, where only what is alike all around the axis fits.
@@ -121,7 +121,7 @@ def _ratio(law: Law) -> float | None:
 
 
 def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
-    """What is read of positions [m] and reactions [N] of all steps (T, V, 3)."""
+    """Readings from positions [m] and reactions [N] of all steps (T, V, 3)."""
     if rig.reading == "force":
         return reactions[:, rig.nodes, 2] @ rig.weights
     rest = rig.scene.mesh.points[rig.nodes, 2]
@@ -202,7 +202,7 @@ def _finite_history(name: str, values: Any) -> np.ndarray:
 
 
 def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | None) -> Cells:
-    """What a mesh is made of, after a look at all numbers."""
+    """Check all numbers; return the cells of the mesh."""
     cells = cell_size if isinstance(cell_size, Cells) else Cells(size=cell_size)
     if not (np.isfinite(dt) and dt > 0):
         raise InputError(f"dt = {dt} must be positive: give the time step in seconds")
@@ -220,7 +220,7 @@ def _cells(radius: float, height: float, dt: float, cell_size: float | Cells | N
 
 
 def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None) -> _Sample:
-    """A sector with cells of given lengths at given radii and heights; with `cells.size`, the whole body of such."""
+    """A sector with cells of given lengths at given radii and heights; with `cells.size`, the whole cylinder."""
     radius, height = max(rings), max(layers)
     if cells.size is not None:
         rings, layers = (dict.fromkeys(places, cells.size) for places in (rings, layers))

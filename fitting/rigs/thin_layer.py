@@ -85,7 +85,7 @@ def reach(rig: Indenter, depth: np.ndarray) -> np.ndarray:
 
 
 def check_indenter(rig: Indenter) -> None:
-    """Refuse what no layer can take.
+    """Refuse an indenter that cannot be computed.
 
     Raises:
         InputError: an unknown shape, a length that is not above 0, a Poisson's ratio or an angle out of bounds.

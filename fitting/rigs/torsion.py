@@ -254,7 +254,7 @@ def _coordinates(rig: Rig) -> int:
 
 
 def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
-    """Stiffness (n, n) [N/m] of a compressed sample: that of changing stress, and that of the stress which stands.
+    """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the stress that stands.
 
     Of a stress S that has stood for long, a motion changes the direction alone; the second part is that of the
     unrelaxed S.
@@ -300,7 +300,7 @@ def torque_for_strain(rig: Rig, modulus: Any, strain: Any) -> Any:
 
 
 def scene_of(rig: Rig, law: Law, prony: Prony | None, omega: Any, amplitude: Any, drive: Drive = Drive()) -> Scene:
-    """The oscillation as a scene with a rigid plate: `lj.simulate` runs it, from rest. Arguments as of `oscillate`.
+    """The oscillation as a scene with a rigid plate, for `lj.simulate`, from rest. Arguments are those of `oscillate`.
 
     `oscillate` with `start="rest"` has the same answer in a fraction of the time: it knows the inverse of the small
     body's stiffness.
@@ -332,7 +332,7 @@ def scene_of(rig: Rig, law: Law, prony: Prony | None, omega: Any, amplitude: Any
 
 
 class _Oscillation(NamedTuple):
-    """One oscillation: what turns, and how it is driven."""
+    """One oscillation: the sample and its drive."""
 
     rig: Rig
     law: Law
@@ -356,13 +356,13 @@ class _Oscillation(NamedTuple):
         return _positions(self.rig, *_unpack(self.rig, q))
 
     def full(self, q: jax.Array, t: Any) -> jax.Array:
-        """All coordinates at time t, of those that are solved for."""
+        """All coordinates at time t, from the unknown ones."""
         if self.by_torque:
             return q
         return jnp.append(q, self.rig.radius * self.amplitude * jnp.sin(self.omega * t))
 
     def solved_part(self, q: jax.Array) -> jax.Array:
-        """Those of all coordinates that are solved for."""
+        """The unknown ones of all coordinates."""
         return q if self.by_torque else q[:-1]
 
 
@@ -545,7 +545,7 @@ def moduli(
 
 
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """What `moduli` approaches as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
+    """The limit of `moduli` as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
 
     The rig is linear there, and its bias is divided out, so they hold neither mesh nor plates. They give the
     derivatives of `moduli` by the parameters to the order of the strain, without a derivative of the simulation. They
@@ -570,12 +570,12 @@ class Held(NamedTuple):
 
 
 def held(rig: Rig, law: Law) -> Held:
-    """What `held_moduli` needs of a rig of `compression.compressed`."""
+    """Input of `held_moduli` from a rig of `compression.compressed`."""
     return Held(*about_held(rig, law), geometry_factor(replace(rig, held=None, height=_rest_height(rig)), law))
 
 
 def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
-    """`linear_moduli` of a compressed sample of the law of `of`: complex moduli [Pa] (n,) of its mesh.
+    """`linear_moduli` of the compressed sample `of`: complex moduli [Pa] (n,) of its mesh.
 
     Args:
         of, rig: the sample.

@@ -1,1 +1,1 @@
-"""Shear waves: what a material does to them, and what they say of a material."""
+"""Shear waves in a material, and the moduli that follow from them."""

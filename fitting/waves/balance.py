@@ -1,4 +1,4 @@
-"""How far measured waves are from balance of forces, and the modulus that this tells.
+"""The balance of forces in measured waves, and the modulus that follows from it.
 
 At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M there,
 K of the shear stress alone. B p are the forces of a pressure p (linear in the elements, continuous), which is whatever
@@ -28,7 +28,7 @@ from liverjax.waves.harmonic import element_operator
 
 
 class Matrices(NamedTuple):
-    """Parts of the dynamic stiffness of every element with n nodes, and where they stand."""
+    """Parts of the dynamic stiffness of every element with n nodes, and their places."""
 
     shear: np.ndarray  # (n, 3, n, 3, E) of a shear modulus of 1 Pa [N/m/Pa]
     mass: np.ndarray  # (n, n, E) of one component [kg]

@@ -25,7 +25,7 @@ WINDOW = 3
 
 
 def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, window: int = WINDOW) -> np.ndarray:
-    """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside and where the mask's edge comes into derivatives or smoothing.
+    """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside, and where derivatives or smoothing reach the mask's edge.
 
     Args:
         field: three components are needed; NaN everywhere without.

@@ -1,4 +1,4 @@
-"""An organ and its waves: moduli of the whole and of its regions from one measurement, and what a map needs."""
+"""An organ and its waves: moduli of the whole and of its regions, and the input of a map."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -76,7 +76,7 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
 
 
 def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:
-    """What `stiffness_map.map_of` solves: a map about the moduli of the whole, of this correlation length [m]."""
+    """Input of `stiffness_map.map_of`: a map about the moduli of the whole, with this correlation length [m]."""
     return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 

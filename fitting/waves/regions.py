@@ -40,13 +40,13 @@ class Regions(NamedTuple):
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Of storage and of loss (F, R) [Pa]."""
+        """Standard errors of storage and of loss (F, R) [Pa]."""
         variance = np.real(np.diagonal(self.covariance, axis1=1, axis2=2))
         return self.noise_factor[:, None] * np.sqrt(variance)
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
-    """The modulus [Pa] of `STARTS` that leaves the least out of balance at the lowest frequency."""
+    """The modulus [Pa] of `STARTS` with the smallest forces out of balance at the lowest frequency."""
     ones = np.ones(m.rows.shape[-1])
 
     def out_of_balance(G):
@@ -90,12 +90,12 @@ def geometric(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def side_by_side(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `geometric`, of arithmetic means."""
+    """The same as `geometric` with arithmetic means."""
     return shares @ G, shares
 
 
 def moved_by_mixing(m: Matrices, waves: MeasuredWaves, shares: np.ndarray, modulus: np.ndarray) -> np.ndarray:
-    """What `side_by_side` would add to moduli (F, R) [Pa] that were found as `geometric`: one step of Gauss-Newton."""
+    """Change of moduli (F, R) [Pa] if `side_by_side` took the place of `geometric`: one step of Gauss-Newton."""
     out = np.empty_like(modulus)
     for f, G in enumerate(modulus):
         elements, by_regions = side_by_side(shares, G)

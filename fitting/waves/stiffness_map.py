@@ -50,7 +50,7 @@ class WaveMap(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What a search needs, all of it fixed."""
+    """The fixed input of a search."""
 
     m: Matrices
     waves: MeasuredWaves
@@ -69,7 +69,7 @@ class Course(NamedTuple):
         ]
 
     def jacobians(self, c: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
-        """Derivatives (I, P) of what is out of balance by c, over the noise."""
+        """Derivatives (I, P) by c of the forces out of balance, over the noise."""
         factor = np.exp(self.mean @ c)
         return [
             (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(g * factor) @ self.mean).tocsc() / sd
@@ -172,14 +172,14 @@ def _evidences(visited: list[tuple[_Reached, np.ndarray]], components: int) -> t
 
 
 def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
-    """Logarithm of the probability of the data at this deviation, but for a number that is the same for all."""
+    """Logarithm of the probability of the data at this deviation, up to a constant."""
     H = np.eye(len(information)) + DEVIATIONS[point.k] ** 2 / excess * information
     logarithm = 2 * float(np.sum(np.log(np.real(np.diagonal(np.linalg.cholesky(H))))))
     return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
 
 
 def _each_deviation(course, point, history, file, progress) -> list[tuple[_Reached, np.ndarray]]:
-    """One deviation after another, each from the field of the last, until chi^2 is that of the noise or no better."""
+    """Try one deviation after another, each from the last field, until chi^2 is that of the noise or stops falling."""
     components, visited = course.m.balances * len(course.waves.omega), []
     while True:
         begin, steps = time.perf_counter(), 0
@@ -254,7 +254,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, point: _Reached, history: list[dict[str, float]]) -> None:
-    """The point reached, whole or not at all."""
+    """Write the point reached, as a whole."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:

@@ -1,4 +1,4 @@
-"""A body of quadratic elements whose nodes are voxels, so that what is measured there is what nodes do."""
+"""A body of quadratic elements whose nodes are voxels, so that measurements are motions of nodes."""
 
 import itertools
 from typing import NamedTuple

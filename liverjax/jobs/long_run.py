@@ -27,7 +27,7 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and what it took now: parts found on disk cost nothing."""
+    """A finished run and the time it took. Parts found on disk cost nothing."""
 
     result: Result  # numpy arrays
     steps: int  # computed now

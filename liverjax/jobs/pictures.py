@@ -1,4 +1,4 @@
-"""Pictures of a body's surface, coloured by what was computed."""
+"""Pictures of a body's surface, coloured by a field."""
 
 from pathlib import Path
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Reduced models of scene files: made from a table of rows, and run in place of the full model while they are right."""
+"""Reduced models of scene files: make one from a table of rows, and run it while its error is small."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Results in parts: a finished part is a file of its own beside the output, which a kill at any moment cannot spoil."""
+"""Results in parts, for runs that resume after a kill: a finished part is a file of its own beside the output."""
 
 import fcntl
 import hashlib
@@ -77,7 +77,7 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def same(identity: dict[str, Any], file: Path) -> None:
-    """Record all that decides the results, or refuse to go on with other parts.
+    """Write down what decides the results; refuse to go on if the parts on disk were made with something else.
 
     Raises:
         InputError: the parts beside `file` are of something else.

@@ -1,4 +1,4 @@
-"""Sweeps: one scene, many rows of parameters, results that a kill at any moment cannot spoil.
+"""Sweeps: one scene and many rows of parameters. A kill at any moment cannot spoil the results.
 
 Rows are run chunk by chunk. A finished chunk is a file of its own in FILE.h5.parts, written beside and renamed; when
 all are there they become FILE.h5. So whatever stops a run, finished chunks stay, and `--resume` computes the others.
@@ -45,7 +45,7 @@ _UNITS = {"final_reactions": "N", "largest_pressure": "Pa"}
 
 
 class Sweep(NamedTuple):
-    """What is to be run; everything that decides the results is in `identity`."""
+    """The runs to make; `identity` has everything that decides the results."""
 
     scene: Scene
     names: tuple[str, ...]
@@ -161,7 +161,7 @@ def run(
     process: tuple[int, int] = (0, 1),
     report: Callable[[int], None] = lambda rows: None,
 ) -> Done:
-    """Run what is not done yet of a sweep into `out`.
+    """Run the rows of a sweep that are not done yet; write into `out`.
 
     Args:
         sweep: `Sweep`.
@@ -236,7 +236,7 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
 
 
 def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
-    """All parts as one file, by whichever process comes last."""
+    """Join all parts to one file; the last process does it."""
     files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
         with resumable_parts.locked(folder / "lock_join"):

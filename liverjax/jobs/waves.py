@@ -21,7 +21,7 @@ from liverjax.waves.mesh_error import harmonic_mesh_error
 
 
 class Waves(NamedTuple):
-    """Amplitudes of a scene and what they took."""
+    """Amplitudes of a scene, and the time and iterations of the solve."""
 
     found: Harmonic
     mesh_error: jax.Array | None  # (F, V, 3) complex [m]

@@ -66,7 +66,7 @@ class Law:
     # -- what a law states -------------------------------------------------------------------------------------------
 
     def strain_energy(self, I: Invariants) -> Any:
-        """Energy density [Pa] of what the law names."""
+        """Energy density [Pa] at the invariants that the law names."""
         W = 0.0
         if self.isochoric_energy is not None:
             W = W + self.isochoric_energy(*reduced(I))
@@ -188,7 +188,7 @@ class Sum(Law):
         return self.laws
 
     def isochoric_part(self):
-        """Sum of the summands' but for those that are only volumetric; `None` where one of them has none."""
+        """The isochoric parts added, without laws that are only volumetric; `None` where a law has no such part."""
         parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
         return None if any(part is None for part in parts) else _added(parts)
 
@@ -202,7 +202,7 @@ class Sum(Law):
             law.check()
 
     def measures(self, F):
-        """One set of invariants a summand: what two of them share is computed once."""
+        """One set of invariants for each law of the sum; shared ones are computed once."""
         return tuple(law.measures(F) for law in self.laws)
 
     def strain_energy(self, I):

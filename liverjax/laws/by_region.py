@@ -40,19 +40,19 @@ class ByRegion(Law):
             law.check()
 
     def isochoric_part(self) -> Any:
-        """Of each law; None where one has none."""
+        """The isochoric part of each law; None where one law has none."""
         if any(law.isochoric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """Of each law; None where none has one."""
+        """The volumetric part of each law; None where no law has one."""
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))
 
     def measures(self, F: Matrix) -> tuple:  # type: ignore[override]
-        """Those of each law at its own elements."""
+        """The invariants of each law at its own elements."""
         return tuple(self.piece(k).measures(in_subset(self.subsets, k, F)) for k in range(len(self.laws)))
 
     def strain_energy(self, I: tuple) -> jax.Array:  # type: ignore[override]
@@ -60,7 +60,7 @@ class ByRegion(Law):
         return put_together(self.subsets, [self.piece(k).strain_energy(i) for k, i in enumerate(I)])
 
     def energy_derivatives(self, I: Any) -> Any:
-        """Laws of several kinds have no invariants in common."""
+        """Refused: laws of several kinds have no invariants in common."""
         raise InputError("laws of several kinds have no derivatives in common: ask each of them")
 
     def shear_modulus(self) -> jax.Array:

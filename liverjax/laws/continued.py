@@ -23,11 +23,11 @@ class Continued(Law):
 
     @property
     def invariants(self) -> tuple:  # type: ignore[override]  # of the law inside
-        """Those of the law, and J."""
+        """The invariants of the law, and J."""
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
     def isochoric_part(self) -> Law | None:
-        """Without its volumetric energy; None where the law has no such split."""
+        """The law without its volumetric energy; None where it has no such split."""
         part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
@@ -42,13 +42,13 @@ class Continued(Law):
         return self._whole().measures(F)._replace(J=self._replaced(J)[0]), J
 
     def strain_energy(self, I):
-        """That of the law at the replaced J, and the volumetric one at J."""
+        """Energy of the law at the replaced J, plus the volumetric energy at J."""
         I, J = I
         W, volume = self._whole().strain_energy(I), self.volumetric_part()
         return W if volume is None else W + volume.strain_energy(I._replace(J=J))
 
     def energy_derivatives(self, I):
-        """By the chain rule."""
+        """Derivatives by the chain rule."""
         I, J = I
         _, slope, curvature = self._replaced(J)
         first, second = self._whole().energy_derivatives(I)

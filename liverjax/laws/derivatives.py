@@ -58,7 +58,7 @@ def _isochoric_derivatives(law: Any, Ibar: dict) -> tuple[First, Second]:
 
 
 def autodiff_derivatives(law: Any, I: Invariants) -> tuple[First, Second]:
-    """The scalar derivatives of `law.strain_energy` by forward mode: what a law gets that states only its energy."""
+    """The scalar derivatives of `law.strain_energy` by forward mode, for a law that states only its energy."""
     values = {n: getattr(I, n) for n in ORDER if n in law.invariants}
     return _scalar_derivatives(lambda **v: law.strain_energy(I._replace(**v)), values)
 

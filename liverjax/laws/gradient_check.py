@@ -27,7 +27,7 @@ STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
 
 
 class Row(NamedTuple):
-    """One line of the table; `passed` is None for what is only told."""
+    """One line of the table; `passed` is None for a line that only informs."""
 
     name: str
     found: str
@@ -36,7 +36,7 @@ class Row(NamedTuple):
 
 
 class Check(NamedTuple):
-    """A table, and what the figure shows."""
+    """A table, and the data of the figure."""
 
     law: Law
     rows: list[Row]
@@ -51,7 +51,7 @@ class Check(NamedTuple):
 
 
 def load(name: str) -> Law:
-    """A shipped law by its name, or FILE.py:LAW, a law object or class of a Python file; typical parameters of a class.
+    """Load a shipped law by its name, or FILE.py:LAW, a law of a Python file. A class gets its typical parameters.
 
     Raises:
         InputError: no such law or file, a file that does not run, a parameter without typical value.
@@ -95,7 +95,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _try(law: Law, name: str) -> None:
-    """Evaluate the law once: whatever it raises becomes one sentence."""
+    """Evaluate the law once. Any error becomes one sentence."""
     for shape in ((), (2,)):
         F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
         for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
@@ -218,7 +218,7 @@ def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable)
 
 
 def _limits_of_energy(energy: Callable) -> list[Row]:
-    """What becomes of the energy at J -> 0, J -> infinity, J = 0 and J < 0."""
+    """The energy at J -> 0, J -> infinity, J = 0 and J < 0."""
 
     def along(*sizes: float) -> np.ndarray:
         return _as_numbers(energy, np.stack([s ** (1 / 3) * np.eye(3) for s in sizes]))
@@ -242,7 +242,7 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
 
 
 def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
-    """Ranges about rest in which work is positive and the law strongly elliptic; stable at rest or failed."""
+    """Ranges about rest with positive work and strong ellipticity. The row fails if rest is not stable."""
     rows, ranges = [], {}
     for test, what in homogeneous.TESTS.items():
         if test == "pure_shear":

@@ -46,7 +46,7 @@ def _isochoric(c: Any, i: int, j: int) -> list[Product]:
 
 
 def groups(law: Law) -> list[Group]:
-    """The products of a single law; `InputError` for a law that is none of invariants I1, I2 and J in that form."""
+    """The products of a single law; `InputError` for a law that cannot be written so."""
     match law:
         case NeoHookean():
             return [Group(_isochoric(law.mu / 2, 1, 0))]

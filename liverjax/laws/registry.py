@@ -88,7 +88,7 @@ def create(name: str, **values: Any) -> Law:
 
 
 def _sequence(value: Any) -> Any:
-    """One number a term as a tuple, so that each is a leaf; directions of elements stay an array."""
+    """A tuple of the numbers of the terms, so that each is a leaf. Directions of elements stay an array."""
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:

@@ -1,4 +1,4 @@
-"""Which nodes of a mesh share an element, and patches of near ones: made once a mesh, on the host."""
+"""Nodes of a mesh that share an element, and patches of near nodes. They are made once for a mesh, on the host."""
 
 from typing import Any
 

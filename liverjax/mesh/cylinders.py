@@ -81,7 +81,7 @@ class Sector(NamedTuple):
 
 
 def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1) -> Sector:
-    """What lies between the plane y = 0 and a turned one of a cylinder whose rings have `corners` corners each.
+    """The part of a cylinder between the plane y = 0 and a turned plane; `corners` are those of each ring.
 
     An axisymmetric problem needs no more than one slice: both planes are planes of symmetry. Areas of polygons are
     those of circles.

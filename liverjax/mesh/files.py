@@ -1,4 +1,4 @@
-"""Mesh files: what meshio reads and writes, of linear and of quadratic tetrahedra; sets come along."""
+"""Mesh files, read and written by meshio: linear and quadratic tetrahedra, with their sets."""
 
 import contextlib
 import io
@@ -117,7 +117,7 @@ _FOREIGN = {
 
 
 def _read_quietly(path: Path) -> Any:
-    """What meshio reads, without what meshio prints: one sentence of ours says what was found."""
+    """Read with meshio, without its printed lines: our own sentence says what was found."""
     import meshio
 
     try:

@@ -9,7 +9,7 @@ from liverjax.tensors.places import given, taken
 
 
 def to_nodes(mesh: TetMesh, share: jax.Array) -> jax.Array:
-    """Sum (V,) at every vertex of what each of its elements gives to each of its vertices, `share` (E,)."""
+    """Sum (V,) at every vertex: each element gives `share` (E,) to each of its vertices."""
     total = jnp.zeros(mesh.number_of_vertices, share.dtype)
     for a in range(4):
         total = given(total, mesh.tetrahedra[:, a], share)
@@ -28,7 +28,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
-    """The transpose of `interpolated`: sums (V,) at the vertices of what every point has, (Q, E)."""
+    """The transpose of `interpolated`: it adds values of the points (Q, E) up at the vertices (V,)."""
     if mesh.order == 1:
         return to_nodes(mesh, shares / 4)
     parts = jnp.asarray(basis(mesh.order).L, shares.dtype) @ shares

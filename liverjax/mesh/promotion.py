@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra from linear ones: a node in the middle of every edge; and the functions beyond them."""
+"""Quadratic tetrahedra from linear ones, with a node in the middle of every edge; and cubic functions."""
 
 import jax
 import jax.numpy as jnp

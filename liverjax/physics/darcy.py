@@ -77,14 +77,14 @@ def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: j
 
 
 def right_side(flow: Flow, b: jax.Array) -> jax.Array:
-    """The part of b (V,) that the free pressures answer for: with what enters, without what given pressures take."""
+    """The part of b (V,) for the free pressures: inflow added, the effect of given pressures subtracted."""
     if flow.enters is not None:
         b = b + flow.enters
     return flow.mask * (b if flow.given is None else b - _product(flow, flow.given))
 
 
 def with_given(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
-    """All pressures (V,) [Pa], those that are given among them."""
+    """All pressures (V,) [Pa], with the given ones."""
     P = solved(mesh, flow, right_side(flow, b))
     return P if flow.given is None else P + flow.given
 
@@ -121,7 +121,7 @@ _POLYNOMIAL_ERROR = 0.1
 
 
 def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
-    """Near A^-1 b for b (V,), A the matrix of the pressure: a symmetric, positive definite, linear map.
+    """Approximate A^-1 b for b (V,), with A the matrix of the pressure: linear, symmetric, positive definite.
 
     The slow waves exactly, by the coarse space, the others by a polynomial.
     """

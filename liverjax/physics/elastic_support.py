@@ -56,7 +56,7 @@ class ElasticSupport(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Node numbers of the mesh, a place, and a history that goes with its times."""
+        """Refuse wrong node numbers, a missing place, and a history that does not fit its times."""
         history.check(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
@@ -75,7 +75,7 @@ class ElasticSupport(Physics):
         return Springs(blocks=tuple(tuple(after * entry for entry in row) for row in own))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Along the axes of every node's block that have a stiffness."""
+        """Nodes are held along the axes in which their block has a stiffness."""
         K = np.moveaxis(np.array([[np.asarray(e) for e in row] for row in blocks(self, mesh)]), -1, 0)
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
@@ -114,7 +114,7 @@ class Springs(NodalForce):
     )
 
     def _stretch(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
-        """Of the springs (V, 3) [m]."""
+        """Stretch of the springs (V, 3) [m]."""
         if self.wall is None:
             return x - mesh.points
         return x - mesh.points - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[None]

@@ -16,7 +16,7 @@ FACTOR = {"euler": 1.0, "newmark": 4.0}
 
 
 class Motion(NamedTuple):
-    """What a step hands to the next."""
+    """Velocity and acceleration, handed from step to step."""
 
     velocity: jax.Array  # (V, 3) [m/s]
     acceleration: jax.Array | None  # (V, 3) [m/s^2], of Newmark's method
@@ -30,7 +30,7 @@ class Inertia(Physics):
     integrator: str = static(default="euler", about="euler (first order) or newmark (second order)")
 
     def begin(self, start: Start) -> Motion:
-        """At rest. m a = f there: Newmark's method keeps its order from the first step."""
+        """Begin at rest, with the acceleration m a = f: Newmark's method keeps its order from the first step."""
         acceleration = None
         if self.integrator == "newmark":
             mass = self.density * nodal_volumes(start.mesh)

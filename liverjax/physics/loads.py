@@ -72,7 +72,7 @@ def dead_loads(mesh: TetMesh, density: Any, gravity: Any, tractions: tuple) -> j
 
 @struct
 class Loads(Physics):
-    """What pulls and pushes a body."""
+    """The loads of a body: weight and tractions."""
 
     density: Any = param("kg/m^3", "None: no weight", default=None)
     gravity: Any = param("m/s^2", "(3,)", default=None)
@@ -122,7 +122,7 @@ class Loading(NodalForce):
         return jnp.ones((), dtype) if self.growth == "none" else jnp.where(self.k == 1, s, 1.0).astype(dtype)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
-        """Minus the loads; with a history straight from those at the beginning of the step to those at its end."""
+        """Minus the loads. With a history they change linearly from the beginning to the end of the step."""
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.force(mesh, x, s) + (1 - s) * self.before.force(mesh, x, s)
@@ -136,7 +136,7 @@ class Loading(NodalForce):
         return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
-        """Of the pressures alone: dead loads do not change."""
+        """Change of the pressures alone: dead loads do not change."""
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.product(mesh, x, s, dx) + (1 - s) * self.before.product(mesh, x, s, dx)

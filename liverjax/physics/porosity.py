@@ -98,7 +98,7 @@ class Porosity(Physics):
 
 
 class Fluid(NamedTuple):
-    """What a step hands to the next."""
+    """Pressure and volumes, handed from step to step."""
 
     pressure: jax.Array  # P of the vertices (V,) [Pa]
     J: jax.Array  # at every point
@@ -136,7 +136,7 @@ def check_sponge(porosity: Porosity) -> None:
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law beside the sponge: without its own volumetric energy, lest bulk is counted twice, unless asked for."""
+    """The law beside the sponge, without its own volumetric energy (bulk would count twice) unless asked for."""
     if porosity is None or porosity.keep_bulk:
         return law
     return law.each(lambda own: own if isochoric_part(own) is None else isochoric_part(own))
@@ -184,7 +184,7 @@ def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
 
 
 def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple[jax.Array, jax.Array]:
-    """Of `darcy.Flow` with inlets, at a time [s]: given pressures (V,) [Pa], and what enters in dt (V,) [m^3]."""
+    """Inlets at a time [s], for `darcy.Flow`: given pressures (V,) [Pa], and the inflow (V,) [m^3] in dt."""
     given = enters = jnp.zeros(mesh.number_of_vertices, mesh.points.dtype)
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
@@ -250,11 +250,11 @@ class CoupledSponge(Sponge):
         return pressure(self.porosity, mesh, self.fluid, self.flow, J)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """Of storage and flow, positive as it is."""
+        """Matrix of storage and flow; it is positive."""
         return self.flow.matrix
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Of the sponge and of the fluid that leaves it."""
+        """Energy of the sponge and of the fluid that leaves it."""
         density = volumetric_energy(self.porosity, J)
         return jnp.sum(mesh.weights * density) + fluid_energy(self.porosity, mesh, self.fluid, self.flow, J)
 
@@ -273,6 +273,6 @@ class LaggedSponge(Sponge):
         return self.given
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Of the sponge, and the work of the fluid's pressure."""
+        """Energy of the sponge, and work of the fluid's pressure."""
         density = volumetric_energy(self.porosity, J)
         return jnp.sum(mesh.weights * (density - interpolated(mesh, self.given) * J))

@@ -22,7 +22,7 @@ class Fixed:
 
 @struct
 class Displaced:
-    """Nodes that are moved: by `by` at the last step, proportionally before; or along a history, a factor of `by`."""
+    """Nodes that are moved by `by` at the last step, in proportion before; or along a history, which may scale `by`."""
 
     nodes: Any = param("1", "node numbers (n,)", lower=0)
     by: Numbers | None = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)

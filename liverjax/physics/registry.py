@@ -1,4 +1,4 @@
-"""The physics of a scene, in order; and those that a scene file may name beside the sections of every scene."""
+"""The physics of a scene, in order, and the further ones that a scene file may name."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ def law_at_rest(scene: Any) -> Law:
 
 
 def physics_of(scene: Any) -> tuple[Physics, ...]:
-    """What acts in a `liverjax.scenes.scene.Scene`: what it lacks is not there."""
+    """The physics that act in a `liverjax.scenes.scene.Scene`; it has no others."""
     law, averaged, mixed = law_at_rest(scene), scene.solve.volumetric == "nodal", scene.solve.volumetric == "mixed"
     if averaged or mixed:
         law = isochoric_part(scene.law)

@@ -37,7 +37,7 @@ class RigidPlate(Physics):
     ties: ClassVar[bool] = True
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Node numbers of the mesh, an axis, and a history."""
+        """Refuse wrong node numbers, axis or history."""
         numbers, turn = np.asarray(self.nodes), np.asarray(self.turn)
         times = np.zeros(()) if self.times is None else np.asarray(self.times)
         if numbers.size < 2 or numbers.max() >= mesh.number_of_nodes:
@@ -67,17 +67,17 @@ class RigidPlate(Physics):
         return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)
 
     def freeze(self, memory: None, step: Step) -> "Torque | None":
-        """The torque; an angle acts on no node."""
+        """The torque; an angle adds no force."""
         if self.by == "angle":
             return None
         return Torque(plate=self.tied(step))
 
     def enriched(self, more: Callable[[Any], Any]) -> "RigidPlate":
-        """With the nodes in between."""
+        """The same with the nodes in between."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Across the axis; along it too where the plate cannot lift; about it where the angle is given."""
+        """Nodes are held across the axis, along it if the plate cannot lift, and about it if the angle is given."""
         nodes, arms = np.asarray(self.nodes), np.asarray(self.at_rest(mesh).arms(mesh.points))
         across = np.linalg.svd(np.asarray(self.axis)[None], full_matrices=True)[2][1:]
         first = [nodes[:1], nodes[:1]] + ([] if self.lifts else [nodes[:1]])
@@ -139,7 +139,7 @@ class Plate(NamedTuple):
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The part of a field (V, 3) along the free motions; at positions x (V, 3) forces work along those of x."""
+        """The part of a field (V, 3) along the free motions. Those of forces depend on the positions x (V, 3)."""
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
     def given(self, s: Any) -> jax.Array:
@@ -147,7 +147,7 @@ class Plate(NamedTuple):
         return self.before + s * (self.after - self.before)
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """The field (V, 3) with the plate's rows that stand for positions x (V, 3)."""
+        """Put the plate's numbers at positions x (V, 3) into the field (V, 3)."""
         turn = self.radius * self.angle(x) if self.plate.by == "torque" else 0.0
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 

@@ -29,7 +29,7 @@ class SlidingSupport(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "SlidingSupport":
-        """From [[support]] with `sliding = true`: the plane is that of the nodes."""
+        """From [[support]] with `sliding = true`: the nodes define the plane."""
         if table["sliding"] is not True:
             raise InputError(
                 f"{name} sliding = {table['sliding']!r} is not true: write sliding = true, or leave it out"
@@ -38,7 +38,7 @@ class SlidingSupport(Physics):
         return on_plane(mesh, nodes, name)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Node numbers of the mesh, and a direction."""
+        """Refuse wrong node numbers and a missing direction."""
         numbers = np.asarray(self.nodes)
         if not numbers.size or numbers.max() >= mesh.number_of_nodes:
             raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
@@ -48,7 +48,7 @@ class SlidingSupport(Physics):
             raise InputError(f"{name} normal = {self.normal} must be of length 1: divide it by its length")
 
     def constrain(self, free: Free) -> Free:
-        """Without the normal direction at the nodes."""
+        """Take the normal direction away at the nodes."""
         if self.axis:
             return free._replace(mask=free.mask.at[self.nodes, selection.AXES.index(self.axis)].set(0.0))
         normals = jnp.zeros_like(free.mask) if free.normals is None else free.normals
@@ -58,7 +58,7 @@ class SlidingSupport(Physics):
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def enriched(self, more: Callable[[Any], Any]) -> "SlidingSupport":
-        """With the nodes in between."""
+        """The same with the nodes in between."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -44,13 +44,13 @@ class Playing(NamedTuple):
 
     @property
     def time(self) -> float:
-        """Of the body [s]; of a scene without time the number of the step."""
+        """Time of the body [s]; in a scene without time, the number of the step."""
         dt = self.scene.solve.dt
         return self.step * (1.0 if dt is None else float(dt))
 
     @property
     def stiffness(self) -> float:
-        """Of a spring that is felt and does not tear [N/m]: shear modulus times a twentieth of the size."""
+        """Stiffness [N/m] of the pulling spring: shear modulus times a twentieth of the size."""
         return float(np.mean(np.asarray(self.scene.law.shear_modulus()))) * self.size / 20
 
 
@@ -92,7 +92,7 @@ def _after_load_steps(scene: Scene) -> State:
 
 
 def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = None, stiffness: float = 0.0) -> Playing:
-    """The body a step later; where the step fails, as it was, with the code of the failure.
+    """The body a step later. If the step fails, it stays as it was, with the code of the failure.
 
     Args:
         playing: the body before.

@@ -85,7 +85,7 @@ def on_surface(playing: Playing) -> np.ndarray:
 
 
 def surface(playing: Playing) -> dict[str, Any]:
-    """What a page needs once."""
+    """The fixed data of a page."""
     return {
         "nodes": playing.nodes.tolist(),
         "triangles": playing.triangles.ravel().tolist(),

@@ -94,7 +94,7 @@ def reduced_identity(scene: Scene) -> str:
 
 
 def refuse_unknown_physics(scene: Scene) -> None:
-    """Refuse a scene with physics that reduced models have not.
+    """Refuse a scene whose physics reduced models do not have.
 
     Raises:
         InputError: porosity, supports and other named physics, a loaded mesh, pressures that follow, averaged or mixed

@@ -32,7 +32,7 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @struct
 class ReducedResult:
-    """What a reduced run leaves; arrays over the T steps. `reduced_positions` gives the motion of the nodes."""
+    """Result of a reduced run: arrays over the T steps. `reduced_positions` gives the motion of the nodes."""
 
     times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
     coordinates: jax.Array = param("m", "of the modes (T, n)")
@@ -53,14 +53,14 @@ class ReducedMotion(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """What a run prescribes, at the end of every step."""
+    """Prescribed loads and motion at the end of every step."""
 
     load: jax.Array  # (T, n) [N]
     gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) where nothing moves
 
 
 class _Equations(NamedTuple):
-    """What is constant during a step."""
+    """The constants of a step."""
 
     model: ReducedModel
     acting: Solid
@@ -131,7 +131,7 @@ class _Found(NamedTuple):
 
 
 class _ReducedIterate(NamedTuple):
-    """Where the iterations of a step are."""
+    """State of the iterations of a step."""
 
     q: jax.Array
     F: jax.Array  # (9, S)

@@ -64,7 +64,7 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
 
 @jax.jit
 def _contributions(whole: ReducedModel, scene: Scene, q: jax.Array, times: jax.Array) -> jax.Array:
-    """What each point gives to each reduced force along a run, at some times: (K, n, P), each state of size 1."""
+    """Contribution of each point to each reduced force along a run, at some times: (K, n, P), each state of size 1."""
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0 = prescribed_gradients(whole, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, False, None, Free(jnp.ones_like(points)))

@@ -136,7 +136,7 @@ def _names_and_limits(
 
 
 def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
-    """Of the full model at every row: (N, V, 3) [m]."""
+    """Displacements of the full model at every row: (N, V, 3) [m]."""
     result = simulate_batch(scene, {name: rows[:, k] for k, name in enumerate(names)}).result
     bad = np.flatnonzero(np.any(np.asarray(result.status) != status.CONVERGED, axis=1))
     if len(bad):

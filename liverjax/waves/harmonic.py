@@ -120,7 +120,7 @@ def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
 
 @partial(jax.jit, static_argnames="mass")
 def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, about: Any, mass: str) -> Harmonic:
-    """Motion, reactions and what is out of balance; `at` are factors and angular frequencies."""
+    """Motion, reactions and residual forces; `at` are factors and angular frequencies."""
     A = _operator(scene, about, mass)
     held = (1 - A.free.mask)[None] * motion
     load = jnp.asarray(nodal_tractions(scene.mesh, scene.traction), complex)[None]
@@ -161,7 +161,7 @@ def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
 
 
 def _small(scene: Scene, mass: str) -> Scene:
-    """The scene as its small motion sees it: no time, no weight; refuses what has no part in it."""
+    """The scene without time and weight, for small motion. Physics that have no small motion are refused."""
     if mass not in MASSES:
         raise InputError(f"mass = {mass!r} is not known: use {' or '.join(MASSES)}")
     if scene.points_are == "loaded":

@@ -1,4 +1,4 @@
-"""What the mesh leaves out of harmonic motion: the same problem in the next richer space of functions."""
+"""Error of harmonic motion by its mesh: the same problem is solved in the next richer space of functions."""
 
 from typing import Any
 

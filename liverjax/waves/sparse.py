@@ -14,7 +14,7 @@ from liverjax.waves.operator import Operator, forces_of_motion
 
 
 def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: jax.Array) -> jax.Array:
-    """Free motions u (F, V, 3) complex [m] with P A P u = P b, where P leaves what is free; 0 where it is not.
+    """Complex motions u (F, V, 3) [m] with P A P u = P b. P projects onto the free directions; u is 0 along the others.
 
     Args:
         A: `Operator`.

@@ -152,7 +152,7 @@ def _half_moved(
 
 
 def _correlation(before: np.ndarray, after: np.ndarray) -> float:
-    """Largest correlation of a coordinate with what it was."""
+    """Largest correlation of a coordinate with its value before."""
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt(np.sum(a * a, axis=0) * np.sum(b * b, axis=0))
     return float(np.max(np.sum(a * b, axis=0) / np.maximum(size, 1e-300)))

@@ -31,7 +31,7 @@ class Logarithmic(Law):
         return -self.c1 * jnp.log1p(-self._filled(X))
 
     def _filled(self, X):
-        """c2 X, the part of the way to the pole; NaN beyond it."""
+        """c2 X, which is 1 at the pole; NaN beyond the pole."""
         return jnp.where(self.c2 * X < 1, self.c2 * X, jnp.nan)
 
     def stretch_derivatives(self, X):

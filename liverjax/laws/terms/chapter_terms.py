@@ -104,12 +104,12 @@ def first_piola(law: "Law", F: Matrix) -> Matrix:
 
 
 def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, Any]]:
-    """D_i (x) D_j and D_i . D_j of every pair: of what L and U are made where their A and B are constant."""
+    """D_i (x) D_j and D_i . D_j of every pair: the constant parts of L and U."""
     return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
 
 
 class Layout(NamedTuple):
-    """What is kept in memory; the default is the fastest (experiments/chapter)."""
+    """The parts that are kept in memory; the default is the fastest (experiments/chapter)."""
 
     #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes; None: computed where they are used.
     constant: list | None = None
@@ -137,7 +137,7 @@ def blocks(
 
 
 class _Node(NamedTuple):
-    """What the six terms need of a node."""
+    """Input of the six terms at a node."""
 
     D: Vector
     cof: Vector  # cof F D
@@ -152,7 +152,7 @@ def _node(s: _At, D: Vector) -> _Node:
 
 
 def _written(values: Any) -> Any:
-    """The same, its arrays written to memory (`stored`); plain numbers stay: what is 0 times them is left out."""
+    """The same with its arrays written to memory (`stored`). Plain numbers stay: products with 0 are left out."""
     leaves, tree = jax.tree.flatten(values)
     arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))
     return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
@@ -197,7 +197,7 @@ def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Any])
 
 
 def _slope(terms: list[_Term], node: _Node, n: int) -> Vector:
-    """d(sum_k g h)/dx of a node, of the terms of group n."""
+    """d(sum_k g h)/dx at a node, for the terms of group n."""
     v = scale(sum(t.h1 * t.g for t in terms), node.cof)
     for t, FS in zip(terms, node.FS[n], strict=True):
         v = tuple(a + t.h * b for a, b in zip(v, FS, strict=True))

@@ -51,7 +51,7 @@ class Scalars(NamedTuple):
 
 
 class State(NamedTuple):
-    """What force and stiffness share at one deformation gradient."""
+    """Values at one deformation gradient that force and stiffness share."""
 
     laws: tuple  # summands, whose energies of stretches and of Green's strain add up
     F: Matrix
@@ -66,7 +66,7 @@ class State(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """The same of laws of several kinds, each at its own elements."""
+    """The same for laws of several kinds, each at its own elements."""
 
     subsets: Subsets
     states: tuple[State, ...]
@@ -92,7 +92,7 @@ def state_of(scalars: Scalars, F: Matrix) -> State:
 
 
 def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
-    """C only where I2 needs it, principal stretches only where a law does."""
+    """C is computed only where I2 needs it, principal stretches only where a law needs them."""
     first, second = scalars
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
@@ -195,7 +195,7 @@ def _weight(invariant: str) -> float:
 
 
 class _Parts(NamedTuple):
-    """What the blocks are put together from."""
+    """The parts of the blocks."""
 
     J: Any
     first: dict

@@ -39,7 +39,7 @@ Frame = tuple[Vector, Matrix]
 
 
 class Principal(NamedTuple):
-    """What stress and moduli share at one F."""
+    """Values at one F that stress and moduli share."""
 
     logs: Vector  # ln lambda_m
     axes: Matrix
@@ -121,7 +121,7 @@ def blocks(law: "Law", F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -
 
 
 def _arrays(law: "Law", F: Matrix) -> Any:
-    """The law with parameters of the precision of F: whole numbers have no derivative."""
+    """The law with its parameters in the precision of F: whole numbers have no derivative."""
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.result_type(F[0][0])), law)
 
 
@@ -138,7 +138,7 @@ def _square(upper: tuple) -> list[list]:
 
 
 def stress_at_constant(law: "Law", F: Matrix) -> Matrix:
-    """`stress` where F is data: the axes do not move, so plain differentiation by the parameters is right and cheap."""
+    """`stress` for an F that is data: its axes do not move, so plain differentiation by parameters is right and cheap."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 

@@ -1,1 +1,1 @@
-"""What is attached to a body: elements of their own between its nodes."""
+"""Elements of their own between the nodes of a body: membranes, ligaments, vessels."""

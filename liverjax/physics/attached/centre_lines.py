@@ -109,7 +109,7 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarray:
-    """Distance along the edges (n,) from the corner that is farthest from any other one."""
+    """Distance along the edges (n,) from a corner at one end."""
     from scipy.sparse.csgraph import dijkstra
 
     first = dijkstra(graph, directed=False, indices=own[0])
@@ -156,7 +156,7 @@ def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _R
 
 
 def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
-    """Lines between the centres of rings that bound one band; from the last ring of a branch to its end."""
+    """Lines between the centres of the two rings of a band, and from the last ring of a branch to its end."""
     count = np.bincount(r.ring)
     centre = np.stack([np.bincount(r.ring, r.points[:, k]) for k in range(3)], axis=1) / count[:, None]
     r, real = _without_tips(r, np.flatnonzero(count >= _LEAST))
@@ -183,7 +183,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
 
 
 def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
-    """Without the last ring of each branch, which may go about a corner of the end: its bands become one."""
+    """Drop the last ring of each branch, which may go about a corner of the end, and join its bands."""
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:
@@ -195,7 +195,7 @@ def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
 
 
 def _outwards(centre: np.ndarray, r: _Rings, real: np.ndarray, a: int, own: int) -> np.ndarray:
-    """Direction (3,) of the line at its last ring a: on from the ring before, or the normal of the ring alone."""
+    """Direction (3,) of the line at its last ring a: from the ring before, or normal to the only ring."""
     inner = r.below[a] if own == r.above[a] else r.above[a]
     before = [b for b in real if b != a and inner in (r.below[b], r.above[b])]
     if before:

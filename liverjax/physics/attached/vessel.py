@@ -91,7 +91,7 @@ class Vessel(Physics):
 
 
 def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
-    """Centre lines of the tubes of a file, with a radius of their own where one is given."""
+    """Centre lines of the tubes of a file; a given radius replaces the measured one."""
     unit, radius = table.get("unit", "m"), table.get("radius")
     if unit not in UNITS:
         raise InputError(f"{name} unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
@@ -121,7 +121,7 @@ def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "v
 
 
 def crossing(mesh: TetMesh, lines: CentreLines, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """Vessels along centre lines, as of a tree; what lies outside the body is left out.
+    """Vessels along centre lines, for example of a tree. Parts outside the body are left out.
 
     Raises:
         InputError: lines outside the body.

@@ -130,14 +130,14 @@ class Obstacle(Physics):
         return replace(self, by=None) if self.history is None else self
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """(3,) [m] at the end of step k; step 0 is the beginning of the run."""
+        """Displacement (3,) [m] at the end of step k; step 0 is the beginning of the run."""
         zero = jnp.zeros(3)
         if self.history is not None:
             return zero + history.value_at(self.by, k * dt, self.times, self.history)
         return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
 
     def freeze(self, memory: Any, step: Step) -> "Touching":
-        """Where it is at the beginning and at the end of the step."""
+        """Its places at the beginning and at the end of the step."""
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
         return Touching(obstacle=self, moved=moved.astype(step.x.dtype))

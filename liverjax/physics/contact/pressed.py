@@ -53,7 +53,7 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Besides: a force, no given motion, factors as history, and a body in the way."""
+        """Refuse besides: no force, a given motion, a history of vectors, and a way without a body in it."""
         super().check(mesh, name)
         history.check(self.times, self.history, name, (1,))
         if self.by is not None:
@@ -83,7 +83,7 @@ class PressedObstacle(Obstacle):
         return np.zeros(0, int), np.zeros((0, 3))
 
     def at_beginning(self) -> "PressedObstacle":
-        """Under the force of time 0; without a history not yet pressed."""
+        """The obstacle under the force of time 0; without a history it is not pressed yet."""
         return self if self.history is not None else replace(self, times=jnp.zeros(1), history=jnp.zeros(1))
 
     def direction(self) -> jax.Array:
@@ -189,7 +189,7 @@ class Pressing(Touching):
         return jnp.where(abs(held - load) <= 1e3 * enough, travel, jnp.nan)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Of the contact, less the work of the force."""
+        """Energy of the contact, less the work of the force."""
         at = self.points(x)
         travel = self.travel(at, 1.0)
         depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)

@@ -21,7 +21,7 @@ SHAPES: dict[str, tuple[str, ...]] = {
 
 
 class Distance(NamedTuple):
-    """Of points, to second order."""
+    """Signed distance of points, with its first and second derivative."""
 
     value: jax.Array  # (…) [m]
     normal: list[jax.Array]  # 3 of (…): gradient, of length 1
@@ -56,7 +56,7 @@ def _normal_to(y: list[jax.Array], axis: Array) -> list[jax.Array]:
 
 
 def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Distance:
-    """From a point, or from an axis that y is normal to."""
+    """Distance from a sphere about a point, or from a cylinder about an axis normal to y."""
     # On the centre itself no direction is nearest: any will do, without a division by 0.
     r = jnp.sqrt(jnp.maximum(sum(c * c for c in y), 1e-30))
     n = [c / r for c in y]
@@ -66,7 +66,7 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
 
 
 def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Number) -> Distance:
-    """From its side, or from its tip where that is nearest; with a round tip, from a sharp cone further in."""
+    """Distance from a cone: from its side, or from its tip where that is nearer. A round tip lies on a sharp cone."""
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]
     along, tip, side = (
