@@ -138,7 +138,7 @@ def _square(upper: tuple) -> list[list]:
 
 
 def stress_at_constant(law: "Law", F: Matrix) -> Matrix:
-    """`stress` for an F that is data: its axes do not move, so plain differentiation by parameters is right and cheap."""
+    """`stress` for an F that is data: its axes do not move, so plain differentiation by parameters will do."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 

@@ -66,7 +66,7 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
 
 
 def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Number) -> Distance:
-    """Distance from a cone: from its side, or from its tip where that is nearer. A round tip lies on a sharp cone."""
+    """Distance from a cone: from its side or its tip. A round tip: from a sharp cone further in, less the radius."""
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]
     along, tip, side = (
