@@ -59,7 +59,7 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
 
 def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
-    """Radii over that of the rim, and weights of their moduli."""
+    """Radii over the radius of the rim, and weights of their moduli."""
     if plates == "cone":
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)

@@ -28,7 +28,7 @@ class Memory(NamedTuple):
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """m(nw) (1, n) of the series; or (2, n), of which the second counts by the loss tangent."""
+        """m(nw) (1, n) of the series; or (2, n), whose second row is multiplied by the loss tangent."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])

@@ -267,7 +267,7 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
-    """The closed form, and after it the fit through the simulation if asked for; the sweep that they fit."""
+    """The fit in closed form, and by default the fit through the simulation; then the sweep that they fit."""
     from fitting.fits import edges, instrument, viscoelastic
     from fitting.methods import generalised_maxwell
     from fitting.rigs import compression

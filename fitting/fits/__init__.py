@@ -1,1 +1,1 @@
-"""What is fitted: sweeps, curves, several tests, maps of stiffness, numbers of scenes."""
+"""The fits: sweeps, curves, several tests, maps of stiffness, numbers of scenes."""

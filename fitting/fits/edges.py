@@ -41,7 +41,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
 def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
     """Change of each parameter, by name, without the first and without the last half decade.
 
-    None in place of a part where too few points are left. Of a spectrum only the equilibrium modulus is compared.
+    None in place of a part where too few points are left. For a spectrum, only the equilibrium modulus is compared.
     """
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))

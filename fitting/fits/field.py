@@ -1,11 +1,11 @@
 """A map of stiffness from measured displacements: a smooth field of one number of the law, with its uncertainty.
 
-The number of an element is that of the scene times exp(m), m the mean of a nodal field (V,) with the prior of
+The number of an element is the scene's number times exp(m). m is the mean of a nodal field (V,) with the prior of
 `fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 is sought by L-BFGS in the whitened z, with gradients through
-the runs. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down to the
-number of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty is that of the
-Gauss-Newton Hessian I + J^T J: its largest eigenvalues by Lanczos, each product a run linearised and transposed
-(Bui-Thanh et al. 2013).
+the runs. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down to the number
+of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty comes from the
+Gauss-Newton Hessian I + J^T J. Lanczos iterations find its largest eigenvalues; each product takes a linearised run and
+its transpose (Bui-Thanh et al. 2013).
 """
 
 import time
@@ -38,7 +38,7 @@ _BOUND = 8.0
 
 
 class Field(NamedTuple):
-    """What was found."""
+    """The map and its uncertainty."""
 
     name: str
     log_factor: np.ndarray  # m (V,)

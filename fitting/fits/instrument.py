@@ -185,7 +185,7 @@ def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[s
 
 
 def _wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
-    """With one more source of error (P,), independent of the others."""
+    """The estimate with one more source of error (P,), independent of the others."""
     root = np.column_stack([estimate.root, direction])
     errors, correlation = errors_and_correlation(root)
     lost = ~np.isfinite(estimate.standard_errors)

@@ -248,8 +248,8 @@ SIMULATED, DIFFERENT = 12, 0.1
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
-    The density is that of the linear rig, with its recursion in time, times what the simulation adds to it at the
-    minimum (complex, one factor a frequency). Some draws are then simulated: `Posterior.simulated` has the largest
+    The density is that of the linear rig, with its recursion in time. A complex factor for each frequency adds the
+    effect of the simulation at the minimum. Some draws are then simulated: `Posterior.simulated` has the largest
     difference of their log density, so that the short cut is checked where it is used.
     """
     data, scales = viscoelastic.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)

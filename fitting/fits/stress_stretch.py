@@ -225,7 +225,7 @@ def _bogen() -> Candidate:
 
 
 def initial_modulus(curves: list[Curve]) -> float:
-    """Scale of the shear modulus [Pa] for starts: median of the stress over that of a unit neo-Hookean law."""
+    """Scale of the shear modulus [Pa] for starts: median of the stress over that of a law with mu = 1 Pa."""
     unit = laws.NeoHookean(mu=1.0, bulk=None)  # type: ignore[arg-type]  # the sample is incompressible
     ratios = []
     for c in curves:

@@ -2,7 +2,7 @@
 
 Tests are sweeps, relaxation, creep, and phase velocities of shear waves.
 
-Every test has noise of its own, whose size is found with the fit: the weights of a test are what it leaves over.
+Every test has noise of its own. Its size is found with the fit, from the residuals of the test.
 """
 
 import time
@@ -226,7 +226,7 @@ def _starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: 
 
 
 def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (relative) of the strengths of an equilibrium modulus and of modes, and their right-hand side."""
+    """Matrix and right-hand side of relative least squares for the equilibrium modulus and the modes."""
     if isinstance(test, TimeTest):
         modulus, at = time_tests.apparent(test)
         A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
@@ -240,7 +240,7 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
-    """G' and G'' [Pa]; of velocities alone nearly |G|, in place of G'."""
+    """G' and G'' [Pa]; for velocities alone, about |G| in place of G'."""
     if isinstance(test, Sweep):
         return test.storage, test.loss
     if test.attenuation is None:

@@ -134,7 +134,7 @@ def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer:
 
 
 def residuals_of(kind: Kind) -> Callable[..., Array]:
-    """Residuals of Prony modes, of a solid or a fluid; of NumPy and of JAX."""
+    """Residuals of Prony modes of a solid or a fluid, in NumPy or JAX."""
     return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
@@ -317,7 +317,7 @@ def _and_prior(r: jax.Array, u: jax.Array, kind: Kind) -> jax.Array:
 def simulated_residuals(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, torsion.Moduli]:
-    """Simulated less measured moduli over their deviations (2n,), rows of a prior below, and what was simulated.
+    """Simulated less measured moduli over their deviations (2n,), then rows of a prior; and the simulated moduli.
 
     Args:
         u: numbers of `kind`.
@@ -337,7 +337,7 @@ def with_jacobian(
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
     """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
 
-    The derivative is that of the linear rig, unless strain or inertia ask for that of the simulation. Gauss-Newton
+    The derivative is that of the linear rig; with large strain or inertia it is that of the simulation. Gauss-Newton
     goes to the same minimum with it, in a small part of the time (experiments/benchmarks/torsion_speed.py).
     """
     if simulation.density is not None or simulation.strain > LINEAR_STRAIN:

@@ -47,7 +47,7 @@ GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
 
 
 def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """Damped step, the gain of cost it promises, and that of the undamped step; one singular value decomposition."""
+    """The damped step, its expected gain of cost, and that of the undamped step; one singular value decomposition."""
     xp = host.arrays_of(J)
     scale = xp.maximum(xp.linalg.norm(J, axis=-2), 1e-300)
     U, s, Vt = xp.linalg.svd(J / scale[..., None, :], full_matrices=False)

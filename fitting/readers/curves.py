@@ -26,7 +26,7 @@ class Curve(NamedTuple):
 
     @property
     def driven(self) -> np.ndarray:
-        """The component of F that the stress works on; where it does not vary, the shear or stretch that does."""
+        """The component of F that the stress does work on; if it is constant, the shear or stretch that varies."""
         own, shear = self.F[:, *self.component], self.F[:, 0, 1]
         return own if np.ptp(own) > 0 else shear if np.ptp(shear) > 0 else self.F[:, 0, 0]
 

@@ -78,7 +78,7 @@ def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
-    """The points whose modulus exceeds what is not known of the instrument's inertia; the others become `grey`.
+    """The points whose modulus exceeds the uncertain part of the instrument's inertia; the others become `grey`.
 
     Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m]; or the raw phase.
     """

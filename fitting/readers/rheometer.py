@@ -67,7 +67,7 @@ def _si(path: str, table: Table, j: int, notes: list[str]) -> np.ndarray:
 
 
 def _fault(column: Column, written: float, value: float) -> tuple[str, str] | None:
-    """What is wrong with a value in SI, as the file writes it, and the remedy."""
+    """The fault of a value in SI, in the file's own words, and the remedy."""
     if not np.isfinite(value):
         problem, remedy = "is not finite", "remove the line"
     elif value <= 0:

@@ -111,7 +111,7 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 
 
 def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
-    """Raw torque, angle and phase in SI, of the rows of a table; a column with a gap is none."""
+    """Raw torque, angle and phase of the rows of a table, in SI. A column with a gap does not count."""
     found = {}
     for quantity, (place, factor) in raw_torque.known_columns(cells, unit_rows[-1] if unit_rows else []).items():
         values = [to_number(row[place], delimiter) if place < len(row) else None for row in rows]

@@ -44,7 +44,7 @@ def _decoded(path: Path, data: bytes) -> str:
 
 
 def find_delimiter(line: str) -> str:
-    """What separates the cells of a line: the most frequent of tab, semicolon, comma and bar, else spaces."""
+    """Delimiter of the cells of a line: the most frequent of tab, semicolon, comma and bar, else spaces."""
     best = max("\t;,|", key=line.count)
     return best if best in line else ("  " if "  " in line.strip() else " ")
 

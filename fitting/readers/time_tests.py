@@ -1,6 +1,6 @@
 """Relaxation and creep from files: time with modulus, compliance, strain and stress, torque and angle, force and path.
 
-The lines are read as those of sweeps are: plain CSV, TRIOS and RheoCompass text, units in the header or below it.
+Files have the forms of sweeps: plain CSV, TRIOS and RheoCompass text, units in the header or below it.
 """
 
 import os

@@ -1,7 +1,7 @@
 """Prony modes as material cards of FEBio, Abaqus, Ansys and SOFA, in SI units (m, kg, s, Pa).
 
 All cards are neo-Hookean with G0, the instantaneous shear modulus. The whole stress relaxes, as in the simulations here
-(part = "all"). A shear test says nothing of the bulk modulus: it is that of Poisson's ratio `POISSON`.
+(part = "all"). A shear test does not determine the bulk modulus, which follows from Poisson's ratio `POISSON`.
 """
 
 from pathlib import Path

@@ -117,7 +117,7 @@ def write(
 ) -> dict[str, Any]:
     """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others stand beside it); returns the JSON.
 
-    With a posterior its summary is in the JSON and its draws in posterior.csv.
+    If there is a posterior, its summary is in the JSON and its draws are in posterior.csv.
     """
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
@@ -186,7 +186,7 @@ def figure(sweep: Sweep, fits: list[Fit]) -> Any:
 
 
 def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
-    """Data, the closed form as a fine line and what was simulated on `top`, the relative differences on `rest`."""
+    """Draw the data, the closed form (a fine line) and the simulation on `top`, the relative differences on `rest`."""
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
@@ -282,7 +282,7 @@ def _parameter_rows(fit: Fit) -> list[str]:
 
 
 def _own_lines(fit: Fit) -> list[str]:
-    """Numbers of a model that is not made of modes; of a spectrum a summary, its strengths are in fit.json."""
+    """Numbers of a model without modes. A spectrum has a summary; its strengths are in fit.json."""
     p = fit.parameters
     assert p is not None
     rows = []

@@ -18,7 +18,7 @@ from liverjax.core.versions import versions
 
 
 def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> dict[str, Any]:
-    """Write both files, and the draws of a posterior; returns the JSON, whose names are those of a sweep's."""
+    """Write both files, and the draws of a posterior. Return the JSON; its names are those of a sweep."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors

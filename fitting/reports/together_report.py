@@ -28,7 +28,7 @@ QUANTITIES = {
 
 
 def write(out: Path, found: Together) -> dict[str, Any]:
-    """Write both files; returns the JSON, whose names are those of a sweep's, with `tests` beside them."""
+    """Write both files. Return the JSON; its names are those of a sweep, and `tests` is added."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
     errors = np.array([s.mean_relative_error for s in found.shares])

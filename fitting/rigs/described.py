@@ -177,7 +177,7 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
 
 
 def _glued_curve(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
-    """By finite elements, with what the mesh leaves out put right."""
+    """The curve by finite elements, corrected for the error of the mesh."""
     sizes, way = described.sizes, 1.0 if described.test == "tension" else -1.0
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:

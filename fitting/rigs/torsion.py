@@ -93,7 +93,7 @@ def cell_size_for(radius: float, height: float) -> float:
 def linear_cell_for(radius: float, height: float) -> float:
     """Cell [m] of about 100 nodes: enough for small strain without inertia, where `bias` holds all of the mesh's error.
 
-    What is left is of the order of the strain: at 1e-3 the moduli are those of `cell_size_for` to 1e-5
+    The rest of the error is of the order of the strain: at 1e-3 the moduli differ by 1e-5 from those of `cell_size_for`
     (experiments/benchmarks/torsion_speed.py).
     """
     return max((math.pi * radius**2 * height / 30) ** (1 / 3), radius / 4, height / 8)
@@ -256,8 +256,7 @@ def _coordinates(rig: Rig) -> int:
 def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
     """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the stress that stands.
 
-    Of a stress S that has stood for long, a motion changes the direction alone; the second part is that of the
-    unrelaxed S.
+    A motion only turns a stress S that has stood for long; the second part is that of the unrelaxed S.
     """
     mesh = rig.mesh
     rest = jnp.zeros(_coordinates(rig), mesh.points.dtype)
@@ -343,7 +342,7 @@ class _Oscillation(NamedTuple):
 
     @property
     def by_torque(self) -> bool:
-        """Whether the torque is given, and the angle solved for."""
+        """Whether the torque is given and the angle unknown."""
         return self.drive.by == "torque"
 
     @property

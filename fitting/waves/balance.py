@@ -66,7 +66,7 @@ class Balanced(NamedTuple):
     factor: np.ndarray  # (bandwidth + 1, I): L of S = L L^H, by diagonals
 
     def whitened(self, columns: scipy.sparse.csc_array, kind: type = np.complex128) -> np.ndarray:
-        """L^-1 of columns (I, k): their products with each other are those of S^-1."""
+        """L^-1 times columns (I, k): the products of two such columns are products with S^-1."""
         left, (bands, n) = columns.astype(kind).toarray(), self.factor.shape
         for a in range(0, n, bands):
             b = min(a + bands, n)

@@ -89,7 +89,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
 
 
 def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | None:
-    """Line, delimiter, and place and unit of every quantity of the first line that names what is needed."""
+    """Number and delimiter of the first line that names all needed quantities, with their places and units."""
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found: dict[str, tuple[int, str]] = {}

@@ -60,7 +60,7 @@ def arrays(path: Path) -> dict[str, Any]:
 
 
 def single(path: Path, name: str) -> np.ndarray:
-    """One array (nx, ny, nz): that of this name, or the only one of the file."""
+    """One array (nx, ny, nz): the array of this name, or the only one of the file."""
     found = arrays(path)
     if name in found:
         return np.asarray(found[name])

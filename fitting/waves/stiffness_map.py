@@ -3,9 +3,9 @@
 At frequency f the modulus of an element is g_f exp(c), g_f that of the whole organ and c = ln(size) + i (loss angle)
 the mean of a complex nodal field (P,), one field for all frequencies. Its real and its imaginary part have the prior of
 `fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number of
-equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. Of the
-deviations on this way, that of the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is
-sought by Gauss-Newton. The uncertainty is that of the Hessian H = I + J^H J/n, where n is chi^2 over what it should be.
+equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. The deviation
+with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by Gauss-Newton. The
+uncertainty comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value.
 """
 
 import time
@@ -33,7 +33,7 @@ STEPS, LAST = 8, 3e-4
 
 
 class WaveMap(NamedTuple):
-    """What was found."""
+    """The map and its uncertainty."""
 
     exponent: np.ndarray  # c (P,) complex at the corners
     sd: np.ndarray  # (P,) of its real and of its imaginary part

@@ -74,7 +74,7 @@ def _corner(mask: np.ndarray) -> np.ndarray:
 
 
 def _whole_bricks(mask: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
-    """Bricks (cells) of which every voxel is in the mask."""
+    """Bricks (cells) with every voxel in the mask."""
     kept = np.ones(cells, bool)
     for offset in np.ndindex(3, 3, 3):
         kept &= mask[_every_second(offset, cells)]
@@ -96,7 +96,7 @@ def _every_second(offset: tuple[int, ...], cells: tuple[int, ...]) -> tuple[slic
 
 
 def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
-    """Values (V,) of a field that is linear in the elements, from those of their corners."""
+    """Values (V,) of a field that is linear in the elements, from its values at their corners."""
     from liverjax.mesh.adjacency import PAIRS
 
     values = np.empty(body.mesh.number_of_nodes, corners.dtype)

@@ -203,7 +203,7 @@ def noise_of(field: WaveField) -> np.ndarray:
     """Standard deviation (F,) [m] of real and imaginary part of one component, from the data themselves.
 
     Fourth differences along the axis on which they are smallest: they hardly see a smooth wave, and their median is
-    blind to few bad voxels. What they see of a wave is (k h)^4 / 8 of its motion: 0.12 % at 20 voxels a wave, 4 % at 8.
+    blind to few bad voxels. A wave leaves (k h)^4 / 8 of its motion in them: 0.12 % at 20 voxels in a wave, 4 % at 8.
     NaN where no five voxels stand in a row.
     """
     out = np.full(len(field.frequencies), np.nan)

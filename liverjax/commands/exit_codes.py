@@ -13,7 +13,7 @@ from liverjax.core.errors import InputError
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
     """Run a command; return its exit code, 2 for unusable input and 130 for Ctrl-C.
 
-    What the command compiles is kept on disk for the next one, see `liverjax.core.programs`.
+    Compiled programs are kept on disk for the next command, see `liverjax.core.programs`.
 
     Args:
         run: runs the command with its options and returns 0 or 1.

@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _without_page(playing: "Playing", steps: int) -> int:
-    """Pull at the node farthest from what is held, by a tenth of the size; 1 if a step failed."""
+    """Pull at the node farthest from the held ones, by a tenth of the size; 1 if a step failed."""
     import numpy as np
 
     from liverjax.core import status

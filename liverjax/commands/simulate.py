@@ -35,7 +35,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Simulate the scene and write its results; 1 if a step failed, with what was computed kept."""
+    """Simulate the scene and write its results; 1 if a step failed. The steps before it are kept."""
     import numpy as np
     from tqdm import tqdm
 
@@ -123,7 +123,7 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
 
 
 def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: dict) -> None:
-    """Write the results in place of the parts of the run; print what it took and what to be cautious of."""
+    """Write the results in place of the parts of the run; print its statistics and cautions."""
     import numpy as np
 
     from liverjax.core.versions import versions

@@ -34,7 +34,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the rows; 1 if a row failed or the disk is full, with what was computed kept."""
+    """Run the rows; 1 if a row failed or the disk is full. Finished rows are kept."""
     import jax
     from tqdm import tqdm
 

@@ -1,1 +1,1 @@
-"""What every room needs: frozen structs, errors, status codes, names, files, versions, plotting."""
+"""Basics of all folders: frozen structs, errors, status codes, names, files, versions, plotting."""

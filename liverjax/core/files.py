@@ -31,7 +31,7 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
 def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
     """Write to the path that this gives: it stands beside `file` and becomes it at the end.
 
-    A kill leaves `file` as it was. An error does too, and removes what was written.
+    A kill leaves `file` as it was. An error leaves it as well, and removes the new file.
 
     Args:
         file: what is to be there whole or not at all.

@@ -1,6 +1,6 @@
 """Tables of time: numbers at increasing times. Between two times a table is linear, outside them it is constant.
 
-A table with one number a time is a factor of what it belongs to; one with three is the vector itself.
+A table with one number for each time is a factor of its load; a table with three is the vector itself.
 """
 
 from pathlib import Path

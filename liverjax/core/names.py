@@ -12,13 +12,13 @@ from liverjax.core.struct import replace
 
 
 class PathStep(NamedTuple):
-    """One step on the way to a number: from `owner` to what it holds at `key`."""
+    """One step on the way to a number: from `owner` to its content at `key`."""
 
     owner: Any  # a struct, tuple, dictionary or array
     key: Any  # field, place or entry
 
     def inside(self) -> Any:
-        """What the owner holds at the key."""
+        """The content of the owner at the key."""
         return getattr(self.owner, self.key) if dataclasses.is_dataclass(self.owner) else self.owner[self.key]
 
     def with_inside(self, value: Any) -> Any:
@@ -74,7 +74,7 @@ def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
 
 
 def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
-    """The keys that the first words of a path stand for, and the words after them."""
+    """The keys for the first words of a path, and the words after them."""
     word, rest = path[0], path[1:]
     if dataclasses.is_dataclass(thing):
         return _keys_of_struct(thing, path, refusal)

@@ -1,7 +1,7 @@
 """Compiled programs kept on disk, so that a machine compiles a program once: JAX's own cache, in a folder of its own.
 
 The folder is one of the user's cache directory. Its name has the releases, the sources and the processor, so no other
-release, checkout or machine trusts what is in it. `LIVERJAX_CACHE` names another folder, or is "off".
+release, checkout or machine uses its programs. `LIVERJAX_CACHE` names another folder, or is "off".
 """
 
 import hashlib
@@ -109,7 +109,7 @@ def _name() -> str:
 
 
 def _processor() -> str:
-    """Kind of the processor and what it can do: a program compiled for one may not run on another."""
+    """Kind of the processor and its features: a program compiled for one may not run on another."""
     said = f"{platform.system()} {platform.machine()} {platform.processor()}\n"
     try:
         first = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]

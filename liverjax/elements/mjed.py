@@ -132,7 +132,7 @@ def element_matrices(
 
 
 def of_nodes(order: int, corners: jax.Array) -> jax.Array:
-    """Element matrices (E, 9 n^2) of n nodes, from those of the corners of every point (Q, E, 144)."""
+    """Element matrices (E, 9 n^2) of n nodes, from the matrices (Q, E, 144) of the corners of every point."""
     Q, E = corners.shape[:2]
     c = jnp.asarray(basis(order).c, corners.dtype)
     K = jnp.einsum("akq,qekilj,blq->eaibj", c, corners.reshape(Q, E, 4, 3, 4, 3), c)

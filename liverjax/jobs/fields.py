@@ -1,7 +1,7 @@
 """Fields of a finished run, on demand: stress, strain, stretches, volume ratio, energy, the fluid's velocity.
 
-The positions of every step are put into the equations of that step again, so that memories (viscosity, fluid) are what
-they were; nothing is solved for.
+The positions of every step are put into its equations again, so memories (viscosity, fluid) are as in the run. Nothing
+is solved.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""A run in parts of some steps: what is finished stays on disk, and a killed run goes on from there.
+"""A run in parts of some steps: finished parts stay on disk, and a killed run goes on from there.
 
 Beside the output stands a folder with one file a part: its rows, and the state after its last step. A part begins with
 a tangent of its own, whether the run was stopped before it or not, so a resumed run ends with the same numbers.

@@ -13,7 +13,7 @@ from liverjax.mesh.tetrahedra import tet_mesh
 
 
 class Surface(NamedTuple):
-    """What is drawn."""
+    """The surface to draw."""
 
     before: np.ndarray  # (V, 3) [m]
     after: np.ndarray  # (V, 3) [m]

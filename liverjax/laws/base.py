@@ -193,7 +193,7 @@ class Sum(Law):
         return None if any(part is None for part in parts) else _added(parts)
 
     def volumetric_part(self):
-        """Sum of the summands'."""
+        """The sum over all laws."""
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
     def check(self):

@@ -16,7 +16,7 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 class ByRegion(Law):
     """Laws side by side, one for each subset of the elements.
 
-    Numbers of a law may be one an element of the whole body (E,); those of its subset count.
+    A number of a law may have one value for each element of the whole body (E,); the values of its subset count.
     """
 
     laws: tuple[Law, ...] = param("1", "one law for each subset", unnamed=True)

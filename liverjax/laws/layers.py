@@ -66,7 +66,7 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
 
 
 def _thinned(density: Any, start: jax.Array) -> jax.Array:
-    """Logarithm (Q, m) of the thickness stretch that makes the energy least; its derivatives are those of the root."""
+    """Logarithm (Q, m) of the thickness stretch with the least energy; it has the derivatives of the root."""
 
     def slope(u: jax.Array) -> jax.Array:
         return jax.jvp(density, (u,), (jnp.ones_like(u),))[1]

@@ -41,7 +41,7 @@ def summed(mesh: TetMesh, values: jax.Array) -> jax.Array:
 
 
 def interpolated(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """Values of a field, linear in every element, at its points: (E,) or (Q, E) from those of the vertices (V,)."""
+    """Values at the points, (E,) or (Q, E), of a field that is linear in every element, from the vertices (V,)."""
     corner = [taken(values, mesh.tetrahedra[:, a]) for a in range(4)]
     if mesh.order == 1:
         return (corner[0] + corner[1] + corner[2] + corner[3]) / 4

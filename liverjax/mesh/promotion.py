@@ -11,7 +11,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 
 def quadratic(mesh: TetMesh) -> TetMesh:
-    """The mesh with 10 nodes an element; of a quadratic mesh, the mesh itself.
+    """The mesh with 10 nodes in each element; a quadratic mesh is returned as it is.
 
     The vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`. A node set takes
     in the middles of the edges of all faces that it holds, so that a held face stays held.

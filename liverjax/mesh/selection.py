@@ -14,7 +14,7 @@ AXES = "xyz"
 def select(
     mesh: TetMesh, where: dict[str, float] | None = None, set: str | None = None, name: str = "where"
 ) -> np.ndarray:
-    """Node numbers that satisfy all conditions of `where`, or those of a node set of the mesh.
+    """Numbers of the nodes that satisfy all conditions of `where`, or of a node set of the mesh.
 
     Args:
         mesh: `TetMesh`.

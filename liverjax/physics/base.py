@@ -1,19 +1,19 @@
 """What a physics is: one frozen struct of numbers, and a second struct that acts during a step.
 
-A scene has a tuple of physics. Each says what it remembers between steps, and what acts during one:
+A scene has a tuple of physics. Each has a memory between steps, and parts that act during a step:
 
 * `begin(start)` -> memory: what it knows of the past at the beginning of a run, any pytree;
 * `freeze(memory, step)` -> what acts: everything that is constant during the step, put together once;
 * `advance(memory, acting, end)` -> memory: after an accepted step;
 * `check(...)`: refuses what no step can use, with one sentence.
 
-What acts is of one of three kinds. Step, tangent and energy are sums over them and know nothing else.
+The acting parts are of three kinds. Step, tangent and energy are sums over them and know nothing else.
 
 * `Solid` and `VolumeStress` act in elements, before assembly: stress and blocks of the stiffness.
 * `NodalForce` acts at nodes, after assembly: forces and blocks of the diagonal.
 
-A `VolumeStress` has pressures at the nodes, which the mixed system of positions and pressures solves for
-(`liverjax.solvers.mixed_system`).
+A `VolumeStress` has pressures at the nodes. The mixed system of positions and pressures solves them
+(`liverjax.simulation.mixed_system`).
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ class Tied(Protocol):
         """Put the numbers of the motions at positions x (V, 3) into the field (V, 3). `placed` is the inverse."""
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) that a field stands for, at part s of the step."""
+        """Positions (V, 3) from a field, at part s of the step."""
 
 
 class Free(NamedTuple):
@@ -146,7 +146,7 @@ class VolumeStress:
         raise TypeError(f"{type(self).__name__} lacks scalars(mesh, pressure, F)")
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Energy [J] at volume ratios J (E,), pressures solved for."""
+        """Energy [J] at volume ratios J (E,), with the pressures in balance."""
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, J)")
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
@@ -178,7 +178,7 @@ class NodalForce:
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached | None:
-        """Stiffness at x of elements of its own between nodes, beside that of `stiffness`; None: it has none."""
+        """Stiffness at x of further elements between nodes, added to `stiffness`; None: there are none."""
         return None
 
     def predicted(self) -> jax.Array | None:
@@ -230,7 +230,7 @@ class Physics:
         return None
 
     def freeze(self, memory: Any, step: Step) -> Any:
-        """What acts during a step; None: nothing acts."""
+        """The part that acts during a step; None: nothing acts."""
         return None
 
     def advance(self, memory: Any, acting: Any, end: End) -> Any:

@@ -29,7 +29,7 @@ class Elastic(Solid):
     law: Law = param("1", "the law")
 
     def stress(self, F: Matrix) -> Matrix:
-        """By the hand-derived terms."""
+        """The hand-derived terms."""
         return invariant_terms.first_piola(self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:

@@ -83,7 +83,7 @@ class Moving(NodalForce):
         return self.mass[:, None] * self.kinematics(x)[1]
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """m a . a dt^2/(2k), of which the force is the gradient."""
+        """m a . a dt^2/(2k); the force is its gradient."""
         a = self.kinematics(x)[1]
         return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(self.mass[:, None] * a * a)
 

@@ -89,7 +89,7 @@ class Porosity(Physics):
         return Fluid(end.pressure, determinant(end.F), memory.J if self.scheme == "lagged" else None)
 
     def bulk_modulus(self) -> Number:
-        """Of the drained sponge."""
+        """Bulk modulus of the drained sponge."""
         return self.bulk
 
     def output(self, memory: "Fluid") -> dict[str, jax.Array]:

@@ -34,7 +34,7 @@ class Displaced:
 
 
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
-    """1 where a degree of freedom is solved for, 0 where it is held or prescribed: (V, 3)."""
+    """Degrees of freedom (V, 3): 1 if unknown, 0 if held or prescribed."""
     if not any(isinstance(condition.nodes, jax.core.Tracer) for condition in (*fixed, *displaced)):
         return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # no small programs to compile
     mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
@@ -45,7 +45,7 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
 
 
 def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
-    """The same on the host (V, 3), for checks: True where a degree of freedom is solved for."""
+    """The same on the host (V, 3), for checks: True if unknown."""
     free = np.ones(mesh.points.shape, bool)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:

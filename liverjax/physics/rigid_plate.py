@@ -152,7 +152,7 @@ class Plate(NamedTuple):
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) that a field stands for."""
+        """Positions (V, 3) from a field."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)

@@ -63,7 +63,7 @@ class History(NamedTuple):
 
 
 class Recall(NamedTuple):
-    """What the memory contributes to a step, constant during its Newton iterations."""
+    """Contribution of the memory to a step; constant during Newton's iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
     now: Any  # 1 - sum_k a_k, () or with the axes of the points
@@ -240,7 +240,7 @@ def blocks(
 
 
 def relaxing(prony: Prony, law: Law) -> Law:
-    """What relaxes of a law: all of it, or its isochoric part."""
+    """The part of a law that relaxes: all of it, or its isochoric part."""
     return law if prony.part == "all" else isochoric_part(law)
 
 
@@ -256,7 +256,7 @@ class Viscoelasticity(Physics):
         return initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
 
     def freeze(self, memory: History, step: Step) -> "Viscoelastic":
-        """The law beside what is remembered."""
+        """The law and its memory for the step."""
         return Viscoelastic(law=self.law, prony=self.prony, recall=recall(self.prony, memory, step.dt), dt=step.dt)
 
     def advance(self, memory: History, acting: "Viscoelastic", end: End) -> History:
@@ -291,7 +291,7 @@ class Viscoelastic(Solid):
         return W if rest is None else W + rest.strain_energy(rest.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix]:
-        """What relaxes with its weight, what does not, and minus the memory."""
+        """The relaxing part with its weight, the part that does not relax, and minus the memory."""
         rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
         weighted = [(self.recall.now, relaxing(self.prony, self.law))]
         return weighted if rest is None else [*weighted, (1.0, rest)], scale_matrix(-1.0, self.recall.past)

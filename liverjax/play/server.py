@@ -25,7 +25,7 @@ class PlayServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Of the page."""
+        """Address of the page."""
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
 
@@ -75,7 +75,7 @@ class Answer(BaseHTTPRequestHandler):
 
 
 def stepped(playing: Playing, asked: dict[str, Any]) -> Playing:
-    """The body after the step that a page asked for."""
+    """The body after a step that a page requested."""
     return pulled(playing, asked.get("node"), asked.get("to"), asked.get("stiffness", playing.stiffness))
 
 

@@ -1,14 +1,14 @@
 """How far a reduced run is from the full model: the residual on the whole mesh, and the motion that it would cause.
 
-The reduced motion is put into the equations of the full model, step by step, with the memories of all elements. What is
-out of balance there, r, drives the error e. To first order e follows the linear equations of the same body,
+The reduced motion is put into the equations of the full model, step by step, with the memories of all elements. The
+forces out of balance, r, drive the error e. To first order e follows the linear equations of the same body,
 
     M a(e) + K e - memory(e) = -r,
 
 with the stiffness K of the reference shape and the same recursions in time. K and M are factorised once a run, so a
 step costs the forces of the full mesh and one solve, and no iterations of Newton's method. In the static case the
-energy norm of e is the dual norm of r. What is left out is of second order in e, and the change of the stiffness by the
-deformation.
+energy norm of e is the dual norm of r. The estimate leaves out terms of second order in e and the change of the
+stiffness by the deformation.
 """
 
 from typing import Any, NamedTuple

@@ -70,7 +70,7 @@ def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
 
 
 def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
-    """The physics of the full model's elements, its law with the numbers of the sampled points."""
+    """The physics in the elements of the full model; its law has the numbers of the sampled points."""
     E = scene.mesh.number_of_elements
     law = regions.law_of_elements(scene.law, scene.region, E)
     elements = model.points % E

@@ -158,7 +158,7 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: _Equations, at: _ReducedIterate) -> _ReducedIterate:
-    """One iteration with the inverse at hand, which then takes up what was seen of the forces (Broyden 1965)."""
+    """One iteration with the inverse at hand, which is then updated with the new forces (Broyden 1965)."""
     dq = at.inverse @ at.r
     dF = jnp.tensordot(dq, e.model.slopes, axes=1)
     # Halved until no sampled point is inverted, six times at most.
@@ -278,7 +278,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
-    """(coordinates, memory, motion), what is given in a step -> those after it, and what the result has."""
+    """One step: (coordinates, memory, motion) before it and its loads -> the same after it, and a row of the result."""
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None

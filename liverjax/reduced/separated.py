@@ -151,7 +151,7 @@ def _displacements(scene: Scene, names: tuple[str, ...], rows: np.ndarray) -> np
 def _terms(
     known: np.ndarray, shape: tuple[int, ...], tolerance: float, most: int
 ) -> tuple[np.ndarray, list[np.ndarray], float]:
-    """Products of the terms at the grid (N, M), their factors, each (M, points), and what is left out.
+    """Products of the terms at the grid (N, M), their factors, each (M, points), and the part left out.
 
     Args:
         known: displacements at the grid (N, 3 V), times the roots of the volumes.
@@ -177,7 +177,7 @@ def _terms(
 
 
 def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
-    """Unit factors of the best product near a tensor, of all axes but the last."""
+    """Unit factors of the product that is nearest to a tensor, for all axes except the last."""
     n = tensor.ndim
     # Begins with the largest singular vectors of each axis.
     factors = [np.linalg.svd(np.moveaxis(tensor, a, 0).reshape(tensor.shape[a], -1))[0][:, 0] for a in range(n - 1)]

@@ -61,7 +61,8 @@ def reduce_scene(
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
     """Modes (n, V, 3) that leave out at most `tolerance` of fields u (N, V, 3), in the norm of lumped volumes (V,).
 
-    By the eigenvalues of the fields' products (Sirovich 1987), which have half of the digits: 1e-7 is the least.
+    They come from the eigenvalues of the fields' products (Sirovich 1987), which have half of the digits: the least
+    tolerance is 1e-7.
     """
     flat = (u * np.sqrt(volumes)[:, None]).reshape(len(u), -1)
     size, vectors = np.linalg.eigh(flat @ flat.T)

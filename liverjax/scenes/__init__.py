@@ -1,1 +1,1 @@
-"""A scene: what it is made of, read from a file, checked."""
+"""Scenes: their parts, their files, their checks."""

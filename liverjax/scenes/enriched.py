@@ -1,6 +1,6 @@
 """The same scene in the next richer space of functions: quadratic elements for linear ones, cubic for quadratic ones.
 
-What holds, moves and loads the body is the same. Positions and numbers of a node between others follow from theirs.
+Supports, motions and loads stay the same. Positions and numbers of a node between others follow from theirs.
 """
 
 import jax
@@ -40,7 +40,7 @@ def _quadratic_mesh(scene: Scene) -> Scene:
 
 
 def _between(mesh: TetMesh, moved: Displaced, nodes: Indices) -> Displaced:
-    """With the middles of edges moved by the mean of their ends."""
+    """The motion with the middles of edges moved by the mean of their ends."""
     if moved.by is None or np.ndim(moved.by) == 1:
         return replace(moved, nodes=nodes)
     by = jnp.zeros((mesh.number_of_vertices, 3), mesh.points.dtype).at[moved.nodes].set(moved.by)

@@ -30,7 +30,7 @@ POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
 @struct
 class Region:
-    """Elements with other numbers than those of the scene, or with another law; a later region wins where two meet."""
+    """Elements with other numbers than the scene, or with another law. Where two regions meet, the later one counts."""
 
     elements: Indices = param("1", "element numbers (n,)")
     law: dict[str, Any] | Law | None = param(

@@ -68,7 +68,7 @@ class Solve:
 
 @struct
 class Scene:
-    """What `simulate` runs; parts that a scene lacks are None or empty and cost nothing."""
+    """Input of `simulate`. Parts that a scene lacks are None or empty and cost nothing."""
 
     mesh: TetMesh = param("1", "the body")
     law: Law = param("1", "its hyperelastic law")

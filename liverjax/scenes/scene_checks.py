@@ -1,4 +1,4 @@
-"""What is refused of a scene, in one sentence each, before anything is compiled."""
+"""Checks of a scene before anything is compiled; each refusal is one sentence."""
 
 import warnings
 
@@ -123,7 +123,7 @@ def _own_volumes(scene: Scene) -> None:
 
 
 def check_bounds(scene: Scene) -> None:
-    """Refuse numbers out of bounds, but for those of the mesh (`check_mesh`); traced ones pass. Compiles nothing.
+    """Refuse numbers out of bounds. Traced ones pass; `check_mesh` looks at the mesh. Compiles nothing.
 
     Raises:
         InputError: one sentence with the number's dotted name, value, bound and remedy.

@@ -112,7 +112,7 @@ def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
 
 
 def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
-    """What [output] of a scene file asks for: names of fields, and whether reactions are written as a table.
+    """The [output] table of a scene file: names of fields, and whether reactions are written as a table.
 
     Raises:
         InputError: keys or values of another kind.
@@ -127,7 +127,7 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
 
 
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
-    """What tables of `liverjax.physics.registry` describe: the first kind that knows all keys of a table."""
+    """The physics of tables in `liverjax.physics.registry`: for each table the first kind that knows all its keys."""
     for section in dict.fromkeys(p.section for p in NAMED):
         for k, table in enumerate(_tables(content, section)):
             name, own = f"{section}.{k}", set(table) - {"where", "set"}
@@ -139,7 +139,7 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
 
 
 def _with_paths(content: Any, folder: Path) -> Any:
-    """With files of histories, surfaces and of a reduced model relative to the folder of the scene file."""
+    """The content with paths (histories, surfaces, a reduced model) relative to the folder of the scene file."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]
     if not isinstance(content, dict):

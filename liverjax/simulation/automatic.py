@@ -62,7 +62,7 @@ def thinnest(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) ->
 
 
 def qualities(points: np.ndarray, tetrahedra: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Quality (E,) of elements: volume over that of the regular one with the same mean square edge."""
+    """Quality (E,) of elements: volume over the volume of a regular one with the same mean square edge."""
     corners = points[tetrahedra]
     edges = np.stack([corners[:, a] - corners[:, b] for a in range(4) for b in range(a)], axis=1)
     length = np.sqrt(np.mean(np.sum(edges**2, axis=2), axis=1))

@@ -18,7 +18,7 @@ from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient
 
 
 class State(NamedTuple):
-    """What one step passes to the next."""
+    """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m]
     memories: tuple  # one of every physics, in order; None where it remembers nothing
@@ -32,7 +32,7 @@ class Sizes(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """What is constant during a step."""
+    """The equations of a step; constant during it."""
 
     scene: Scene
     physics: tuple[Physics, ...]
@@ -153,7 +153,7 @@ def equations(scene: Scene, state: State, k: Any, sizes: Sizes | None = None) ->
 
 
 def positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
-    """Positions (V, 3) of unknowns q (3 V,) and of what is held at part s of the step."""
+    """Positions (V, 3) from unknowns q (3 V,) and the held nodes, at part s of the step."""
     held, solve, free = e.mesh.points, e.scene.solve, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
     if e.scene.displaced:

@@ -1,4 +1,5 @@
-"""What reverse mode keeps of a run: the state and the root of every step, or a few states; it computes the rest again.
+"""Checkpoints of reverse mode: it keeps the state and the root of every step, or a few states, and computes the rest
+again.
 
 The root of a step (its name is set in `liverjax.solvers.step_cutting`) is kept. The derivative evaluates forces and
 tangent at the root again, but does not repeat Newton's iterations. If fewer states than steps are kept (Griewank and
@@ -41,13 +42,13 @@ def lengths(steps: int, kept: int) -> tuple[int, int, int]:
 
 
 def one_step(step: Callable) -> Callable:
-    """`step`, of which reverse mode keeps only the arguments and the root."""
+    """`step`; reverse mode keeps only its arguments and its root."""
     policy = jax.checkpoint_policies.save_only_these_names(ROOT)
     return jax.checkpoint(step, policy=policy, prevent_cse=False)
 
 
 def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
-    """What `step` (carry, k) gives beside the carry, stacked over `numbers` (T,); see the module for `kept`."""
+    """The outputs of `step` (carry, k) beside the carry, stacked over `numbers` (T,); the module explains `kept`."""
     steps = len(numbers)
     if kept >= steps:
         return jax.lax.scan(step, start, numbers)[1]

@@ -1,4 +1,4 @@
-"""Derivatives of what a run leads to, by any number of a scene: with what they cost in memory, and a code.
+"""Derivatives of a number from a run by any number of its scene, with a prediction of memory and a status.
 
     found = lj.value_and_gradient(lambda result: loss(result.positions), scene, {"law.mu": 770.0})
 

@@ -1,12 +1,13 @@
-"""What the mesh leaves out of a run: one linearised solve a step in the next richer space of functions.
+"""Error of a run by its mesh: one linearised solve in each step in the next richer space of functions.
 
 The positions of a step, with nothing added, are put into quadratic elements (those of quadratic elements into cubic
-ones). What is out of balance there, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot show.
+ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot show.
 A reaction changes by its derivative along du. Memories of viscosity, fluid and inertia go along with the richer run.
 
-The estimate is hierarchical (Bank and Smith 1993). Of linear elements du is 0.8 to 1.3 of the error in small and in
-moderate strain, and adding it leaves about a tenth. Of quadratic ones the cubic functions show about two thirds of the
-error, so du counts 1.5 times. It knows nothing of the shape of the body, of time steps, nor of the fluid's own space.
+The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
+moderate strain; with du added, about a tenth is left. For quadratic ones the cubic functions show about two thirds of
+the error, so du counts 1.5 times. It knows nothing of the shape of the body, of time steps, nor of the fluid's own
+space.
 """
 
 from collections.abc import Callable

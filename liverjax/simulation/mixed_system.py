@@ -72,7 +72,7 @@ def _pressures(mesh: TetMesh, flow: Flow | None, compliance: jax.Array, balance:
 def eliminated_points(
     mesh: TetMesh, flow: Flow | None, A: PointMatrix, motion: Any, exactly: bool = False
 ) -> tuple[jax.Array, ...]:
-    """The same of quadratic elements: forces, columns (V,), of a motion (V,) that changes pressures too."""
+    """The same for quadratic elements: forces, columns (V,), of a motion (V,) that changes pressures too."""
     assert A.pressures is not None
     balance = -point_matrix.volume_changes(mesh, A, motion)
     dP = _pressures(mesh, flow, A.pressures.diagonal[0][0], balance, exactly)
@@ -105,7 +105,8 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Any) -> jax.Array:
     """Stiffness [Pa/m^3] of every point against a change of its volume where nothing flows between elements.
 
-    C is the matrix of the pressures: its diagonal shared out by volume, so that the elements' sum is no softer.
+    C is the matrix of the pressures. Its diagonal is shared out by volume, so that the sum of the elements is not
+    softer.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights

@@ -1,4 +1,4 @@
-"""What rigid obstacles feel of a run: the force on each, and how deep the surface is in it."""
+"""Forces on the rigid obstacles of a run, and the depth of the surface in each."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class ObstacleForces(NamedTuple):
-    """Of each obstacle of a scene, in their order, at every step."""
+    """Force and depth of each obstacle of a scene, in their order, at every step."""
 
     force: jax.Array  # (obstacles, T, 3) [N] of the body on the obstacle
     depth: jax.Array  # (obstacles, T) [m] largest depth of the surface in it

@@ -26,7 +26,7 @@ from liverjax.solvers.problem import StepStatistics
 
 @struct
 class Result:
-    """What a run leaves; arrays over the T steps, all of them differentiable but the statistics."""
+    """Result of a run: arrays over the T steps. All but the statistics are differentiable."""
 
     times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
     positions: jax.Array = param("m", "(T, V, 3)")

@@ -282,7 +282,7 @@ def _flat(e: Equations, columns: Any) -> jax.Array:
 
 
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
-    """K as a function of flat vectors (3 V,); pressures that depend on motion are nearly solved for, or `exactly`."""
+    """K as a function of flat vectors (3 V,). Pressures that follow motion are solved roughly, or `exactly`."""
     A, volume, n = K.matrix, _coupled(e), 3 * e.mesh.number_of_nodes
     following = [a for a in e.nodal if not a.conservative]
 
@@ -337,7 +337,7 @@ def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
 
 
 def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int) -> tuple[jax.Array, jax.Array]:
-    """Solution of K x = b with pressures solved for, for derivatives, and its residual over |b|; no load follows."""
+    """Solve K x = b with the pressures, for derivatives. Return x and its residual over |b|."""
     if e.scene.solve.linear_solver == "direct":
         x = _factorised(e, K, b)
         return x, true_residual(product(e, K, exactly=True), b, x)

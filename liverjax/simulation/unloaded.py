@@ -1,7 +1,7 @@
 """The shape before the load: reference positions from which the loads lead to the given ones.
 
-The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions; of
-quadratic elements the middles of its edges follow from these, since elements are straight there, and move by
+The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions.
+Quadratic elements are straight there, so the middles of their edges follow from the vertices; they move by
 displacements of their own. What must vanish are the out-of-balance forces of the body with reference shape X at X + u.
 For small u their derivative is the stiffness K, so K's preconditioner serves Newton's method with BiCGSTAB.
 

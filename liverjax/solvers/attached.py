@@ -35,7 +35,7 @@ def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
 
 
 def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
-    """A matrix of the vertices with elements added, as far as their vertices are neighbours in the body."""
+    """A matrix of the vertices with elements added where their vertices are neighbours in the body."""
     if not attached:
         return A
     rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
@@ -69,7 +69,7 @@ def symmetric_part(A: Attached) -> Attached:
 
 
 def definite(A: Attached) -> Attached:
-    """Without negative eigenvalues."""
+    """The matrix without its negative eigenvalues."""
     n, m = A.nodes.shape
     K = jnp.moveaxis(A.blocks.reshape(3 * n, 3 * n, m), -1, 0)
     size, axes = jnp.linalg.eigh(0.5 * (K + jnp.swapaxes(K, 1, 2)))

@@ -87,7 +87,8 @@ def added(a: Block, b: Block) -> Block:
 
 
 def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None = None) -> Block:
-    """Inverse 3 x 3 blocks; unit rows where `mask` (V, 3) is 0, that of the mean where one is not positive definite.
+    """Inverse 3 x 3 blocks: unit rows where `mask` (V, 3) is 0, the inverse mean where a block is not positive
+    definite.
 
     Along `normals` (V, 3), unit vectors or 0, nothing moves: their part of a block is its mean.
     """

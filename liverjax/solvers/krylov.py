@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 
 class LinearStatistics(NamedTuple):
-    """What one solve took: iterations and residual."""
+    """Statistics of one solve: iterations and residual."""
 
     iterations: jax.Array
     residual: jax.Array  # |b - A x| / |b|, recomputed at the end
@@ -140,10 +140,9 @@ def differentiable_solve(
 ) -> jax.Array:
     """A solve as a linear map of `b`: its derivatives are solves as well, not derivatives of the iterations.
 
-    Conjugate gradients for a symmetric A, positive definite as theirs; otherwise BiCGSTAB. NaN where the true residual
-    stays above 6e-6 |b| (float32: 1e-3) and ten times the tolerance: no wrong solution passes for one. With the
-    `diagonal` D of an A whose entries beside it add up to no more, a solution that iterations found is as good as its
-    digits allow where the residual is below 4 eps |D x|: x rounded to them has eps |D x|.
+    It takes conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. NaN where the true residual
+    stays above 6e-6 |b| (float32: 1e-3) and ten times the tolerance: no wrong solution passes for one. A residual below
+    4 eps |D x| is accepted too, with the `diagonal` D of a diagonally dominant A: rounding x alone causes eps |D x|.
     """
     symmetric, solver, diagonal = known
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients

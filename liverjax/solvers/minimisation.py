@@ -28,7 +28,7 @@ _UNTANGLED = 1e-4
 
 
 class Minimum(NamedTuple):
-    """What was reached."""
+    """The point reached."""
 
     q: jax.Array
     code: jax.Array

@@ -19,7 +19,7 @@ from liverjax.solvers.krylov import (
 
 
 class NewtonStatistics(NamedTuple):
-    """What one solve took; every field is an array (under vmap, one entry for each run)."""
+    """Statistics of one solve; every field is an array (under vmap, one entry for each run)."""
 
     status: jax.Array
     iterations: jax.Array

@@ -12,7 +12,7 @@ LINEAR_TOLERANCE = 5e-2
 
 
 class StepStatistics(NamedTuple):
-    """What one step took; every field an array (one a lane under vmap)."""
+    """Statistics of one step; every field is an array (under vmap, one entry for each run)."""
 
     status: jax.Array
     iterations: jax.Array  # of Newton, all parts together

@@ -1,9 +1,10 @@
 """Newton's problem along a load: the solution is followed from the last equilibrium, in parts where it fails in one go.
 
-The residual r(q, s) has the loads and prescribed motion of a step's end at s = 1, of its beginning at s = 0. What is
-out of balance at the beginning (inertia, a fluid) goes in proportion: r - (1 - s) r(start, 0) is 0 where a step begins.
-Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted through the tangent,
-never jumped to. A part that fails is halved. Only the root at s = 1 counts, and derivatives are those of the root.
+The residual r(q, s) has the loads and prescribed motion of a step's end at s = 1, of its beginning at s = 0. Forces
+that are out of balance at the beginning (inertia, a fluid) are reduced in proportion: r - (1 - s) r(start, 0) is 0
+where a step begins. Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted
+through the tangent, never jumped to. A part that fails is halved. Only the root at s = 1 counts, and derivatives are
+those of the root.
 """
 
 from functools import partial
@@ -91,8 +92,8 @@ def solve(
 ) -> tuple[jax.Array, StepStatistics, Kept]:
     """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative.
 
-    Returns the root, what it took, and the tangent for the next step; `kept` is that of the last, `near` one of which
-    derivatives may take parts.
+    Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, `near`
+    one for derivatives.
     """
     start = jax.lax.stop_gradient(start)
     guess = None if guess is None else jax.lax.stop_gradient(guess)

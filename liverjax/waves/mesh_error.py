@@ -19,8 +19,8 @@ def harmonic_mesh_error(
     """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
 
     Quadratic elements are solved where the result is of linear ones, cubic where it is of quadratic ones. Too few
-    elements a wave show as an error of the size of the motion: the phase of the waves is wrong then. The cost is that
-    of a mesh with eight (quadratic: three) times the unknowns.
+    elements a wave show as an error of the size of the motion: the phase of the waves is wrong then. It costs as much
+    as a mesh with eight times the unknowns (quadratic elements: three times).
 
     Args:
         scene, factors, about, motion: as of `harmonic`.

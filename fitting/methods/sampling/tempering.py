@@ -116,7 +116,7 @@ def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _moved(
     density: Density, start: _Particles, power: float, limit: float, rng: np.random.Generator
 ) -> tuple[_Particles, int, float, float]:
-    """The particles after moves that leave the tempered density as it is; moves, acceptance, what is remembered."""
+    """The particles after moves that do not change the tempered density; then moves, acceptance and correlation."""
     half = len(start.u) // 2
     halves = slice(0, half), slice(half, 2 * half)
     now = _Particles(*(field.copy() for field in start))

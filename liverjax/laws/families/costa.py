@@ -43,7 +43,7 @@ class Costa(Law):
         return sum(terms[:3]) + 2 * sum(terms[3:])
 
     def green_energy(self, E):
-        """By expm1: no cancellation at rest."""
+        """The energy by expm1, so that nothing cancels at rest."""
         return 0.5 * self.c * jnp.expm1(self._exponent(E))
 
     def green_derivatives(self, E):

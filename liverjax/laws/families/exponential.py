@@ -30,7 +30,7 @@ class Exponential(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """By expm1: no cancellation at rest."""
+        """The energy by expm1, so that nothing cancels at rest."""
         return self.c1 * jnp.expm1(self.c2 * X)
 
     def stretch_derivatives(self, X):

@@ -27,7 +27,7 @@ class Logarithmic(Law):
         return (self.alpha,)
 
     def stretch_energy(self, X):
-        """By log1p: no cancellation at rest."""
+        """The energy by log1p, so that nothing cancels at rest."""
         return -self.c1 * jnp.log1p(-self._filled(X))
 
     def _filled(self, X):

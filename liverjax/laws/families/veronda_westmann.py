@@ -22,7 +22,7 @@ class VerondaWestmann(Law):
     invariants: ClassVar = ("I1", "I2", "J")
 
     def isochoric_energy(self, I1, I2):
-        """By expm1: no cancellation at rest."""
+        """The energy by expm1, so that nothing cancels at rest."""
         return self.c1 * jnp.expm1(self.c2 * (I1 - 3)) - 0.5 * self.c1 * self.c2 * (I2 - 3)
 
     def isochoric_derivatives(self, I1, I2):

@@ -87,7 +87,7 @@ def _state_of_law(law: "Law", F: Matrix) -> State:
 
 
 def state_of(scalars: Scalars, F: Matrix) -> State:
-    """An energy of I1, I2 and J at F, of which the derivatives are known."""
+    """The state of an energy of I1, I2 and J at F with known derivatives."""
     return _state(scalars, F, ())
 
 

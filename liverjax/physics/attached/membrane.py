@@ -1,8 +1,8 @@
 """A membrane on a part of the surface: a capsule that is stretched with it, and that bends without force.
 
 Its law acts in its plane. The stress across it is 0 (plane stress). A law with an isochoric part is taken as
-incompressible: the thickness is stretched by 1 over the change of area. Of another law the stretch of the thickness is
-solved for, at every point.
+incompressible: the thickness is stretched by 1 over the change of area. For another law, the stretch of the thickness
+is an unknown at every point.
 
 Source: Holzapfel, Eberlein, Wriggers and Weizsaecker 1996, "A new axisymmetrical membrane element for anisotropic,
 finite strain analysis of arteries", and Bonet and Wood 2008, section 6.6 (plane stress).

@@ -53,7 +53,7 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse besides: no force, a given motion, a history of vectors, and a way without a body in it."""
+        """Refuse also no force, a given motion, a history of vectors, and an obstacle that never meets the body."""
         super().check(mesh, name)
         history.check(self.times, self.history, name, (1,))
         if self.by is not None:
@@ -87,7 +87,7 @@ class PressedObstacle(Obstacle):
         return self if self.history is not None else replace(self, times=jnp.zeros(1), history=jnp.zeros(1))
 
     def direction(self) -> jax.Array:
-        """Of the force (3,)."""
+        """Direction of the force (3,)."""
         force = jnp.asarray(self.force, float)
         return force / jnp.linalg.norm(force)
 

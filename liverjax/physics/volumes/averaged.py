@@ -79,7 +79,7 @@ class Averaged(VolumeStress):
         return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """The pressure of an element, which has no slope where those of the nodes are given."""
+        """The pressure of an element; it has no slope, since the pressures of the nodes are given."""
         p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 

@@ -136,7 +136,7 @@ class Mixed(VolumeStress):
         return integrals(mesh, strain(self.kind, J)) - self.compliance(mesh, pressure)
 
     def compliance(self, mesh: TetMesh, pressure: jax.Array) -> jax.Array:
-        """Integrals (V,) [m^3] of p's functions times p/(K - gamma), and what holds those of linear elements."""
+        """Integrals (V,) [m^3] of p's functions times p/(K - gamma); for linear elements with the stabilisation."""
         if mesh.order > 1:
             return gathered(mesh, mesh.weights * interpolated(mesh, pressure) / self.rest)
         own = [taken(pressure, mesh.tetrahedra[:, a]) for a in range(4)]
