@@ -98,10 +98,10 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     print(f"gradients keep and work with about {kept:.0f} MB", file=sys.stderr)
     length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10
     file = options.out / "progress.h5"
-    limit, resume = options.iterations, options.resume
     bar, told = cost_bar("iterations")
+    how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
     with bar:
-        found = field.estimate(problem, options.name, length, limit, file=file, resume=resume, progress=told)
+        found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes)
     print(field_report.table_of_field(found))
     content = _files(options) | {"map": field_report.of_field(found)}

@@ -148,16 +148,24 @@ class _Search:
 _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")
 
 
+class MapOptions(NamedTuple):
+    """How a map is searched for and kept."""
+
+    max_iterations: int = 60  # of L-BFGS for each weight
+    modes: int = 60  # the most directions of the field that the uncertainty looks at
+    file: Path | None = None  # HDF5 file for the point of every iteration; None: nowhere
+    resume: bool = False  # begin from that file if it is there
+    #: Called after each iteration: number of the weight, chi^2 over the number of components.
+    progress: Callable[[int, float], None] = lambda weight, chi2: None
+    mesh_error: bool = True  # estimate the error by the meshes, and how far it moves the field (`mesh_bias`)
+
+
 def estimate(
     problem: Problem,
     name: str = "law.mu",
     length: float = 0.03,
-    max_iterations: int = 60,
-    modes: int = 60,
-    file: Path | None = None,
-    resume: bool = False,
-    progress: Callable[[int, float], None] = lambda weight, chi2: None,
-    mesh_error: bool = True,
+    options: MapOptions = MapOptions(),
+    **changes: Any,
 ) -> Field:
     """The field of `name` that explains the data.
 
@@ -165,12 +173,8 @@ def estimate(
         problem: scenes of one mesh and what was measured.
         name: dotted name of a positive number of the law; what the scenes have there is where the field begins.
         length: correlation length of the prior [m].
-        max_iterations: of L-BFGS for each weight.
-        modes: the most directions of the field that the uncertainty looks at.
-        file: HDF5 file to which every iteration's point is written; None: nowhere.
-        resume: begin from that file if it is there.
-        progress: told of every iteration: number of the weight, chi^2 over the number of components.
-        mesh_error: estimate what the meshes leave out, and how far that moves the field (`mesh_bias`).
+        options: how to search, see `MapOptions`.
+        changes: fields of `options` by their names, for example ``max_iterations=40``.
 
     Raises:
         InputError: as `start_of`; or `file` belongs to another fit.
@@ -178,15 +182,16 @@ def estimate(
     begin = time.perf_counter()
     base = start_of(problem, name)
     p = smooth.prior(problem.scenes[0].mesh, length)
-    search = _Search(problem, name, base, p, file, progress)
-    if resume and file is not None:
+    options = options._replace(**changes)
+    search = _Search(problem, name, base, p, options.file, options.progress)
+    if options.resume and options.file is not None:
         search.read()
-    _deviations_in_turn(search, max_iterations)
+    _deviations_in_turn(search, options.max_iterations)
     deviation = DEVIATIONS[search.k]
     m = deviation * smooth.field_at_nodes(p, search.z)
     search.cost(search.z)
     asked = _Asked.at(search, deviation, m)
-    values, vectors = _measured_directions(asked, len(m), modes)
+    values, vectors = _measured_directions(asked, len(m), options.modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
     return Field(
         name=name,
@@ -194,7 +199,7 @@ def estimate(
         modulus=np.asarray(values_at(problem, name, base, jnp.asarray(m))[name]),
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
-        mesh_bias=_bias_of_map(search, asked, m, values, vectors) if mesh_error else None,
+        mesh_bias=_bias_of_map(search, asked, m, values, vectors) if options.mesh_error else None,
         deviation=deviation,
         length=length,
         chi2=search.chi2,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits.field import Field, start_of
-from fitting.fits.scene_numbers import Problem, fit
+from fitting.fits.scene_numbers import Problem, Unknowns, fit
 from fitting.methods.estimate import Estimate
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
@@ -79,4 +79,5 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
         at_rest = jnp.mean(base)
         return jnp.stack([*u[:3], jnp.exp(u[3]), at_rest * jnp.exp(u[4]), at_rest * jnp.exp(u[4] + u[5])])
 
-    return fit(problem, values_of, natural_of, NAMES, np.asarray(start) / np.asarray(scale), **options)[0]
+    unknowns = Unknowns(np.asarray(start) / np.asarray(scale), values_of, natural_of, NAMES)
+    return fit(problem, unknowns, **options)[0]

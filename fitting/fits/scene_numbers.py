@@ -40,12 +40,18 @@ def misfit(problem: Problem, values: dict[str, Any], store: str | int = "all") -
     return jnp.concatenate(parts), jnp.stack(codes)
 
 
+class Unknowns(NamedTuple):
+    """What Gauss-Newton varies, u (n,), and what it stands for."""
+
+    start: np.ndarray  # first u (n,)
+    values_of: Callable[[jax.Array], dict[str, Any]]  # u -> numbers of the scenes by dotted name
+    natural_of: Callable[[jax.Array], jax.Array]  # u -> the parameters to report (m,)
+    names: Sequence[str]  # of these
+
+
 def fit(
     problem: Problem,
-    values_of: Callable[[jax.Array], dict[str, Any]],
-    natural_of: Callable[[jax.Array], jax.Array],
-    names: Sequence[str],
-    start: Any,
+    unknowns: Unknowns,
     max_iterations: int = 20,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
     mesh_error: bool = True,
@@ -54,14 +60,13 @@ def fit(
 
     Args:
         problem: scenes and data.
-        values_of: u -> numbers of the scenes by dotted name.
-        natural_of: u -> the parameters to report (n,), of `names`.
-        start: first u (n,).
-        max_iterations, progress: as of `levenberg_marquardt_host`.
+        unknowns: u, and how numbers and parameters follow from it.
+        max_iterations, progress: see `levenberg_marquardt_host`.
         mesh_error: estimate what the meshes leave out, and how far that moves the parameters (`mesh_bias`); a warning
             says where it is more than the standard error. It takes a run more, and one linear solve a step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
+    start, values_of, natural_of, names = unknowns
 
     @jax.jit
     def with_jacobian(problem, u):
@@ -143,4 +148,4 @@ def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estim
         return out
 
     lj.with_parameters(problem.scenes[0], dict(zip(names, starts, strict=True)))
-    return fit(problem, values_of, natural_of, labels, np.zeros(len(flat)), **options)[0]
+    return fit(problem, Unknowns(np.zeros(len(flat)), values_of, natural_of, labels), **options)[0]

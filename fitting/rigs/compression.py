@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 import liverjax as lj
-from fitting.rigs.torsion import Rig
+from fitting.rigs.plates import Rig
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.laws import Law

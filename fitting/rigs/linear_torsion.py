@@ -1,0 +1,181 @@
+"""The torsion rig at small strain: its stiffness, the bias of its mesh, and the moduli it shows, without time steps."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from fitting.rigs.plates import (
+    Rig,
+    coordinates,
+    number_of_coordinates,
+    packed,
+    rest_height,
+    sample_positions,
+    work_conjugates,
+)
+from liverjax.core.struct import Number, replace
+from liverjax.elements import mjed
+from liverjax.laws import Law, isochoric_part, volumetric_part
+from liverjax.physics import viscosity
+from liverjax.physics.viscosity import Prony
+from liverjax.tensors.material_axes import symmetric
+from liverjax.tensors.matrices import deformation_gradient, matmul
+
+
+def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
+    """Elastic tangent at rest in the rig's coordinates, dense (n, n) [N/m]."""
+    mesh = rig.mesh
+    V = mesh.points.shape[0]
+    dofs = (3 * mesh.tetrahedra[:, :, None] + jnp.arange(3)[None, None]).reshape(-1, 12)
+    entries = mjed.element_matrices(mesh, law, mesh.points).reshape(-1, 12, 12)
+    dense = jnp.zeros((3 * V, 3 * V), mesh.points.dtype).at[dofs[:, :, None], dofs[:, None, :]].add(entries)
+    first, n = 3 * rig.bottom, 3 * (V - rig.top)
+    X = mesh.points[V - rig.top :]
+    turn = jnp.stack([-X[:, 1], X[:, 0], jnp.zeros(rig.top)], axis=-1).ravel() / rig.radius
+    columns = [turn]
+    if rig.free_height:
+        columns = [jnp.tile(jnp.array([0.0, 0.0, 1.0]), rig.top), turn]
+    T = jnp.stack(columns, axis=-1)
+    K_fp = dense[first:n, n:] @ T
+    K_pp = T.T @ dense[n:, n:] @ T
+    return jnp.block([[dense[first:n, first:n], K_fp], [K_fp.T, K_pp]])
+
+
+class Response(NamedTuple):
+    """The linear answer of the rig: coordinates per unit arc length (real or complex), and force per arc length."""
+
+    shape: jax.Array  # (n,), its last entry 1
+    stiffness: jax.Array  # [N/m]
+
+
+def _response(column: jax.Array) -> Response:
+    """The answer, from the coordinates (n,) that a unit force on the last of them causes."""
+    return Response(column / column[-1], 1 / column[-1])
+
+
+def exact_stiffness(rig: Rig, law: Law) -> Number:
+    """Force per arc length of the true elastic cylinder, pi r^2 G / (2 h) [N/m]."""
+    return jnp.pi * rig.radius**2 * law.shear_modulus() / (2 * rig.height)
+
+
+@jax.jit
+def geometry_factor(rig: Rig, law: Law) -> jax.Array:
+    """Elastic torsional stiffness of the mesh over pi r^4 G / (2 h): what the polygon and the stiff elements add.
+
+    Moduli divided by it are free of that bias in the linear range.
+    """
+    inverse = jnp.linalg.inv(rest_stiffness(rig, law))
+    return _response(inverse[:, -1]).stiffness / exact_stiffness(rig, law)
+
+
+class Linearised(NamedTuple):
+    """The rig as it is held, before any frequency is known."""
+
+    inverse: jax.Array  # of the stiffness (n, n) against a motion too quick to relax
+    relaxing: jax.Array | None  # the part of the stiffness that relaxes and the part that stands, where they differ
+    standing: jax.Array | None
+    bias: jax.Array | None = None  # of the mesh, where the sample is compressed: `geometry_factor` of its rest
+
+
+def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
+    """The stiffness of the rig for all frequencies, and its inverse."""
+    if rig.held is not None:
+        relaxing, standing, bias = held(rig, law)
+        standing = standing * (1.0 if prony is None else 1 - jnp.sum(jnp.asarray(prony.ratios)))
+        return Linearised(jnp.linalg.inv(relaxing + standing), relaxing, standing, bias)
+    if prony is None or prony.part == "all":
+        return Linearised(jnp.linalg.inv(rest_stiffness(rig, law)), None, None)
+    isochoric, volumetric = (rest_stiffness(rig, part(law)) for part in (isochoric_part, volumetric_part))
+    return Linearised(jnp.linalg.inv(isochoric + volumetric), isochoric, volumetric)
+
+
+def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
+    """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the stress that stands.
+
+    A motion only turns a stress S that has stood for long; the second part is that of the unrelaxed S.
+    """
+    mesh = rig.mesh
+    rest = jnp.zeros(number_of_coordinates(rig), mesh.points.dtype)
+    elastic = Prony(ratios=jnp.zeros(0), relaxation_times=jnp.zeros(0))
+
+    def gradient(q):
+        return deformation_gradient(mesh, sample_positions(rig, *coordinates(rig, q)))
+
+    def stress(q):
+        return viscosity.relaxing_stress(elastic, law, gradient(q))
+
+    def forces(q, S):
+        x = sample_positions(rig, *coordinates(rig, q))
+        f = mjed.nodal_force(mesh, matmul(gradient(q), symmetric(tuple(S))))
+        return packed(rig, *work_conjugates(rig, x, f))
+
+    S = stress(rest)
+    standing = jax.jacfwd(forces)(rest, S)
+    return jax.jacfwd(lambda q: forces(q, stress(q)))(rest) - standing, standing
+
+
+def axial_force(rig: Rig, law: Law) -> jax.Array:
+    """Force [N] with which a compressed sample, before it relaxes, pushes the plates apart."""
+    x = sample_positions(rig, *coordinates(rig, jnp.zeros(number_of_coordinates(rig), rig.mesh.points.dtype)))
+    return -work_conjugates(rig, x, mjed.internal_force(rig.mesh, law, x))[1]
+
+
+def steady_response(rest: Linearised, modulus: Number) -> Response:
+    """Response on the steady cycle where the relaxing stress is `modulus` times the elastic one (complex)."""
+    if rest.relaxing is None or rest.standing is None:
+        elastic = _response(rest.inverse[:, -1])
+        return Response(elastic.shape, elastic.stiffness * modulus)
+    K = modulus * rest.relaxing + rest.standing
+    return _response(jnp.linalg.solve(K, jnp.zeros(K.shape[0], K.dtype).at[-1].set(1.0)))
+
+
+def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
+    """Torque amplitude [N m] that gives about `strain` at the rim of a sample of dynamic modulus |G*| [Pa]."""
+    return jnp.pi * rig.radius**3 / 2 * modulus * strain
+
+
+def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
+    """The limit of `moduli` as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
+
+    The rig is linear there, and its bias is divided out, so they hold neither mesh nor plates. They give the
+    derivatives of `moduli` by the parameters to the order of the strain, without a derivative of the simulation. They
+    have no inertia.
+
+    Args:
+        law: scaled to G0, its modulus at rest.
+        prony: how it relaxes.
+        omega: angular frequencies (n,) [rad/s].
+        steps: time steps a cycle; None: those of continuous time.
+    """
+    ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
+    return law.shear_modulus() * (1 - jnp.sum(ratios, axis=0))
+
+
+class Held(NamedTuple):
+    """A compressed sample of a law, before any relaxation is known."""
+
+    relaxing: jax.Array  # (n, n) [N/m]: `about_held`
+    standing: jax.Array
+    bias: jax.Array  # of its mesh at rest: `geometry_factor`
+
+
+def held(rig: Rig, law: Law) -> Held:
+    """Input of `held_moduli` from a rig of `compression.compressed`."""
+    return Held(*about_held(rig, law), geometry_factor(replace(rig, held=None, height=rest_height(rig)), law))
+
+
+def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
+    """`linear_moduli` of the compressed sample `of`: complex moduli [Pa] (n,) of its mesh.
+
+    Args:
+        of, rig: the sample.
+        prony: how it relaxes.
+        omega: angular frequencies (n,) [rad/s].
+        steps: time steps a cycle; None: those of continuous time.
+    """
+    ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
+    stands = 1 - jnp.sum(jnp.asarray(prony.ratios))
+    parts = Linearised(of.relaxing, of.relaxing, stands * of.standing)
+    stiffness = jax.lax.map(lambda modulus: steady_response(parts, modulus).stiffness, 1 - jnp.sum(ratios, axis=0))
+    return 2 * rig.height / (jnp.pi * rig.radius**2) * stiffness / of.bias

@@ -1,0 +1,135 @@
+"""The sample between the plates of a rheometer: its mesh, and the coordinates that its plates leave.
+
+Coordinates are the displacements u of the free nodes, the lift of the top plate, and arc = radius * angle.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.core.struct import Number, param, static, struct
+from liverjax.mesh import shapes
+from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
+
+#: Chapter, section 5.3; its section 5.2 prints 41 mm for 4 mm +- 1 mm (at 41 mm inertia resonates inside the band).
+RADIUS, HEIGHT = 0.010, 0.004
+
+
+@struct
+class Rig:
+    """A sample between two plates; nodes are ordered bottom plate, free, top plate."""
+
+    mesh: TetMesh = param("m", "the sample")
+    radius: Number = param("m", "plate radius")
+    height: Number = param("m", "gap")
+    density: Number | None = param("kg/m^3", "None: no inertia, and no velocity is carried", default=None)
+    bottom: int = static(about="number of nodes on the gripped plate")
+    top: int = static(about="number of nodes on the turning plate")
+    held: jax.Array | None = param(
+        "m", "positions (V, 3) of the compressed sample; None: it is not (`compression`)", default=None
+    )
+    free_height: bool = static(default=False, about="the top plate may also move along the axis under no axial force")
+
+
+def cell_size_for(radius: float, height: float) -> float:
+    """Default cell [m]: 100 to 400 nodes for any shape; geometry_factor removes the error that leaves if linear."""
+    return max((math.pi * radius**2 * height / 100) ** (1 / 3), radius / 6, height / 12)
+
+
+def linear_cell_for(radius: float, height: float) -> float:
+    """Cell [m] of about 100 nodes: enough for small strain without inertia, where `bias` holds all of the mesh's error.
+
+    The rest of the error is of the order of the strain: at 1e-3 the moduli differ by 1e-5 from those of `cell_size_for`
+    (experiments/benchmarks/torsion_speed.py).
+    """
+    return max((math.pi * radius**2 * height / 30) ** (1 / 3), radius / 4, height / 8)
+
+
+def make_rig(
+    radius: float = RADIUS,
+    height: float = HEIGHT,
+    cell_size: float | None = None,
+    free_height: bool = False,
+    density: float | None = None,
+) -> Rig:
+    """A rig with a generated cylinder.
+
+    Args:
+        radius, height: of the sample [m].
+        cell_size: edge length of the mesh [m]; default `cell_size_for`.
+        free_height: let the top plate rise (Poynting effect) instead of holding the gap.
+        density: [kg/m^3]; `None` leaves inertia out.
+
+    Raises:
+        InputError: lengths that are not positive.
+    """
+    for name, value in (("radius", radius), ("height", height)):
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} = {value} must be positive: give the plate {name} in metres")
+    mesh = shapes.cylinder(radius, height, cell_size or cell_size_for(radius, height))
+    return rig_from_mesh(mesh, radius, height, free_height, density)
+
+
+def rig_from_mesh(
+    mesh: TetMesh, radius: float, height: float, free_height: bool = False, density: float | None = None
+) -> Rig:
+    """A rig around any mesh whose axis is z and whose plates are its lowest and highest planes."""
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    z = points[:, 2]
+    near = 1e-9 * (z.max() - z.min())
+    plate = np.where(z < z.min() + near, 0, np.where(z > z.max() - near, 2, 1))
+    order = np.argsort(plate, kind="stable")
+    number = np.argsort(order)
+    return Rig(
+        mesh=tet_mesh(points[order], number[tets]),
+        radius=radius,
+        height=height,
+        density=density,
+        bottom=int((plate == 0).sum()),
+        top=int((plate == 2).sum()),
+        free_height=free_height,
+    )
+
+
+def sample_positions(rig: Rig, u: jax.Array, lift: Number, angle: Number) -> jax.Array:
+    """Positions (V, 3) [m] at displacements u of the free nodes, a lift and an angle of the top plate."""
+    X = rig.mesh.points if rig.held is None else rig.held
+    n = X.shape[0] - rig.top
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    x, y, z = X[n:].T
+    top = jnp.stack([c * x - s * y, s * x + c * y, z + lift], axis=-1)
+    return jnp.concatenate([X[: rig.bottom], X[rig.bottom : n] + u.reshape(-1, 3), top])
+
+
+def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Work conjugates of (u, lift, arc): nodal forces, axial force, torque / radius [N]."""
+    n = x.shape[0] - rig.top
+    top, force = x[n:], f[n:]
+    torque = jnp.sum(top[:, 0] * force[:, 1] - top[:, 1] * force[:, 0])
+    return f[rig.bottom : n].ravel(), jnp.sum(force[:, 2]), torque / rig.radius
+
+
+def coordinates(rig: Rig, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(u, lift, angle) of the full vector of coordinates, angle last."""
+    if rig.free_height:
+        return q[:-2], q[-2], q[-1] / rig.radius
+    return q[:-1], jnp.zeros((), q.dtype), q[-1] / rig.radius
+
+
+def packed(rig: Rig, u: jax.Array, axial: jax.Array, arc: jax.Array) -> jax.Array:
+    """The full vector of coordinates, or of the forces along them."""
+    return jnp.concatenate([u, axial[None], arc[None]] if rig.free_height else [u, arc[None]])
+
+
+def rest_height(rig: Rig) -> jax.Array:
+    """Height of the sample before it is compressed [m]."""
+    z = rig.mesh.points[:, 2]
+    return jnp.max(z) - jnp.min(z)
+
+
+def number_of_coordinates(rig: Rig) -> int:
+    """Number of coordinates."""
+    return 3 * (rig.mesh.number_of_nodes - rig.top - rig.bottom) + 1 + rig.free_height
