@@ -3,10 +3,9 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import bodies, elements, identification, reduced, rigs
+from experiments.pages import bodies, elements, identification, reduced, rigs, stability
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
-from experiments.pages.stability import Returned, returned
 
 
 def _main_job() -> str:
@@ -289,53 +288,6 @@ def _gradient() -> str:
     )
 
 
-def _inverted() -> str:
-    solver = "projected, from the start itself"
-    half, fifth = returned(solver, ("50 % inverted",)), returned(solver, ("20 % inverted",))
-    left = returned("projected, guess left")
-
-    def part(found: Returned) -> str:
-        return "all" if found.least == 1 else f"at least {percent(found.least)}"
-
-    return (
-        f"from the start itself, projected, {percent(half.least)} to {percent(half.most)} of those half inverted come "
-        f"back ({half.laws} laws; {percent(half.folded)} of the others end folded, in equilibrium), with 20 % inverted "
-        f"{part(fifth)}; at rest {part(left)}, because an inverted guess is left for the reference shape"
-    )
-
-
-def _steps() -> str:
-    (data,) = load("stability_steps")
-
-    def good(precision: str) -> str:
-        kind = ("complete", "projected", precision)
-        mine = [r for r in data["rows"] if (r["model"], r["robust"], r["precision"]) == kind]
-        return f"{sum(r['converged'] == data['steps'] for r in mine)} of {len(mine)}"
-
-    return (
-        f"with it the complete model converges at {good('float64')} step sizes from 1 ms to 10 s, in float32 at "
-        f"{good('float32')}"
-    )
-
-
-def _bulk() -> str:
-    (data,) = load("stability_bulk")
-    key = ("Cook's membrane", 1e4, 16, "direct", "float64")
-    rows = [
-        r for r in data["rows"] if tuple(r[k] for k in ("body", "ratio", "cells", "linear_solver", "precision")) == key
-    ]
-    off = {r["volumetric"]: abs(r["error"]) for r in rows}
-    return (
-        f"Cook at K/mu = 1e4: by element {percent(off['element'])} off, averaged at the nodes {percent(off['nodal'])}"
-    )
-
-
-def _cost() -> str:
-    (data,) = load("stability_cost")
-    over = ", ".join(f"{r['model']} {r['time_over_off']:.2f}" for r in data["rows"])
-    return f"run time over that without: {over}"
-
-
 def _laws() -> str:
     (data,) = load("laws_table")
     worst = max(max(r["stress_error"], r["tangent_error"]) for r in data["laws"].values())
@@ -433,11 +385,15 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     "training_set": ("1,000 runs of the phantom by a sweep, and a polynomial surrogate of them", _training, ""),
     "stability_inverted": (
         "scrambled, inverted and crushed starts, every solver: how many come back?",
-        _inverted,
+        stability.inverted_came_out,
         "its regularised stiffness is the second solver",
     ),
-    "stability_steps": ("the liver under its full weight at any step, with and without `robust`", _steps, ""),
-    "stability_bulk": ("locking against K/mu", _bulk, ""),
+    "stability_steps": (
+        "the liver under its full weight at any step, with and without `robust`",
+        stability.steps_came_out,
+        "",
+    ),
+    "stability_bulk": ("locking against K/mu", stability.bulk_came_out, ""),
     "elements": (
         "linear, quadratic and mixed elements: error, estimated error, run time",
         elements.came_out,
@@ -475,7 +431,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         reduced.separated_came_out,
         "weighs its model against proper generalised decomposition and gives no number",
     ),
-    "stability_cost": ("what does robustness at hand cost where it is not needed?", _cost, ""),
+    "stability_cost": ("what does robustness at hand cost where it is not needed?", stability.cost_came_out, ""),
     "laws_table": ("every law: error of its terms beside time and compile time", _laws, ""),
     "curves_fit": (
         "which law follows brain and rubber in tension, compression and shear at once?",
