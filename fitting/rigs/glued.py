@@ -26,7 +26,6 @@ from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
 from liverjax.simulation import automatic
 
-READINGS = ("force", "displacement")
 #: A punch narrower than this part of the sample, or a gap beside it, is below what the mesh is made for.
 NARROWEST = 0.01
 #: Where a default mesh is known to be within 1 %: height over radius, and largest K/mu by the form for volume changes.
