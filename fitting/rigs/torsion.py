@@ -106,18 +106,17 @@ def scene_of(
     times = dt * jnp.arange(steps + 1)
     turn = amplitude * jnp.sin(omega * times)
     plate = RigidPlate(nodes=jnp.arange(n - rig.top, n), turn=turn, times=times, by=drive.by, lifts=rig.free_height)
-    moves = rig.density is not None
     return Scene(
         mesh=rig.mesh,
         law=law,
         viscosity=prony,
-        body=Body(density=rig.density) if moves else None,
+        body=None if rig.density is None else Body(density=rig.density),
         fixed=(Fixed(nodes=jnp.arange(rig.bottom)),),
         physics=(plate,),
         solve=Solve(
             dt=dt,
             steps=steps,
-            kind="dynamic" if moves else "static",
+            kind="static" if rig.density is None else "dynamic",
             integrator="newmark",
             tolerance=drive.options.tolerance,
         ),

@@ -29,7 +29,7 @@ def check(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
         check_bound(dotted, metadata, value)
 
 
-def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, Any]]:
+def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str, Mapping, object]]:
     """Dotted name, metadata and value of every field that has a bound or a unit."""
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
@@ -47,7 +47,7 @@ def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str
             yield dotted, field.metadata, value
 
 
-def check_bound(where: str, metadata: Mapping, value: Any) -> None:
+def check_bound(where: str, metadata: Mapping, value: object) -> None:
     """Refuse a value that a field's `metadata` does not allow, in one sentence that begins with `where`.
 
     Args:
@@ -81,7 +81,7 @@ def check_bound(where: str, metadata: Mapping, value: Any) -> None:
         _refuse(where, metadata, value, np.asarray([value], float) if numbers is None else numbers)
 
 
-def _refuse(where: str, metadata: Mapping, value: Any, numbers: np.ndarray) -> None:
+def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -> None:
     """Refuse with a sentence on the first bound that one of the numbers (n,) breaks."""
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
@@ -102,7 +102,7 @@ def _refuse(where: str, metadata: Mapping, value: Any, numbers: np.ndarray) -> N
             raise InputError(f"{said}{'' if unit == '1' else f' {unit}'}: {example or remedy}")
 
 
-def _numbers_of(where: str, metadata: Mapping, value: Any, leaves: list) -> np.ndarray:
+def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> np.ndarray:
     """The numbers of all leaves (n,)."""
     try:
         if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):

@@ -54,7 +54,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callabl
     structure = jax.tree.structure(arguments)
     shape: list[Any] = []
 
-    def flat(*leaves: Any) -> list[Any]:
+    def flat(*leaves: jax.Array) -> list[jax.Array]:
         out = function(*jax.tree.unflatten(structure, leaves))
         shape[:] = [jax.tree.structure(out)]
         return jax.tree.leaves(out)
@@ -95,7 +95,7 @@ def _found(file: Path) -> Callable[..., Any] | None:
         return None
 
 
-def _called(program: Callable[..., Any], structure: Any, *arguments: Any) -> Any:
+def _called(program: Callable[..., Any], structure: jax.tree_util.PyTreeDef, *arguments: Any) -> Any:
     return jax.tree.unflatten(structure, program(*jax.tree.leaves(arguments)))
 
 

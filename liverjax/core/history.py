@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number, Numbers
 
 #: Columns of a file: a factor, or a vector.
 _FACTOR, _VECTOR = ("time", "factor"), ("time", "x", "y", "z")
 
 
-def read_history(value: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> tuple[jax.Array, jax.Array]:
+def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> tuple[jax.Array, jax.Array]:
     """Times (T,) [s], and factors (T,) or vectors (T, 3), from a scene file's `history`.
 
     Args:
@@ -76,7 +77,7 @@ def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) 
         raise InputError(f"{name} history has shape {np.shape(history)}, its times {count}: give {shapes}")
 
 
-def entry_at(time: Any, times: Any, history: Any) -> jax.Array:
+def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:
     """The factor (), or the vector (3,), at a time [s]."""
     values = jnp.asarray(history)
     if values.ndim == 1:
@@ -84,7 +85,7 @@ def entry_at(time: Any, times: Any, history: Any) -> jax.Array:
     return jnp.stack([jnp.interp(time, times, values[:, k]) for k in range(values.shape[1])])
 
 
-def value_at(value: Any, time: Any, times: Any, history: Any) -> Any:
+def value_at(value: object, time: Number, times: Any, history: Any) -> Any:
     """A value at a time [s]: multiplied by the factor or replaced by the vector; constant without a history."""
     if history is None:
         return value

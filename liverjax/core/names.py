@@ -39,14 +39,14 @@ def get(thing: Any, name: str, refusal: str) -> Any:
     return walk(thing, name, refusal)[-1].inside()
 
 
-def put(thing: Any, name: str, value: Any, refusal: str) -> Any:
+def put(thing: Any, name: str, value: object, refusal: str) -> Any:
     """Copy `thing` with `value` (it may be traced) at a dotted name. `walk` explains arguments and errors."""
     for step in reversed(walk(thing, name, refusal)):
         value = step.with_inside(value)
     return value
 
 
-def metadata(thing: Any, name: str, refusal: str) -> dict[str, Any]:
+def metadata(thing: Any, name: str, refusal: str) -> dict[str, object]:
     """Unit and bounds of the field that a dotted name leads to. `walk` explains arguments and errors."""
     last = next(step for step in reversed(walk(thing, name, refusal)) if dataclasses.is_dataclass(step.owner))
     return dict(last.owner.__dataclass_fields__[last.key].metadata)

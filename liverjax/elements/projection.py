@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.laws.base import Law
 from liverjax.laws.derivatives import accumulate
 from liverjax.laws.terms import green_terms, invariant_terms
@@ -67,7 +68,7 @@ def frame(F: Matrix) -> Frame:
     return Frame(transpose(u), tuple(dot(a, b) for a, b in zip(u, f, strict=True)), transpose(tuple(n)))
 
 
-def _chosen(where: Any, a: Vector, b: Vector) -> Vector:
+def _chosen(where: Number, a: Vector, b: Vector) -> Vector:
     return tuple(jnp.where(where, x, y) for x, y in zip(a, b, strict=True))
 
 
@@ -77,7 +78,7 @@ def _unit(a: Vector, otherwise: Vector) -> Vector:
 
 
 def blocks(
-    parts: list[tuple[Any, Law]],
+    parts: list[tuple[Number, Law]],
     S: Matrix | None,
     F: Matrix,
     D: list[Vector],
@@ -96,8 +97,8 @@ def blocks(
     """
     if any(law.subsets is not None for _, law in parts):
         return _by_subset(parts, S, F, D, pairs, volume)
-    first: dict[str, Any] = {}
-    second: dict[tuple[str, str], Any] = {}
+    first: dict[str, object] = {}
+    second: dict[tuple[str, str], object] = {}
     stretched, added = [], []
     metric = None if S is None else projected(S)
     for weight, law in parts:
@@ -127,7 +128,7 @@ def blocks(
 
 
 def _by_subset(
-    parts: list[tuple[Any, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
+    parts: list[tuple[Number, Law]], S: Matrix | None, F: Matrix, D: list[Vector], pairs: tuple, volume: Scalars | None
 ) -> list[Matrix]:
     """`blocks` of laws of several kinds, each at its own elements."""
     groups = next(law.subsets for _, law in parts if law.subsets is not None)
@@ -141,7 +142,7 @@ def _by_subset(
 
 
 def regularised(
-    parts: list[tuple[Any, Law]],
+    parts: list[tuple[Number, Law]],
     S: Matrix | None,
     F: Matrix,
     D: list[Vector],
@@ -151,7 +152,7 @@ def regularised(
     """The same with the chapter's regularisation in place of the projection. Eigenvalues may still be negative."""
     result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
-    def with_more(weight: Any, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:
+    def with_more(weight: Number, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:
         K = invariant_terms.blocks(state, D, pairs, regularised=True)
         return [add_matrices(a, scale_matrix(weight, b)) for a, b in zip(result, K, strict=True)]
 
@@ -160,7 +161,7 @@ def regularised(
     return result if volume is None else with_more(1.0, invariant_terms.state_of(volume, F))
 
 
-def _gather(total: dict, weight: Any, values: dict) -> None:
+def _gather(total: dict, weight: Number, values: dict) -> None:
     for key, value in values.items():
         accumulate(total, key, weight * value)
 
@@ -170,7 +171,7 @@ def _diagonal_matrix(value: Any) -> Matrix:
     return ((value, zero, zero), (zero, value, zero), (zero, zero, value))
 
 
-def _fibre(W4: Any, W44: Any, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+def _fibre(W4: Number, W44: Number, a: Vector, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """2 W_4 (a.D_i)(a.D_j) Id + 4 W_44 (a.D_i)(a.D_j) Fa (x) Fa, the positive part of each eigenvalue."""
     Fa = matvec(F, a)
     across = jnp.maximum(2 * W4, 0.0)

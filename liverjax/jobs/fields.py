@@ -94,7 +94,7 @@ def _put_again(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[Stat
     return advanced(e, End(x, F, vertices)), at
 
 
-def _whole_stress(e: Equations, F: Matrix, pressure: Any) -> Matrix:
+def _whole_stress(e: Equations, F: Matrix, pressure: jax.Array) -> Matrix:
     first, *rest = [solid.stress(F) for solid in e.solids]
     for more in rest:
         first = add_matrices(first, more)

@@ -1,8 +1,8 @@
 """Results on disk: HDF5, a ParaView series, a picture."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,11 @@ from liverjax.simulation.run import Result
 
 
 def write_hdf5(
-    file: Path, scene: Scene, result: Result, attributes: dict[str, Any], fields: dict[str, np.ndarray] | None = None
+    file: Path,
+    scene: Scene,
+    result: Result,
+    attributes: Mapping[str, object],
+    fields: dict[str, np.ndarray] | None = None,
 ) -> None:
     """Rows, mesh and `fields` (T, E, …) as datasets; status, iterations and `attributes` as attributes.
 

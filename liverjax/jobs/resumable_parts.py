@@ -5,16 +5,16 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
+from liverjax.core.struct import Number
 
 
 def beside(out: Path) -> Path:
@@ -76,7 +76,7 @@ def locked(file: Path) -> Iterator[None]:
         yield
 
 
-def same(identity: dict[str, Any], file: Path) -> None:
+def same(identity: Mapping[str, object], file: Path) -> None:
     """Write down what decides the results; refuse to go on if the parts on disk were made with something else.
 
     Raises:
@@ -101,7 +101,7 @@ def remove(folder: Path) -> None:
     folder.rmdir()
 
 
-def digest(*arrays: Any) -> str:
+def digest(*arrays: Number) -> str:
     """SHA-256 of the numbers of some arrays."""
     sha = hashlib.sha256()
     for a in arrays:

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import jax
@@ -54,7 +54,7 @@ class Sweep(NamedTuple):
     outputs: tuple[str, ...]
     probes: tuple[int, ...]  # nodes whose positions are kept over time
     chunk: int
-    identity: dict[str, Any]
+    identity: dict[str, object]
 
 
 class Done(NamedTuple):

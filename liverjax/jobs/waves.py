@@ -2,8 +2,9 @@
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +75,7 @@ def _last_positions(file: Path, scene: Scene) -> jax.Array:
     return jnp.asarray(x)
 
 
-def write_waves(file: Path, scene: Scene, waves: Waves, attributes: dict[str, Any]) -> None:
+def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
     """Frequencies, complex displacements and reactions (F, V, 3), and the mesh as datasets; `attributes` as such."""
     import h5py
 

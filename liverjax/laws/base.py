@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Number, Numbers, param, replace, static, struct
 from liverjax.laws.derivatives import First, Second, accumulate, autodiff_derivatives, reduced, split_derivatives
 from liverjax.laws.terms import invariant_terms
 from liverjax.laws.terms.green_terms import components, material_axes
@@ -56,10 +56,10 @@ class Law:
     #: The powers of a `stretch_energy`.
     exponents: Any
     #: Fields of the volumetric energy U(J), and of directions; None: the law has none.
-    bulk: Any = None
+    bulk: Number | None = None
     volumetric: str
-    fibre: Any = None
-    sheet: Any
+    fibre: Numbers | None = None
+    sheet: Numbers
     #: Which elements have which law (`liverjax.tensors.subsets.Subsets`); None: one law everywhere.
     subsets: Any = None
 
@@ -166,12 +166,12 @@ class Law:
             return NotImplemented
         return Sum(laws=self.summands() + other.summands())
 
-    def __radd__(self, other: Any) -> "Law":
+    def __radd__(self, other: Number) -> "Law":
         """0 + law, so that Python's `sum` adds a list of laws."""
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
-def _floating(F: Any) -> jax.Array:
+def _floating(F: Number) -> jax.Array:
     """`F` as an array of floating-point numbers; integers become the default precision."""
     F = jnp.asarray(F)
     return F if jnp.issubdtype(F.dtype, jnp.floating) else F.astype(float)
@@ -238,7 +238,7 @@ class Volumetric(Law):
     W = K/2 (J - 1)^2 ("quadratic"), K/2 ln^2 J ("log") or K/4 (J^2 - 1 - 2 ln J) ("simo").
     """
 
-    bulk: Any = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
+    bulk: Number = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     below: float | None = static(default=None, about="J below which U is its Taylor parabola there")
     invariants: ClassVar = ("J",)

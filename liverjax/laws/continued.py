@@ -2,10 +2,11 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law, Volumetric
 from liverjax.tensors.matrices import determinant
 
@@ -77,7 +78,7 @@ class Continued(Law):
         part = self.law.isochoric_part()
         return self.law if part is None else part
 
-    def _replaced(self, J: Any) -> tuple[Any, Any, Any]:
+    def _replaced(self, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
         """c^2/(2c - J) below c and J above, its slope and curvature."""
         c, lower = self.below, self.below > J
         inverse = 1 / (2 * c - jnp.minimum(J, c))

@@ -14,7 +14,7 @@ Second = dict[tuple[str, str], Any]
 ORDER = ("I1", "I2", "I4", "J")
 
 
-def accumulate(total: dict, key: Any, value: Any) -> None:
+def accumulate(total: dict, key: object, value: object) -> None:
     """Add to an entry of a table of derivatives, in place; an absent entry begins with the value."""
     total[key] = total[key] + value if key in total else value
 

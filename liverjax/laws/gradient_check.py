@@ -110,7 +110,7 @@ def _try(law: Law, name: str) -> None:
                 raise InputError(f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: mend the law")
 
 
-def _is_law(value: Any) -> bool:
+def _is_law(value: object) -> bool:
     return isinstance(value, Law) or (inspect.isclass(value) and issubclass(value, Law) and value is not Law)
 
 

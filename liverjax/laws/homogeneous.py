@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
@@ -14,7 +15,7 @@ from liverjax.tensors.matrices import pack, unpack
 TESTS = {"uniaxial": "stretch", "equibiaxial": "stretch", "pure_shear": "stretch", "simple_shear": "shear"}
 
 
-def deformation_gradient(test: str, driven: Any, stretch: Any = 1.0) -> jax.Array:
+def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.Array:
     """F (..., 3, 3) with det F = 1; axis 3 is free of traction.
 
     Args:
@@ -60,6 +61,6 @@ def measured(test: str, P: jax.Array) -> jax.Array:
     return P[..., 0, 1] if test == "simple_shear" else P[..., 0, 0]
 
 
-def response(law: Law, test: str, driven: Any, stretch: Any = 1.0) -> jax.Array:
+def response(law: Law, test: str, driven: Number, stretch: Number = 1.0) -> jax.Array:
     """Nominal stress [Pa] of a test at stretches or amounts of shear (...)."""
     return measured(test, nominal_stress(law, deformation_gradient(test, driven, stretch)))

@@ -15,7 +15,7 @@ from liverjax.laws.registry import create, find
 _ITERATIONS, _LONGEST = 30, 0.5
 
 
-def read_layer(table: Any, name: str) -> Law:
+def read_layer(table: object, name: str) -> Law:
     """The law of a thin part by its table; its bulk modulus may be left out, since it does not act.
 
     Raises:

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from math import comb
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 from liverjax.laws.base import Law, Volumetric
 from liverjax.laws.families.arruda_boyce import COEFFICIENTS, ArrudaBoyce
 from liverjax.laws.families.fung_demiray import FungDemiray
@@ -22,7 +24,7 @@ from liverjax.tensors.matrices import Invariants
 class Product(NamedTuple):
     """W^k = c I1^i I2^j J^p."""
 
-    c: Any
+    c: Number
     i: int
     j: int
     p: float
@@ -32,10 +34,10 @@ class Group(NamedTuple):
     """phi(sum_k W^k); `slopes` gives phi' and phi'' of the sum, `None` stands for the sum itself."""
 
     products: list[Product]
-    slopes: Callable[[Any], tuple[Any, Any]] | None = None
+    slopes: Callable[[Number], tuple[Number, Number]] | None = None
 
 
-def _isochoric(c: Any, i: int, j: int) -> list[Product]:
+def _isochoric(c: Number, i: int, j: int) -> list[Product]:
     """c (Ibar1 - 3)^i (Ibar2 - 3)^j by the binomial theorem, without its constant."""
     return [
         Product(c * comb(i, a) * comb(j, b) * (-3.0) ** (i - a + j - b), a, b, -2 * a / 3 - 4 * b / 3)
@@ -74,17 +76,17 @@ def groups(law: Law) -> list[Group]:
     raise InputError(f"law {type(law).__name__} is no sum of products g(I1, I2) h(J): use terms = 'contracted'")
 
 
-def _exponential(scale: Any, factor: Any) -> Group:
+def _exponential(scale: Number, factor: Number) -> Group:
     """scale exp(factor (Ibar1 - 3))."""
 
-    def slopes(s: Any) -> tuple[Any, Any]:
+    def slopes(s: Number) -> tuple[Number, Number]:
         e = scale * factor * jnp.exp(factor * (s - 3))
         return e, factor * e
 
     return Group([Product(1.0, 1, 0, -2 / 3)], slopes)
 
 
-def functions_of_volume(law: Law, J: Any) -> list[tuple[Any, Any]]:
+def functions_of_volume(law: Law, J: Number) -> list[tuple[jax.Array, jax.Array]]:
     """h' and h'' of the products whose g is 1."""
     if isinstance(law, NeoHookeanCompressible):
         first, second = law.energy_derivatives(Invariants(J=J))

@@ -10,7 +10,7 @@ import numpy as np
 from liverjax.core import bounds
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import Number, Numbers, replace
 from liverjax.laws.base import Law
 from liverjax.laws.continued import Continued
 from liverjax.laws.families.arruda_boyce import ArrudaBoyce
@@ -59,7 +59,7 @@ def parameters(law: Any) -> list[dataclasses.Field]:
     return [f for f in dataclasses.fields(law) if not f.metadata.get("static")]
 
 
-def create(name: str, **values: Any) -> Law:
+def create(name: str, **values: Numbers) -> Law:
     """A law by its name, its parameters checked against their bounds.
 
     Args:
@@ -116,7 +116,7 @@ def typical(name: str) -> Law:
     return scaled(law, 770.0 / law.shear_modulus())
 
 
-def scaled(law: Law, factor: Any) -> Law:
+def scaled(law: Law, factor: Number) -> Law:
     """The law with its energy times `factor`: every parameter in Pa is multiplied, every other one kept."""
 
     def one(s: Law) -> Law:
@@ -131,5 +131,5 @@ def scaled(law: Law, factor: Any) -> Law:
     return sum(others, first)
 
 
-def _times(value: Any, factor: Any) -> Any:
+def _times(value: Any, factor: Number) -> Any:
     return tuple(v * factor for v in value) if isinstance(value, (tuple, list)) else jnp.multiply(value, factor)

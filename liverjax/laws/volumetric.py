@@ -1,10 +1,10 @@
 """Volumetric energies U(J) and their two derivatives."""
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 
 
 def _quadratic_energy(K, J):
@@ -25,7 +25,7 @@ def _simo(K, J):
 VOLUMETRIC = {"quadratic": _quadratic_energy, "log": _log, "simo": _simo}
 
 
-def volumetric(kind: str, K: Any, J: Any) -> tuple[Any, Any, Any]:
+def volumetric(kind: str, K: Number, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
     """U, dU/dJ and d2U/dJ2 [Pa] of bulk modulus K [Pa]; `InputError` for an unknown kind."""
     if kind not in VOLUMETRIC:
         raise InputError(f"volumetric = {kind!r} is not known: use one of {', '.join(VOLUMETRIC)}")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Indices, param, static, struct
 
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
@@ -31,7 +31,7 @@ class Pattern:
     number_of_patches: int = static(default=1, about="P")
 
 
-def pattern(tetrahedra: Any, points: jax.Array) -> Pattern:
+def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     """The pattern of elements (E, 4) on points (V, 3) [m]; host side, equal meshes give equal patterns.
 
     The points may be traced (derivatives by the shape): then all nodes are one patch.

@@ -5,6 +5,7 @@ import io
 import os
 import re
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -188,7 +189,7 @@ def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
     return sets
 
 
-def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: dict[str, Any] | None = None) -> None:
+def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:
     """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that carry data."""
     import meshio
 

@@ -1,11 +1,10 @@
 """Parts of a mesh: nodes chosen by place or by name, triangles of its surface."""
 
-from typing import Any
-
 import numpy as np
 
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Indices
 from liverjax.mesh.tetrahedra import TetMesh
 
 AXES = "xyz"
@@ -50,7 +49,7 @@ def select(
     return np.flatnonzero(inside)
 
 
-def boundary_triangles(mesh: TetMesh, nodes: Any | None = None) -> np.ndarray:
+def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
     """Outer triangles (m, 3), normals outwards; with `nodes` those whose three nodes are among them."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))])

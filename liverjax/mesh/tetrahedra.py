@@ -4,7 +4,7 @@ An element has 4 nodes, or 10: vertices and the middles of its edges (`liverjax.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Indices, Numbers, param, static, struct
 from liverjax.mesh.adjacency import PAIRS, Pattern, pattern
 from liverjax.mesh.basis import basis
 from liverjax.tensors.matrices import stored
@@ -134,10 +134,10 @@ class TetMesh:
 
 
 def tet_mesh(
-    points: Any,
-    tetrahedra: Any,
-    node_sets: dict[str, Any] | None = None,
-    element_sets: dict[str, Any] | None = None,
+    points: Numbers,
+    tetrahedra: Indices,
+    node_sets: Mapping[str, object] | None = None,
+    element_sets: Mapping[str, object] | None = None,
 ) -> TetMesh:
     """A mesh from positions (V, 3) [m] and node numbers (E, 4), without any check (see `check_mesh`).
 
@@ -164,7 +164,7 @@ def tet_mesh(
     )
 
 
-def with_points(mesh: TetMesh, points: Any) -> TetMesh:
+def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
     """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with.
 
     Edges stay straight: where the mesh is quadratic the positions of their middles follow from those of the vertices.

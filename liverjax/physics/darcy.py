@@ -33,12 +33,12 @@ class Flow(NamedTuple):
     slow: Coarse  # coarse space of the matrix
     low: jax.Array  # about the least eigenvalue of D^-1 A beyond the coarse space
     high: jax.Array  # no eigenvalue of D^-1 A is above it
-    tolerance: Any  # of a solve, relative to its right-hand side
+    tolerance: jax.Array  # of a solve, relative to its right-hand side
     given: jax.Array | None = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
     enters: jax.Array | None = None  # (V,) [m^3] what enters during the step; None: nothing does
 
 
-def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Any, tolerance: Any) -> Flow:
+def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
     """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
     mask = jnp.ones(mesh.number_of_vertices, J.dtype)
     if porosity.drained is not None:

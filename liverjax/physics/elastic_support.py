@@ -14,7 +14,7 @@ import numpy as np
 
 from liverjax.core import history
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, Numbers, param, struct
+from liverjax.core.struct import Indices, Number, Numbers, param, struct
 from liverjax.mesh import selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
@@ -28,10 +28,12 @@ class ElasticSupport(Physics):
     triangles: Any = param("1", "node numbers (m, 3)", lower=0, default=None)
     normal: Number = param("Pa/m", "stiffness per area along the normal", lower=0.0, default=0.0)
     tangential: Number = param("Pa/m", "stiffness per area along the surface", lower=0.0, default=0.0)
-    nodes: Any = param("1", "node numbers (n,)", lower=0, default=None)
+    nodes: Indices | None = param("1", "node numbers (n,)", lower=0, default=None)
     stiffness: Number = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Any = param("1", "factors of the stiffness (T,), or where the wall moves to (T, 3) [m]", default=None)
+    history: Numbers | None = param(
+        "1", "factors of the stiffness (T,), or where the wall moves to (T, 3) [m]", default=None
+    )
 
     section: ClassVar[str] = "support"
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "normal", "tangential", "stiffness", "history")
@@ -113,7 +115,7 @@ class Springs(NodalForce):
         "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None
     )
 
-    def _stretch(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+    def _stretch(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Stretch of the springs (V, 3) [m]."""
         if self.wall is None:
             return x - mesh.points

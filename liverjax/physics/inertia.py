@@ -55,7 +55,7 @@ class Moving(NodalForce):
     mass: jax.Array = param("kg", "(V,)")
     x: jax.Array = param("m", "positions at the beginning (V, 3)")
     motion: Motion = param("1", "velocity and acceleration there")
-    dt: Any = param("s", "time step")
+    dt: jax.Array = param("s", "time step")
     mask: jax.Array = param("1", "(V, 3) 1 where free")
     integrator: str = static(default="euler")
 

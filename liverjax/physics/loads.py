@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core import history
-from liverjax.core.struct import Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Indices, Number, Numbers, param, replace, static, struct
 from liverjax.mesh import surface
 from liverjax.mesh.nodal import load_volumes
 from liverjax.mesh.tetrahedra import TetMesh
@@ -17,10 +17,10 @@ from liverjax.physics.base import NodalForce, Physics, Step
 class Traction:
     """A load on boundary triangles: dead (`value`), or a pressure that follows them."""
 
-    triangles: Any = param("1", "node numbers (m, 3), normals outwards", lower=0)
+    triangles: Indices = param("1", "node numbers (m, 3), normals outwards", lower=0)
     value: Any = param("Pa", "force per reference area (3,); direction and reference area count", default=None)
-    pressure: Any = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
-    times: Any = param("s", "times of a history (T,)", default=None)
+    pressure: Number | None = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
+    times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Any = param("1", "factors of value or pressure (T,), or the value itself (T, 3) [Pa]", default=None)
 
     def at(self, time: Number) -> "Traction":
@@ -60,7 +60,7 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
     return force
 
 
-def dead_loads(mesh: TetMesh, density: Any, gravity: Any, tractions: tuple) -> jax.Array:
+def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple) -> jax.Array:
     """Nodal forces (V, 3) [N] that do not follow the body: weight (none where `density` is None) and tractions."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
@@ -77,7 +77,7 @@ class Loads(Physics):
     density: Any = param("kg/m^3", "None: no weight", default=None)
     gravity: Any = param("m/s^2", "(3,)", default=None)
     times: Numbers | None = param("s", "times of a history of gravity (T,)", default=None)
-    history: Any = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
+    history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: Any, step: Step) -> "Loading":
@@ -104,7 +104,7 @@ class Loading(NodalForce):
 
     dead: jax.Array = param("N", "(V, 3)")
     traction: tuple[Traction, ...] = param("1", "of which pressures follow the body")
-    k: Any = param("1", "number of the step")
+    k: Number = param("1", "number of the step")
     steps: int = static(default=1, about="of the run")
     growth: str = static(default="none", about="steps: with the load steps; first: within the first step; none")
     before: "Loading | None" = param("1", "at the beginning of the step, where there is a history", default=None)
@@ -114,7 +114,7 @@ class Loading(NodalForce):
         """No pressure follows the body."""
         return not follows(self.traction)
 
-    def fraction(self, s: Any) -> Any:
+    def fraction(self, s: Number) -> Any:
         """Part of the loads that acts at part s of the step."""
         if self.growth == "steps":
             return (self.k - 1 + s) / self.steps

@@ -38,12 +38,12 @@ SCHEMES = ("implicit", "lagged")
 class Inlet:
     """A part of the body with a given pressure of the fluid, or a given flux through its surface."""
 
-    nodes: Any = param("1", "nodes of the pressure (n,)", lower=0, default=None)
-    pressure: Any = param("Pa", "of the fluid at the nodes", default=None)
+    nodes: Indices | None = param("1", "nodes of the pressure (n,)", lower=0, default=None)
+    pressure: Number | None = param("Pa", "of the fluid at the nodes", default=None)
     triangles: Any = param("1", "surface of the flux, node numbers (m, 3)", lower=0, default=None)
     flux: Number | None = param("m/s", "volume that enters per reference area and time", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Any = param("1", "factors of pressure or flux (T,)", default=None)
+    history: Numbers | None = param("1", "factors of pressure or flux (T,)", default=None)
 
     def at(self, value: object, time: Number) -> jax.Array:
         """Pressure or flux at a time [s]."""
@@ -197,7 +197,7 @@ def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple
     return given, enters
 
 
-def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
+def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array) -> jax.Array:
     """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
@@ -205,7 +205,7 @@ def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end:
     return darcy.with_given(mesh, flow, b)
 
 
-def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: Any) -> jax.Array:
+def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array) -> jax.Array:
     """b . P / 2 [J] with P = A^-1 b the pressure at the end of a step that ends with volumes J_end (E,)."""
     b = flow.store * fluid.pressure - integrals(mesh, J_end - fluid.J)
     P = pressure(porosity, mesh, fluid, flow, J_end)

@@ -1,13 +1,11 @@
 """Prescribed motion: nodes that are held, and nodes that are moved."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.history import entry_at
-from liverjax.core.struct import Number, Numbers, param, static, struct
+from liverjax.core.struct import Indices, Number, Numbers, param, static, struct
 from liverjax.mesh.selection import AXES
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -16,7 +14,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 class Fixed:
     """Nodes that do not move along some axes."""
 
-    nodes: Any = param("1", "node numbers (n,)", lower=0)
+    nodes: Indices = param("1", "node numbers (n,)", lower=0)
     axes: str = static(default="xyz", about="held axes")
 
 
@@ -24,10 +22,10 @@ class Fixed:
 class Displaced:
     """Nodes that are moved by `by` at the last step, in proportion before; or along a history, which may scale `by`."""
 
-    nodes: Any = param("1", "node numbers (n,)", lower=0)
+    nodes: Indices = param("1", "node numbers (n,)", lower=0)
     by: Numbers | None = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
-    history: Any = param(
+    history: Numbers | None = param(
         "m", "displacements at these times (T, 3), or factors of by (T,); linear in between", default=None
     )
     axes: str = static(default="xyz", about="prescribed axes")

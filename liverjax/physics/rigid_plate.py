@@ -142,7 +142,7 @@ class Plate(NamedTuple):
         """The part of a field (V, 3) along the free motions. Those of forces depend on the positions x (V, 3)."""
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
-    def given(self, s: Any) -> jax.Array:
+    def given(self, s: Number) -> jax.Array:
         """Angle or torque at part s of the step."""
         return self.before + s * (self.after - self.before)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Numbers, param, replace, static, struct
+from liverjax.core.struct import Indices, Numbers, param, replace, static, struct
 from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
@@ -20,7 +20,7 @@ _FLAT = 1e-6
 class SlidingSupport(Physics):
     """Nodes that do not move along a normal: along an axis, or any direction."""
 
-    nodes: Any = param("1", "node numbers (n,)", lower=0)
+    nodes: Indices = param("1", "node numbers (n,)", lower=0)
     normal: Numbers | None = param("1", "of the plane (3,), of length 1; not used with an axis", default=None)
     axis: str = static(default="", about="x, y or z where the normal is that axis")
 

@@ -66,7 +66,7 @@ class Recall(NamedTuple):
     """Contribution of the memory to a step; constant during Newton's iterations."""
 
     past: Matrix  # sum_k (c_k S^(n-1) + b_k gamma_k^(n-1)) [Pa]
-    now: Any  # 1 - sum_k a_k, () or with the axes of the points
+    now: jax.Array  # 1 - sum_k a_k, () or with the axes of the points
 
 
 def check(prony: Prony, law: Law) -> None:
@@ -271,7 +271,7 @@ class Viscoelastic(Solid):
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
     recall: Recall = param("1", "what is remembered")
-    dt: Any = param("s", "time step")
+    dt: jax.Array = param("s", "time step")
 
     def stress(self, F: Matrix) -> Matrix:
         """See `first_piola`."""

@@ -84,7 +84,7 @@ def on_surface(playing: Playing) -> np.ndarray:
     return playing.positions[playing.nodes].astype("<f4")
 
 
-def surface(playing: Playing) -> dict[str, Any]:
+def surface(playing: Playing) -> dict[str, object]:
     """The fixed data of a page."""
     return {
         "nodes": playing.nodes.tolist(),

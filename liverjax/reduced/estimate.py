@@ -44,7 +44,7 @@ from liverjax.simulation.run import prepared
 class _Body(NamedTuple):
     """The linear body that the error moves: sparse matrices (f, f) of the free degrees of freedom."""
 
-    relaxing: Any  # stiffness of what relaxes [N/m]
+    relaxing: jax.Array  # stiffness of what relaxes [N/m]
     rest: Any  # of what does not, or None
     mass: Any  # diagonal (f,) [kg], or None
 
@@ -80,7 +80,7 @@ def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
     mesh, law, prony = scene.mesh, law_at_rest(scene), scene.viscosity
 
-    def stiffness(law: Any) -> Any:
+    def stiffness(law: Any) -> jax.Array:
         return mjed.stiffness_matrix(mesh, law, mesh.points)[free][:, free].tocsc()
 
     rest = None

@@ -84,7 +84,7 @@ def reduced_identity(scene: Scene) -> str:
     whole = hashlib.sha256()
     for array in (scene.mesh.points, scene.mesh.tetrahedra):
         whole.update(np.ascontiguousarray(np.asarray(array)).tobytes())
-    parts: list[Any] = [scene.mesh.order, str(jax.tree.structure(scene.law))]
+    parts: list[object] = [scene.mesh.order, str(jax.tree.structure(scene.law))]
     prony = scene.viscosity
     parts.append(None if prony is None else (prony.part, prony.scheme, len(jnp.atleast_1d(jnp.asarray(prony.ratios)))))
     parts += [(np.asarray(c.nodes).tolist(), c.axes) for held in (scene.fixed, scene.displaced) for c in held]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core import status
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import Number, param, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.base import End, Free, Solid, Step
 from liverjax.physics.inertia import FACTOR
@@ -69,7 +69,7 @@ class _Equations(NamedTuple):
     mass: jax.Array | None  # (n, n) [kg]
     q: jax.Array  # at the beginning
     motion: ReducedMotion | None
-    dt: Any
+    dt: jax.Array
     newmark: bool | None
     spread: jax.Array | None  # sizes of the slopes (n, 9, S) [1/m] where a part of the body is moved
 
@@ -180,7 +180,7 @@ def _corrected(e: _Equations, at: _ReducedIterate) -> _ReducedIterate:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _newton(newmark: bool, most: int, e: _Equations, tolerance: Any, inverse: jax.Array) -> _Found:
+def _newton(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse: jax.Array) -> _Found:
     """The coordinates at the end of a step, from the inverse of the step before (zeros: none yet).
 
     The tangent is taken anew only where the iterations gain little. Derivatives are those of the solution.

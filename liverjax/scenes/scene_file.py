@@ -138,7 +138,7 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
             yield kinds[0].read(mesh, table, name)
 
 
-def _with_paths(content: Any, folder: Path) -> Any:
+def _with_paths(content: object, folder: Path) -> Any:
     """The content with paths (histories, surfaces, a reduced model) relative to the folder of the scene file."""
     if isinstance(content, list):
         return [_with_paths(value, folder) for value in content]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.mesh.adjacency import PAIRS, Pattern
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.matrices import cofactor, dot, stored
@@ -80,7 +81,7 @@ def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block
 def added(a: Block, b: Block) -> Block:
     """Sum of two blocks; an entry None is 0."""
 
-    def plus(x: Any, y: Any) -> Any:
+    def plus(x: Number, y: Number) -> Number:
         return y if x is None else x if y is None else x + y
 
     return tuple(tuple(map(plus, *rows)) for rows in zip(a, b, strict=True))

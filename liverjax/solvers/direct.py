@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Number
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.attached import Attached
@@ -34,7 +35,12 @@ def solve(
 
 
 def solve_points(
-    mesh: TetMesh, A: PointMatrix, free: Any, b: jax.Array, normals: Any = None, attached: tuple[Attached, ...] = ()
+    mesh: TetMesh,
+    A: PointMatrix,
+    free: Any,
+    b: jax.Array,
+    normals: Number | None = None,
+    attached: tuple[Attached, ...] = (),
 ) -> jax.Array:
     """The same for quadratic elements; b and the solution are (3, V), positions alone.
 
@@ -79,7 +85,7 @@ def _entries(attached: tuple[Attached, ...], n: int) -> list[tuple]:
     return found
 
 
-def _solve(*given: Any) -> np.ndarray:
+def _solve(*given: object) -> np.ndarray:
     import scipy.sparse
 
     rows, diagonal, nodes, free, b, normals, attached = jax.tree.map(np.asarray, given)
@@ -98,7 +104,7 @@ def _solve(*given: Any) -> np.ndarray:
     return _one_solution(A.tocsr(), free.ravel(), b.ravel(), normals, abs(diagonal[0, 0]).mean()).reshape(m, n)
 
 
-def _solve_points(order: int, *given: Any) -> np.ndarray:
+def _solve_points(order: int, *given: object) -> np.ndarray:
     import scipy.sparse
 
     blocks, nodes, own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
@@ -134,7 +140,7 @@ def _solve_points(order: int, *given: Any) -> np.ndarray:
     return x[: 3 * n].reshape(3, n).astype(b.dtype)
 
 
-def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, normals: Any, mean: float) -> np.ndarray:
+def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, normals: Number, mean: float) -> np.ndarray:
     """Solution (n,) of A x = b where `free` (n,) is not 0; `mean` stands for A along the normals."""
     import scipy.sparse.linalg
 

@@ -1,10 +1,12 @@
 """Linear solves inside jit: preconditioned Krylov methods that check their true residual."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from liverjax.core.struct import Number
 
 
 class LinearStatistics(NamedTuple):
@@ -19,7 +21,7 @@ def conjugate_gradients(
     matvec: Callable[[jax.Array], jax.Array],
     b: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
-    tolerance: Any,
+    tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
     """Solve A x = b for symmetric positive definite A, both given as functions of a flat vector (n,).
@@ -55,7 +57,11 @@ def conjugate_gradients(
 
 
 def chebyshev(
-    matvec: Callable[[jax.Array], jax.Array], b: jax.Array, diagonal: jax.Array, bounds: tuple[Any, Any], degree: Any
+    matvec: Callable[[jax.Array], jax.Array],
+    b: jax.Array,
+    diagonal: jax.Array,
+    bounds: tuple[Number, Number],
+    degree: Number,
 ) -> jax.Array:
     """A polynomial in D^-1 A applied to D^-1 b, near A^-1 b: symmetric, positive definite (Saad 2003, 12.3).
 
@@ -82,7 +88,7 @@ def stabilised_biconjugate_gradients(
     matvec: Callable[[jax.Array], jax.Array],
     b: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
-    tolerance: Any,
+    tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
     """The same for a matrix without symmetry: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
@@ -134,7 +140,7 @@ def differentiable_solve(
     matvec: Callable[[jax.Array], jax.Array],
     b: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
-    tolerance: Any,
+    tolerance: Number,
     max_iterations: int,
     known: Known = Known(),
 ) -> jax.Array:
@@ -167,8 +173,8 @@ _INNER, _REFINEMENTS = 5e-2, 60
 
 
 def with_true_residual(
-    nearly: Callable[[jax.Array, Any], jax.Array],
-    tolerance: Any,
+    nearly: Callable[[jax.Array, Number], jax.Array],
+    tolerance: Number,
     matvec: Callable[[jax.Array], jax.Array],
     b: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:

@@ -7,7 +7,7 @@ untangled as a stable neo-Hookean body of the same moduli, whose energy is finit
 there.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ class _Descent(NamedTuple):
     energy: jax.Array
     r: jax.Array
     relative: jax.Array
-    by: Any
+    by: jax.Array
     definite: jax.Array  # so many times more a tangent without negative eigenvalues, then the true one is tried
     patience: jax.Array  # how many times it will be if that fails again
     indefinite: jax.Array  # the last true tangent was not positive
@@ -92,7 +92,9 @@ def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple
     return jax.lax.cond(potential.volume(start, jnp.ones((), start.dtype)) <= 0, away, lambda: (start, zero, zero))
 
 
-def _evaluated(problem: Problem, q: jax.Array, definite: Any, patience: Any, indefinite: Any, *counts: Any) -> _Descent:
+def _evaluated(
+    problem: Problem, q: jax.Array, definite: jax.Array, patience: jax.Array, indefinite: jax.Array, *counts: jax.Array
+) -> _Descent:
     r, force, by = problem.residual(q, jnp.ones((), q.dtype))
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
     energy = _potential(problem).energy(q)

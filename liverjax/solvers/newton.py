@@ -4,12 +4,13 @@ The steps of a scene follow their load in parts as well: `liverjax.solvers.step_
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from liverjax.core import status
+from liverjax.core.struct import Number
 from liverjax.solvers.krylov import (
     Known,
     conjugate_gradients,
@@ -43,7 +44,7 @@ def newton_root(
     residual: Callable[[jax.Array], jax.Array],
     start: jax.Array,
     precondition: Callable[[jax.Array], jax.Array],
-    scale: Any,
+    scale: Number,
     options: NewtonOptions = NewtonOptions(),
 ) -> tuple[jax.Array, NewtonStatistics]:
     """Root of `residual`, a function of a flat vector (n,).

@@ -6,12 +6,13 @@ elements, have an assembled matrix: the second level of the preconditioner.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.basis import basis
@@ -72,7 +73,7 @@ def pull(mesh: TetMesh, A: PointMatrix, pressures: jax.Array) -> tuple[jax.Array
     return tuple(mesh.spread([tuple(p * g for g in border) for border in A.border]))
 
 
-def levels(mesh: TetMesh, A: PointMatrix, bulk: Any = None) -> Levels:
+def levels(mesh: TetMesh, A: PointMatrix, bulk: Number | None = None) -> Levels:
     """Blocks of the diagonal, and the matrix of the vertices' linear elements.
 
     Args:

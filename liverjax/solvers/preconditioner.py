@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.block_matrix import BlockMatrix
 from liverjax.tensors.places import given, taken
@@ -25,7 +26,7 @@ class Coarse(NamedTuple):
     used: jax.Array  # False: left out
 
 
-def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
+def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
     """The coarse space for the leading m x m blocks. Left out if they are not positive definite or `used` is false.
 
     Args:
@@ -50,7 +51,7 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Any) -> Coarse:
     return Coarse(inverse, jnp.asarray(used))
 
 
-def worthwhile(A: BlockMatrix, inertia: Any) -> Any:
+def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:
     """Whether slow motions slow down block-Jacobi: true if inertia is less than a thirtieth of the diagonal."""
     if inertia is None:
         return jnp.array(True)

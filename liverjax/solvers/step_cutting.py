@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from liverjax.core import status
+from liverjax.core.struct import Number
 from liverjax.solvers.krylov import Known, differentiable_solve
 from liverjax.solvers.minimisation import minimise, untangled
 from liverjax.solvers.problem import (
@@ -171,8 +172,8 @@ def _follow(
 
 
 def _robust(
-    problem: Problem, potential: Potential, start: jax.Array, guess: Any, kept: Kept, options: StepOptions
-) -> tuple[jax.Array, Any]:
+    problem: Problem, potential: Potential, start: jax.Array, guess: jax.Array, kept: Kept, options: StepOptions
+) -> tuple[jax.Array, jax.Array]:
     """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least.
 
     At rest a start is but a guess: where it is nearly flat or leads nowhere, the load is followed from the reference
@@ -255,7 +256,7 @@ class _Verdict(NamedTuple):
 
 
 def _judge(
-    c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, roundoff: Any, options: StepOptions
+    c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, roundoff: Number, options: StepOptions
 ) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
     # The first point of a part need not be better, if its direction was that of a tangent made there.
@@ -351,7 +352,7 @@ def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
 
 
 def _direction(
-    problem: Problem, kept: Kept, at: Any, load: jax.Array, forcing: Any, when: tuple[Any, Any]
+    problem: Problem, kept: Kept, at: Any, load: jax.Array, forcing: Number, when: tuple[Number, Number]
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
     """Solve dr/dq dq = load to `forcing`; return dq, the iterations, the tangent and whether it is positive.
 

@@ -5,6 +5,9 @@ With f_m = F a_m and D' = A^T D the material part of the stiffness of two nodes 
 
 from typing import Any
 
+import jax
+
+from liverjax.core.struct import Number
 from liverjax.tensors.matrices import Matrix, Vector, dot, matmul, stored, transpose
 
 #: Pairs of different axes, and where the six components of a symmetric matrix stand.
@@ -56,13 +59,13 @@ def anisotropic(T: list, a: Vector) -> Matrix:
     return tuple(tuple(_contract([T[m][p][n] for p in range(3)], a) for n in range(3)) for m in range(3))
 
 
-def _contract(values: list, a: Vector) -> Any:
+def _contract(values: list, a: Vector) -> jax.Array:
     """Scalar product that leaves out components of `a` that are the number 0, as in the coordinate directions."""
     terms = [v if isinstance(c, float) and c == 1 else v * c for v, c in zip(values, a, strict=True) if not _is_zero(c)]
     return sum(terms[1:], terms[0])
 
 
-def _is_zero(c: Any) -> bool:
+def _is_zero(c: Number) -> bool:
     return isinstance(c, float) and c == 0
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number
 
 Vector = tuple[Any, ...]
 Matrix = tuple[Vector, ...]
@@ -22,7 +23,7 @@ class Invariants(NamedTuple):
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2
-    I4: Any = None  # a . C a of the law's fibre direction a
+    I4: jax.Array | None = None  # a . C a of the law's fibre direction a
     J: Any = None  # det F
     stretches: Any = None  # `liverjax.tensors.principal.Stretches`
     E: Any = None  # Green's strain, a tuple matrix in the axes of the law
@@ -43,12 +44,12 @@ def add(*vectors: Vector) -> Vector:
     return tuple(sum(c[1:], c[0]) for c in zip(*vectors, strict=True))
 
 
-def scale(s: Any, a: Vector) -> Vector:
+def scale(s: Number, a: Vector) -> Vector:
     """Scalar times vector."""
     return (s * a[0], s * a[1], s * a[2])
 
 
-def scale_matrix(w: Any, A: Matrix) -> Matrix:
+def scale_matrix(w: Number, A: Matrix) -> Matrix:
     """Scalar times matrix."""
     return tuple(scale(w, row) for row in A)
 
@@ -75,7 +76,7 @@ def cofactor(F: Matrix) -> Matrix:
     return transpose((cross(c1, c2), cross(c2, c0), cross(c0, c1)))
 
 
-def determinant(F: Matrix) -> Any:
+def determinant(F: Matrix) -> jax.Array:
     """J = det F."""
     c0, c1, c2 = transpose(F)
     return dot(c0, cross(c1, c2))

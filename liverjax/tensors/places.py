@@ -1,15 +1,15 @@
 """Read and add at node and edge numbers of a mesh. They are within bounds, so the program does not check."""
 
-from typing import Any
-
 import jax
 
+from liverjax.core.struct import Indices
 
-def taken(values: jax.Array, places: Any) -> jax.Array:
+
+def taken(values: jax.Array, places: Indices) -> jax.Array:
     """`values` (n, …) at `places`, whole numbers from 0 to n - 1 of any shape."""
     return values.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def given(total: jax.Array, places: Any, shares: jax.Array) -> jax.Array:
+def given(total: jax.Array, places: Indices, shares: jax.Array) -> jax.Array:
     """`total` (n, …) with `shares` added at `places`, whole numbers from 0 to n - 1, as often as they occur."""
     return total.at[places].add(shares, mode="promise_in_bounds", wrap_negative_indices=False)

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.tensors.material_axes import PAIRS, SIX, rotated, six_of, symmetric
 from liverjax.tensors.matrices import Matrix, Vector, determinant, dot, matvec, right_cauchy_green, transpose
 
@@ -27,7 +28,7 @@ class Stretches(NamedTuple):
 
     logs: Vector  # ln lambda_m
     change: tuple  # X: `change` in principal axes
-    log_J: Any  # NaN for J < 0: isochoric stretches do not exist there
+    log_J: jax.Array  # NaN for J < 0: isochoric stretches do not exist there
 
 
 def principal(F: Matrix) -> tuple[Vector, Matrix]:
@@ -106,7 +107,7 @@ def _(left, primals, tangents):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _counted_one(left: int, C: tuple) -> Any:
+def _counted_one(left: int, C: tuple) -> jax.Array:
     """The number 1, which may be differentiated `left` times. A further derivative would be wrong: it is refused."""
     return jnp.ones_like(C[0])
 
@@ -121,7 +122,7 @@ def _(left, primals, tangents):
 # -- powers -----------------------------------------------------------------------------------------------------------
 
 
-def power_sum(s: Stretches, alpha: Any) -> Any:
+def power_sum(s: Stretches, alpha: Number) -> jax.Array:
     """sum_m (J^(-1/3) lambda_m)^alpha - 3, without cancellation at rest."""
     return _power_sum(jnp.asarray(alpha, jnp.result_type(s.log_J)), s.logs, s.change, s.log_J)
 
@@ -140,7 +141,7 @@ def _(primals, tangents):
 _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # i, j of g[i, i, j]
 
 
-def expanded_power_sum(alpha: Any, logs: Vector, change: tuple, log_J: Any) -> Any:
+def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
     """The expansion of this module's head for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
 
     Divided differences of one kind are one stacked array: a tenth of the operations to compile.
@@ -166,7 +167,7 @@ def expanded_power_sum(alpha: Any, logs: Vector, change: tuple, log_J: Any) -> A
     return total * jnp.exp(-alpha / 3 * (log_J - log_J0)) - 3
 
 
-def divided_difference(p: Any, *logs: Any) -> Any:
+def divided_difference(p: Number, *logs: Number) -> jax.Array:
     """Divided difference of c^p at one, two or three nodes c = exp(log), accurate where nodes are near or equal."""
     if len(logs) == 1:
         return jnp.exp(p * logs[0])
@@ -184,7 +185,7 @@ def divided_difference(p: Any, *logs: Any) -> Any:
     )
 
 
-def _divided_power(p: Any, y: list) -> Any:
+def _divided_power(p: Any, y: list) -> Number:
     """Divided difference of (1 + c)^p at three |c| < 0.11: its binomial series, cut at 0.11^16 = 5e-16."""
     homogeneous = [jnp.ones_like(y[0]), *[jnp.zeros_like(y[0])] * 15]  # complete homogeneous sums h_k of the nodes
     for node in y:
@@ -197,17 +198,17 @@ def _divided_power(p: Any, y: list) -> Any:
     return total
 
 
-def sinh_ratio(p: Any, delta: Any) -> Any:
+def sinh_ratio(p: Number, delta: Number) -> jax.Array:
     """sinh(p delta) / sinh(delta), p where delta = 0."""
     return p * _sinhc(p * delta) / _sinhc(delta)
 
 
-def _sinhc(x: Any) -> Any:
+def _sinhc(x: Number) -> Any:
     """sinh(x)/x; its series (last term 1/19!) below 1."""
     square = x * x
     near = square < 1
-    small: Any = jnp.where(near, square, 0.0)
-    series: Any = 0.0
+    small: jax.Array = jnp.where(near, square, 0.0)
+    series: Number = 0.0
     for k in range(9, -1, -1):
         series = series * small + 1 / math.factorial(2 * k + 1)
     safe = jnp.where(near, 1.0, x)

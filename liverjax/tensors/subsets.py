@@ -6,6 +6,8 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
+
 T = TypeVar("T")
 
 
@@ -42,7 +44,7 @@ def in_subset(s: Subsets, k: int, numbers: T) -> T:
     """The numbers of a pytree that belong to subset k, of arrays (…, E) and (…, E, 3). Others stay as they are."""
     E, own = s.number_of_elements, s.elements[k][0]
 
-    def one(a: Any) -> Any:
+    def one(a: Number) -> Number:
         shape = jnp.shape(a)
         if shape[-1:] == (E,):
             return jnp.asarray(a)[..., own]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, static, struct
+from liverjax.core.struct import Number, Numbers, param, static, struct
 from liverjax.laws.base import Law
 from liverjax.laws.terms.green_terms import GreenModuli
 from liverjax.tensors.material_axes import SIX, symmetric
@@ -30,8 +30,8 @@ class Costa(Law):
     b_fn: Number = param("1", "shear fibre-normal", above=0.0, typical=4.0)
     b_sn: Number = param("1", "shear sheet-normal", above=0.0, typical=2.0)
     bulk: Number = param("Pa", "bulk modulus of U(J)", above=0.0, typical=7700.0)
-    fibre: Any = param("1", "fibre direction, (3,) or (E, 3)", each=True, default=(1.0, 0.0, 0.0))
-    sheet: Any = param("1", "sheet direction, (3,) or (E, 3)", each=True, default=(0.0, 1.0, 0.0))
+    fibre: Numbers = param("1", "fibre direction, (3,) or (E, 3)", each=True, default=(1.0, 0.0, 0.0))
+    sheet: Numbers = param("1", "sheet direction, (3,) or (E, 3)", each=True, default=(0.0, 1.0, 0.0))
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("E", "J")
 
@@ -77,6 +77,6 @@ class Costa(Law):
             )
 
     @classmethod
-    def guccione(cls, *, c: Any, b_f: Any, b_t: Any, b_fs: Any, bulk: Any, **directions: Any) -> "Costa":
+    def guccione(cls, *, c: Number, b_f: Number, b_t: Number, b_fs: Number, bulk: Number, **directions: Any) -> "Costa":
         """Guccione, McCulloch and Waldman 1991: b_ff = b_f, b_ss = b_nn = b_sn = b_t, b_fs = b_fn = b_fs."""
         return cls(c=c, b_ff=b_f, b_ss=b_t, b_nn=b_t, b_sn=b_t, b_fs=b_fs, b_fn=b_fs, bulk=bulk, **directions)

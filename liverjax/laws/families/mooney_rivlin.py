@@ -14,7 +14,7 @@ _POWERS = {"c10": (1, 0), "c01": (0, 1), "c20": (2, 0), "c11": (1, 1), "c02": (0
 }
 
 
-def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Any:
+def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
     """coefficient * prod x^n without a power of zero (whose derivative is not a number)."""
     value = coefficient
     for x, n in factors:
@@ -32,13 +32,13 @@ class MooneyRivlin(Law):
 
     c10: Number = param("Pa", "coefficient of (Ibar1 - 3)", typical=300.0)
     c01: Number = param("Pa", "coefficient of (Ibar2 - 3)", typical=85.0)
-    c20: Any = param("Pa", "coefficient of (Ibar1 - 3)^2", default=None)
-    c11: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)", default=None)
-    c02: Any = param("Pa", "coefficient of (Ibar2 - 3)^2", default=None)
-    c30: Any = param("Pa", "coefficient of (Ibar1 - 3)^3", default=None)
-    c21: Any = param("Pa", "coefficient of (Ibar1 - 3)^2 (Ibar2 - 3)", default=None)
-    c12: Any = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)^2", default=None)
-    c03: Any = param("Pa", "coefficient of (Ibar2 - 3)^3", default=None)
+    c20: Number | None = param("Pa", "coefficient of (Ibar1 - 3)^2", default=None)
+    c11: Number | None = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)", default=None)
+    c02: Number | None = param("Pa", "coefficient of (Ibar2 - 3)^2", default=None)
+    c30: Number | None = param("Pa", "coefficient of (Ibar1 - 3)^3", default=None)
+    c21: Number | None = param("Pa", "coefficient of (Ibar1 - 3)^2 (Ibar2 - 3)", default=None)
+    c12: Number | None = param("Pa", "coefficient of (Ibar1 - 3)(Ibar2 - 3)^2", default=None)
+    c03: Number | None = param("Pa", "coefficient of (Ibar2 - 3)^3", default=None)
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("I1", "I2", "J")

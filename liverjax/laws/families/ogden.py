@@ -3,10 +3,11 @@
 Xi(alpha) = sum_m (J^(-1/3) lambda_m)^alpha. A law of stretches receives X = Xi - 3, which is exact at rest.
 """
 
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, static, struct
+from liverjax.core.struct import Array, Number, param, static, struct
 from liverjax.laws.base import Law
 
 
@@ -18,8 +19,8 @@ class Ogden(Law):
     every stretch where each mu_k alpha_k > 0.
     """
 
-    mu: Any = param("Pa", "mu_k, one a term", each=True, typical=(700.0, -40.0))
-    alpha: Any = param("1", "alpha_k, one a term", nonzero=True, each=True, typical=(2.5, -4.0))
+    mu: Sequence[float] | Array = param("Pa", "mu_k, one a term", each=True, typical=(700.0, -40.0))
+    alpha: Sequence[float] | Array = param("1", "alpha_k, one a term", nonzero=True, each=True, typical=(2.5, -4.0))
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.laws import products
 from liverjax.tensors.matrices import (
     IDENTITY,
@@ -36,25 +37,25 @@ if TYPE_CHECKING:
 class _Term(NamedTuple):
     """One product's scalars: g and its derivatives by I1 and I2, h and its derivatives by J."""
 
-    g: Any
-    g1: Any
-    g2: Any
-    g11: Any
-    g12: Any
-    g22: Any
-    h: Any
-    h1: Any
-    h2: Any
+    g: Number
+    g1: Number
+    g2: Number
+    g11: Number
+    g12: Number
+    g22: Number
+    h: Number
+    h1: jax.Array
+    h2: jax.Array
 
 
-def _power(x: Any, n: int) -> Any:
+def _power(x: Number, n: int) -> Number:
     return 1.0 if n == 0 else x**n
 
 
-def _term(k: products.Product, I1: Any, I2: Any, J: Any) -> _Term:
+def _term(k: products.Product, I1: Number, I2: Number, J: jax.Array) -> _Term:
     c, i, j, p = k
 
-    def g(a: int, b: int) -> Any:
+    def g(a: int, b: int) -> Number:
         """The a-th derivative by I1, the b-th by I2."""
         factor = (1, i, i * (i - 1))[a] * (1, j, j * (j - 1))[b]
         return 0.0 if factor == 0 else c * factor * _power(I1, i - a) * _power(I2, j - b)
@@ -69,7 +70,7 @@ class _At(NamedTuple):
     C: Matrix
     B: Matrix  # I1 Id - C
     cof: Matrix
-    J: Any
+    J: jax.Array
     groups: list  # (terms, phi', phi'')
 
 
@@ -103,7 +104,7 @@ def first_piola(law: "Law", F: Matrix) -> Matrix:
     return total
 
 
-def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, Any]]:
+def constant_matrices(D: list[Vector], pairs: tuple) -> list[tuple[Matrix, jax.Array]]:
     """D_i (x) D_j and D_i . D_j of every pair: the constant parts of L and U."""
     return [(outer(D[i], D[j]), dot(D[i], D[j])) for i, j in pairs]
 
@@ -158,7 +159,7 @@ def _written(values: Any) -> Any:
     return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])
 
 
-def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Any], regularised: bool) -> Matrix:
+def _six_terms(s: _At, i: _Node, j: _Node, constant: tuple[Matrix, Number], regularised: bool) -> Matrix:
     K = scale_matrix(0.0, IDENTITY)
     for n, (terms, phi1, phi2) in enumerate(s.groups):
         for t, FSDi, FSDj, SDj in zip(terms, i.FS[n], j.FS[n], j.S[n], strict=True):
@@ -185,7 +186,7 @@ def _second_derivative_of_J(F: Matrix, Di: Vector, Dj: Vector) -> Matrix:
     return ((0.0, n2, -n1), (-n2, 0.0, n0), (n1, -n0, 0.0))
 
 
-def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Any]) -> Matrix:
+def _linear_matrices(t: _Term, i: _Node, j: _Node, constant: tuple[Matrix, Number]) -> Matrix:
     """L + U of dS/dC : H = beta H + sum delta_ab (B_b : H) B_a, with B_1 = Id and B_2 = I1 Id - C."""
     DiDj, product = constant
     beta = -2 * t.g2

@@ -43,7 +43,7 @@ class GreenModuli(NamedTuple):
 
     normal: Matrix  # C_mmnn
     shear: Vector  # C_mnmn of the pairs 12, 13, 23
-    curvature: Any
+    curvature: jax.Array
 
 
 def components(direction: Any, like: Any) -> Vector:

@@ -9,6 +9,7 @@ No matrix is inverted. Energies of stretches and of Green's strain add their str
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from liverjax.laws.terms import green_terms, stretch_terms
@@ -40,7 +41,7 @@ class Stress(NamedTuple):
     """P = F S + p cof F, arrays of shape (E,): `S` a symmetric matrix or, where it is spherical, one array; p = W_J."""
 
     S: Matrix | Any
-    p: Any
+    p: jax.Array
 
 
 class Scalars(NamedTuple):
@@ -58,7 +59,7 @@ class State(NamedTuple):
     C: Matrix | None
     cof: Matrix
     I1: Any
-    J: Any
+    J: jax.Array
     first: dict
     second: dict
     fibres: dict  # invariant I4 of a summand -> its fibre direction
@@ -166,7 +167,7 @@ def second_piola(F: Matrix, resultant: Stress) -> Matrix:
     J = dot(F[0], cof[0])
     p_over_J = p / jnp.where(abs(J) < _FLAT, jnp.copysign(_FLAT, J), J)
 
-    def entry(i: int, j: int) -> Any:
+    def entry(i: int, j: int) -> jax.Array:
         s = S[i][j] if isinstance(S, tuple) else (S if i == j else 0.0)
         return s + p_over_J * dot(columns[i], columns[j])
 
@@ -197,7 +198,7 @@ def _weight(invariant: str) -> float:
 class _Parts(NamedTuple):
     """The parts of the blocks."""
 
-    J: Any
+    J: jax.Array
     first: dict
     second: dict
     slopes: list[dict]  # of every node

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from liverjax.core.struct import Number
 from liverjax.tensors.material_axes import (
     PAIRS,
     SIX,
@@ -81,7 +82,7 @@ def _at_stretches(law: "Law", F: Matrix, frame: Frame) -> Principal:
 def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
     """C_mmnn as a matrix and C_mnmn of the three pairs."""
 
-    def normal(m: int, n: int) -> Any:
+    def normal(m: int, n: int) -> jax.Array:
         h = -2 * s.tau[m] if m == n else 0.0
         for w, a, t in zip(s.first, s.alphas, s.powers, strict=True):
             h = h + w * a * a * ((t[m] if m == n else 0.0) - (t[m] + t[n]) / 3 + sum(t) / 9)
@@ -90,7 +91,7 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
             h = h + w * (a[m] * b[n] if k == l else a[m] * b[n] + b[m] * a[n])
         return h * (s.inverse[m] * s.inverse[n])
 
-    def shear(m: int, n: int) -> Any:
+    def shear(m: int, n: int) -> jax.Array:
         G = 0.0
         for w, a, t in zip(s.first, s.alphas, s.powers, strict=True):
             ratio = sinh_ratio(a / 2 - 1, s.logs[m] - s.logs[n])
@@ -120,7 +121,7 @@ def blocks(law: "Law", F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -
     return [pushed(F, anisotropic(half[j], D[i])) for i, j in pairs]
 
 
-def _arrays(law: "Law", F: Matrix) -> Any:
+def _arrays(law: "Law", F: Matrix) -> jax.Array:
     """The law with its parameters in the precision of F: whole numbers have no derivative."""
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.result_type(F[0][0])), law)
 
@@ -188,25 +189,25 @@ def _(primals, tangents):
     return _moduli_of_axes(law, F, frame), add(*parts)
 
 
-def _perturbed(tangents: Any) -> bool:
+def _perturbed(tangents: Number) -> bool:
     return not all(isinstance(t, SymbolicZero) for t in jax.tree.leaves(tangents, is_leaf=_vanishes))
 
 
-def _filled_matrix(tangents: Any, like: Any) -> Any:
+def _filled_matrix(tangents: Number, like: Any) -> jax.Array:
     def fill(t, v):
         return jnp.zeros_like(v) if isinstance(t, SymbolicZero) else t
 
     return jax.tree.map(fill, tangents, like, is_leaf=_vanishes)
 
 
-def _vanishes(t: Any) -> bool:
+def _vanishes(t: Number) -> bool:
     return isinstance(t, SymbolicZero)
 
 
 # -- the same from the expanded energy, slower, to be differentiated --------------------------------------------------
 
 
-def _expanded_energy(law: "Law", logs: Vector, axes: Matrix, log_J0: Any, Y: tuple) -> Any:
+def _expanded_energy(law: "Law", logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
     """w of C = diag(lambda^2) + N^T Y N in frozen principal axes N."""
     X = six_of(rotated(symmetric(Y), transpose(axes)))
     relative = [x * jnp.exp(-logs[i] - logs[j]) for x, (i, j) in zip(X, SIX, strict=True)]

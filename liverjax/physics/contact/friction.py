@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Number, param, replace, struct
+from liverjax.core.struct import Array, Number, param, replace, struct
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Start, Step
 from liverjax.physics.contact.obstacle import (
@@ -65,12 +65,15 @@ class RoughObstacle(Obstacle):
         moved = super().freeze(memory, step).moved
         past = contact_points(self, step.mesh, step.x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
-        parts = {
-            "friction": self.friction,
-            "nodes": touching_nodes(self, step.mesh),
-            "functions": point_functions(step.mesh, step.x.dtype),
-        }
-        return Rubbing(obstacle=self, moved=moved, slip=slip, past=past, **parts)
+        return Rubbing(
+            obstacle=self,
+            moved=moved,
+            slip=slip,
+            past=past,
+            friction=self.friction,
+            nodes=touching_nodes(self, step.mesh),
+            functions=point_functions(step.mesh, step.x.dtype),
+        )
 
     def advance(self, memory: jax.Array, acting: "Rubbing", end: End) -> jax.Array:
         """The slip (3, Q, m) [m] at the end of the step."""
@@ -83,9 +86,9 @@ class Rubbing(Touching):
 
     friction: Number = param("1", "mu", default=0.0)
     slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
-    past: Any = param("m", "points of contact then, as seen from the obstacle (3, Q, m)", default=None)
-    nodes: Any = param("1", "of the triangles (n, m)", default=None)
-    functions: Any = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
+    past: jax.Array | None = param("m", "points of contact then, as seen from the obstacle (3, Q, m)", default=None)
+    nodes: Array | None = param("1", "of the triangles (n, m)", default=None)
+    functions: Array | None = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
 
     conservative: ClassVar[bool] = False  # type: ignore[misc]
 

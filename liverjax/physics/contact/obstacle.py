@@ -45,7 +45,9 @@ class Obstacle(Physics):
     position: Numbers = param(
         "m", "point of the plane or of the cylinder's axis, centre, tip (3,)", default=(0.0, 0.0, 0.0)
     )
-    axis: Any = param("1", "normal to the free side; axis; from the cone's tip inwards (3,)", default=(0.0, 0.0, 1.0))
+    axis: Numbers = param(
+        "1", "normal to the free side; axis; from the cone's tip inwards (3,)", default=(0.0, 0.0, 1.0)
+    )
     radius: Number = param("m", "of sphere and cylinder; of a cone's rounded tip", lower=0.0, default=0.0)
     half_angle: Number = param("deg", "of the cone, between axis and side", above=0.0, default=45.0)
     by: Numbers | None = param("m", "displacement (3,), reached at the last step", default=None)

@@ -132,7 +132,7 @@ class Pressing(Touching):
     load: Any = param("N", "size of the force at the beginning and at the end (2,)", default=None)
     direction: Any = param("1", "of the force (3,)", default=None)
     before: Any = param("m", "travel at the beginning ()", default=None)
-    nodes: Any = param("1", "of the triangles (n, m)", default=None)
+    nodes: jax.Array | None = param("1", "of the triangles (n, m)", default=None)
     functions: jax.Array | None = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
 
@@ -142,11 +142,11 @@ class Pressing(Touching):
         """Points of contact (3, Q, m) at positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
 
-    def place(self, x: jax.Array, s: Any) -> jax.Array:
+    def place(self, x: jax.Array, s: Number) -> jax.Array:
         """Displacement (3,) [m] of the obstacle at positions x (V, 3) and part s of the step."""
         return self.travel(self.points(x), s) * self.direction
 
-    def travel(self, at: jax.Array, s: Any) -> jax.Array:
+    def travel(self, at: jax.Array, s: Number) -> jax.Array:
         """Travel () [m] at which the contact carries the force; NaN where no place does. Has first derivatives."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))

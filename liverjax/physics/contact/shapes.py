@@ -65,7 +65,7 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
     return Distance(r - radius, n, bent)
 
 
-def _cone(y: list[jax.Array], axis: Any, radius: Any, half_angle: Number) -> Distance:
+def _cone(y: list[jax.Array], axis: jax.Array, radius: Number, half_angle: Number) -> Distance:
     """Distance from a cone: from its side or its tip. A round tip: from a sharp cone further in, less the radius."""
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]

@@ -101,7 +101,7 @@ class Mixed(VolumeStress):
     rest: Any = param("Pa", "K - gamma, carried by the pressures")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
-    unit: Any = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
+    unit: jax.Array = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
     kind: str = static(about="of the volumetric energy")
 
     coupled: ClassVar[bool] = False
