@@ -8,7 +8,8 @@ import pytest
 from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
-from fitting.fits import edges, models, viscoelastic
+from fitting.fits import models, viscoelastic
+from fitting.fits.honesty import edges, total_error
 from fitting.methods import generalised_maxwell, kramers_kronig
 from fitting.methods.kramers_kronig import runs_probability
 from fitting.readers.rheometer import Sweep, read_sweep, some, within
@@ -149,8 +150,52 @@ def test_the_front_page_says_that_its_ends_decide(tmp_path, capsys):
     assert len(changes["ratios"]) == 3 and len(changes["relaxation_times"]) == 3
     assert abs(changes["shear_modulus"]) > content["standard_errors"]["shear_modulus"]
     assert "Pa *" in out and "without the first or the last half decade" in out
-    words = ("mark of the instrument", "Kramers-Kronig", "structured misfit", "so the ends of the band decide them")
-    assert all(any(w in sentence for sentence in content["warnings"]) for w in words)
+    words = ("the fit misses the data", "structured misfit", "so the ends of the band decide them", "between samples")
+    assert len(content["warnings"]) == 4  # the most important one first, each with what to do
+    for sentence, word in zip(content["warnings"], words, strict=True):
+        assert word in sentence
+    assert "Kramers-Kronig" in content["warnings"][0]
+    # The last point is the instrument's: left out and named; --max-frequency keeps it and warns.
+    assert any("1 of 31 points above 12.64 Hz is left out" in note for note in content["notes"])
+    main([str(LIONS_MANE), "--method", "closed-form", "--max-frequency", "16", "--out", str(tmp_path)])
+    kept = json.loads((tmp_path / "fit.json").read_text())
+    assert len(kept["shear_waves"]["frequency_Hz"]) == 31
+    assert any("mark of the instrument" in w for w in kept["warnings"])
+
+
+def test_the_total_error_has_every_share(tmp_path):
+    args = [str(LIONS_MANE), "--method", "closed-form", "--radius", "0.004", "--height", "0.0092"]
+    main([*args, "--out", str(tmp_path)])
+    content = json.loads((tmp_path / "fit.json").read_text())
+    shares, total, G0 = content["error_shares"], content["total_errors"], content["shear_modulus"]
+    # 50 um of 9.2 mm, and 10 um of a radius of 4 mm, to the fourth power.
+    geometry = np.hypot(50e-6 / 9.2e-3, 4 * 10e-6 / 4e-3)
+    assert shares["geometry"]["shear_modulus"] == pytest.approx(geometry * G0)
+    assert shares["geometry"]["ratios"] == [0, 0, 0] == shares["geometry"]["relaxation_times"]
+    assert shares["noise"] == content["standard_errors"]
+    change = content["band_sensitivity"]["without_last_half_decade"]["shear_modulus"]
+    beyond = np.sqrt(change**2 - content["standard_errors"]["shear_modulus"] ** 2)
+    assert shares["band"]["shear_modulus"] == pytest.approx(beyond)
+    square = sum(part["shear_modulus"] ** 2 for part in shares.values())
+    assert total["shear_modulus"] == pytest.approx(np.sqrt(square))
+    main([*args, "--gap-error", "1e-3", "--out", str(tmp_path)])
+    told = json.loads((tmp_path / "fit.json").read_text())
+    assert told["error_shares"]["geometry"]["shear_modulus"] == pytest.approx(0.01 * G0)  # the gap is in the noise
+    assert told["standard_errors"]["shear_modulus"] > 0.1 * G0
+
+
+def test_whole_intervals_hold_the_moduli_where_the_gap_is_not_told():
+    """Noise of 1 %, a gap off by 50 um of 4 mm (seeded): intervals of noise alone miss half of them."""
+    rng, inside, noise_alone = np.random.default_rng(0), 0, 0
+    s = two_modes(0.0)
+    for _ in range(60):
+        G = (s.storage, s.loss) * (1 + 0.01 * rng.standard_normal((2, 31)))
+        off = 1 + 50e-6 / 4e-3 * rng.standard_normal()
+        f = viscoelastic.closed_form(s._replace(storage=off * G[0], loss=off * G[1]), 2)
+        apart = abs(float(f.model.shear_modulus) - 800.0)
+        inside += apart <= f.uncertainty.quantile * total_error.total_errors(f)["shear_modulus"]
+        noise_alone += apart <= f.uncertainty.quantile * f.uncertainty.standard_errors[0]
+    assert inside >= 52 and noise_alone <= 45  # 57 of 60 expected; below 52 by chance in 2 of 100 cases
 
 
 def test_points_outside_the_limits_are_left_out_and_said():

@@ -68,7 +68,7 @@ STOREYS = {
         "play",
         "commands",
     ),
-    "fitting": ("readers", "rigs", "methods", "waves", "fits", "amplitude", "reports", "commands"),
+    "fitting": ("readers", "rigs", "methods", "waves", "fits", "amplitude", "master", "reports", "commands"),
 }
 #: Files of a package that belong to no room: what users import, and the way in.
 DOORS = {"liverjax": {"check"}, "fitting": {"fit", "joint", "rheometer", "torsion"}}

@@ -30,6 +30,10 @@ def main() -> None:
         keep = ("modes", "shear_modulus", "equilibrium_modulus", "ratios", "relaxation_times", "standard_errors")
         keep += ("mean_relative_error", "max_relative_error", "run_time_s", "compile_time_s", "warnings", "details")
         rows[name] = {k: content[k] for k in keep} | {
+            "total_errors": content["total_errors"],
+            "error_shares": content["error_shares"],
+            "frequencies": len(content["shear_waves"]["frequency_Hz"]),
+            "notes": content["notes"],
             "exit_code": code,
             "total_s": total,
             "closed_form": {k: closed[k] for k in keep},

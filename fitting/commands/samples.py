@@ -11,15 +11,12 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from fitting.fits import samples
-    from fitting.readers import rheometer
     from fitting.reports import samples_report
     from liverjax.core.files import writable
 
     sweeps = []
     for path in options.sweep:
-        sweep = rheometer.read_sweep(path, options.table)
-        sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
-        sweeps.append(rheometer.without_inertia(sweep, options.radius, options.height))
+        sweeps.append(shared_options.usable_sweep(options, path))
         for note in sweeps[-1].notes:
             print(f"note: {path.name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))

@@ -1,4 +1,4 @@
-"""Options that several commands share: number of modes, draws of the posterior, material cards."""
+"""What several commands ask for in the same words: a number of modes, draws of the posterior, cards; the sweep."""
 
 import argparse
 import sys
@@ -9,6 +9,7 @@ from liverjax.core.errors import InputError
 
 if TYPE_CHECKING:
     from fitting.methods.generalised_maxwell import Maxwell
+    from fitting.readers.frequency_sweep import Sweep
 
 
 def add_modes(command: argparse.ArgumentParser) -> None:
@@ -46,3 +47,13 @@ def write_cards(out: Path, model: "Maxwell") -> None:
     for sentence in material_cards.write(out / "cards", model):
         print(f"note: {sentence}", file=sys.stderr)
     print(f"written: {out}/cards")
+
+
+def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
+    """The sweep of a file without the points that are the instrument's; a band that is asked for is kept whole."""
+    from fitting.methods import kramers_kronig
+    from fitting.readers import rheometer
+
+    sweep = rheometer.within(rheometer.read_sweep(path, options.table), options.min_frequency, options.max_frequency)
+    sweep = rheometer.without_inertia(sweep, options.radius, options.height)
+    return sweep if options.max_frequency else kramers_kronig.without_instrument(sweep)

@@ -58,9 +58,32 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--method", choices=("torsion", "closed-form"), help="default torsion; of several samples closed-form"
     )
+    command.add_argument(
+        "--master",
+        nargs="?",
+        type=_celsius,
+        const=MIDDLE,
+        metavar="C",
+        help="the files hold sweeps at several temperatures: shift them to the one nearest to C degrees Celsius "
+        "(default the middle one) and fit the master curve",
+    )
+    command.add_argument("--vertical", action="store_true", help="with --master: moduli have shift factors too")
     _add_sample(command)
     _add_outputs(command)
     return command
+
+
+#: `--master` without a temperature.
+MIDDLE = float("nan")
+
+
+def _celsius(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no temperature in degrees Celsius: give the file first"
+        ) from None
 
 
 def _add_sample(command: argparse.ArgumentParser) -> None:
@@ -109,11 +132,12 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Fit the model; 1 if the fit did not converge."""
     from fitting.methods import uncertainty
-    from fitting.readers import rheometer
     from fitting.reports import sweep_report
 
     _check(options)
-    if len(options.sweep) > 1:
+    if options.master is not None:
+        options.method = options.method or "closed-form"  # the moduli are of no frequency that a plate was turned at
+    elif len(options.sweep) > 1:
         from fitting.commands import samples
 
         return samples.run(options)
@@ -121,14 +145,17 @@ def run(options: argparse.Namespace) -> int:
         from fitting.commands import together
 
         return together.run(options)
-    options.sweep, options.method = options.sweep[0], options.method or "torsion"
-    sweep = rheometer.read_sweep(options.sweep, options.table)
-    sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
-    sweep = rheometer.without_inertia(sweep, options.radius, options.height)
+    options.method = options.method or "torsion"
+    if options.master is None:
+        sweep, shift = shared_options.usable_sweep(options, options.sweep[0]), {}
+    else:
+        sweep, shift = _master(options)
     for note in sweep.notes:
         print(f"note: {note}", file=sys.stderr)
     import_meanwhile()
     fits, sweep = _fits(options, sweep)
+    for fit in fits:
+        fit.details.update(shift)
     profile = None
     if options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
@@ -156,6 +183,22 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png, fit.h5")
     return 0 if fits[-1].converged else 1
+
+
+def _master(options: argparse.Namespace) -> tuple["Sweep", dict]:
+    """The master curve of the files, written and printed, and its part of fit.json."""
+    from fitting.master import master_curve, master_report, temperature_sweeps
+    from fitting.readers import rheometer
+
+    reference = None if options.master != options.master else options.master + 273.15
+    data = temperature_sweeps.read_temperatures(options.sweep)
+    found = master_curve.master_curve(data, reference, options.vertical)
+    writable(options.out, ("shift_factors.csv", "master_curve.csv", "shift.png"))
+    master_report.write_master_curve(options.out, found)
+    print(master_report.shift_table(found))
+    print(f"written: {options.out}/shift_factors.csv, master_curve.csv, shift.png")
+    sweep = rheometer.within(found.sweep, options.min_frequency, options.max_frequency)
+    return sweep, {"shift": master_curve.shift_numbers(found)}
 
 
 def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> list[str]:
@@ -186,7 +229,8 @@ def _check(options: argparse.Namespace) -> None:
     if options.density is not None and options.method == "closed-form":
         raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
     _check_precompression(options)
-    if len(options.sweep) > 1:
+    _check_master(options)
+    if len(options.sweep) > 1 and options.master is None:
         _check_samples(options)
     if options.others:
         _check_together(options)
@@ -219,6 +263,22 @@ def _check_precompression(options: argparse.Namespace) -> None:
     ):
         if asked:
             raise InputError(f"--precompression fits Prony modes to one sample without inertia: leave out {name}")
+
+
+def _check_master(options: argparse.Namespace) -> None:
+    """Refuse what a master curve does not have."""
+    if options.master is None:
+        if options.vertical:
+            raise InputError("--vertical is of a master curve: give --master too")
+        return
+    for name, asked in (
+        ("--with", bool(options.others)),
+        ("--table", options.table is not None),
+        ("--density", options.density is not None),
+        ("--precompression", options.precompression != 0),
+    ):
+        if asked:
+            raise InputError(f"--master shifts sweeps at all temperatures of the files: leave out {name}")
 
 
 def _check_samples(options: argparse.Namespace) -> None:
@@ -268,7 +328,8 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
     """The fit in closed form, and by default the fit through the simulation; then the sweep that they fit."""
-    from fitting.fits import edges, instrument, viscoelastic
+    from fitting.fits import instrument, viscoelastic
+    from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
     from fitting.rigs import compression
 
@@ -288,6 +349,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fits.append(_simulated(options, corrected, fits[0], simulation))
     for fit in fits if options.precompression else ():
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
+    for fit in fits:
+        fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
     if options.gap_error:
         fits = [instrument.with_gap_error(fit, options.gap_error / simulation.height) for fit in fits]
     return fits, corrected

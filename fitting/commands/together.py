@@ -20,7 +20,8 @@ def run(options: argparse.Namespace) -> int:
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
-    tests = [_read_one_sweep(options, options.sweep[0]), *(read_any(options, path) for path in options.others)]
+    first = shared_options.usable_sweep(options, options.sweep[0])
+    tests = [first, *(read_any(options, path) for path in options.others)]
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
@@ -40,13 +41,6 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png")
     return 0 if found.converged else 1
-
-
-def _read_one_sweep(options: argparse.Namespace, path: Path) -> "Measured":
-    from fitting.readers import rheometer
-
-    sweep = rheometer.within(rheometer.read_sweep(path, options.table), options.min_frequency, options.max_frequency)
-    return rheometer.without_inertia(sweep, options.radius, options.height)
 
 
 def read_any(options: argparse.Namespace, path: Path) -> "Measured":

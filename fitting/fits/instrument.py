@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fitting.fits import viscoelastic
-from fitting.fits.edges import HALF_DECADE
+from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
@@ -155,9 +155,9 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
     """
     seen = fit.kind.maxwell
     kind = fit.kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
-    spread = uncertainty.estimate(fit.solution, sweep.storage_sd is not None, kind.maxwell)
+    spread = uncertainty.estimate(fit.solution, sweep.noise_given, kind.maxwell)
     model = Maxwell(spread.values[0], spread.values[1 : fit.modes + 1], spread.values[fit.modes + 1 :])
-    old, new = (uncertainty.cautions(sweep, of, fit.solution, kind.name) for of in (fit.uncertainty, spread))
+    old, new = (uncertainty.cautions(sweep, of, kind.name) for of in (fit.uncertainty, spread))
     warnings = (*(w for w in fit.warnings if w not in old), *new)
     return fit._replace(model=model, kind=kind, uncertainty=spread, warnings=warnings)
 

@@ -238,7 +238,7 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
 def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> Target:
     size = np.hypot(sweep.storage, sweep.loss)
-    return target(kind, residuals, sweep.resolved, size, sweep.storage_sd is not None)
+    return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
 
 
 #: Draws that are simulated, and the difference of their log density above which a warning says so.

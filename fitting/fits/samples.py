@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.fits import edges, models, viscoelastic
+from fitting.fits import models, viscoelastic
+from fitting.fits.honesty import edges
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
 from fitting.methods import as_prony_modes, generalised_maxwell, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum

@@ -200,7 +200,7 @@ def _noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.
     out = []
     for test, r, s, count in zip(tests, left, used, counts, strict=True):
         found = s * float(np.sqrt(np.sum(r**2) / max(1.0, count * (1 - free / counts.sum()))))
-        given = isinstance(test, Sweep) and test.storage_sd is not None
+        given = isinstance(test, Sweep) and test.noise_given
         out.append(max(1.0 if given else QUIETEST, found))
     return np.array(out)
 

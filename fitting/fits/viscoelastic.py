@@ -1,7 +1,7 @@
 """Identify a generalised Maxwell model from a frequency sweep, in closed form or through the torsion simulation."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -158,13 +158,13 @@ class Simulated(NamedTuple):
 
 def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], details: dict[str, Any]) -> Fit:
     found, storage, loss = at.solution, at.storage, at.loss
-    spread = uncertainty.estimate(found, sweep.storage_sd is not None, kind.maxwell, (2 * len(storage), kind.effective))
+    spread = uncertainty.estimate(found, sweep.noise_given, kind.maxwell, (2 * len(storage), kind.effective))
     own = None
     if kind.values is not None:
-        rows = (2 * len(storage), sweep.storage_sd is not None, kind.effective)
+        rows = (2 * len(storage), sweep.noise_given, kind.effective)
         own = uncertainty.estimated(kind.names, kind.values, found, *rows)
     sentences = _misfit(sweep, storage, loss, kind)
-    sentences += tuple(uncertainty.cautions(sweep, spread, found, kind.name) if own is None else ())
+    sentences += tuple(uncertainty.cautions(sweep, spread, kind.name) if own is None else ())
     converged = bool(found.converged)
     advice = at.advice or (("try fewer modes",) if own is None else ("try another model",))
     if not converged:
@@ -188,7 +188,7 @@ def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> 
     worst, n = int(np.argmax(e)), len(storage)
     where = f"{'storage' if worst < n else 'loss'}_modulus at {sweep.angular_frequency[worst % n] / (2 * np.pi):.3g} Hz"
     return (
-        f"the fit misses the data by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
+        f"{MISSES} by {100 * e.mean():.2g} % on average and by {100 * e.max():.3g} % in {where}: "
         f"try {'another --model' if kind.values else 'more modes or another --model'}, or look at the data",
     )
 
@@ -405,6 +405,9 @@ OF_THE_DATA = (
     "structured misfit",
     "poses as inertia",
 )
+#: Words of the warnings that come first, the most important of all at the beginning.
+MISSES = "the fit misses the data"
+IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", "half decade")
 KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency", "instrument")
 
 
@@ -466,7 +469,17 @@ def through_torsion(
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
     fit = fit._replace(details=fit.details | of_the_model)
-    return fit._replace(warnings=(*fit.warnings, *more, *_bias(start, fit)))
+    own = tuple(w for w in fit.warnings if not (w.startswith(MISSES) and any(m.startswith(MISSES) for m in more)))
+    return fit._replace(warnings=by_importance((*own, *more, *_bias(start, fit))))
+
+
+def by_importance(sentences: Sequence[str]) -> tuple[str, ...]:
+    """Warnings in the order of `IMPORTANT`; the others as they stand."""
+
+    def place(sentence: str) -> int:
+        return next((k for k, words in enumerate(IMPORTANT) if words in sentence), len(IMPORTANT))
+
+    return tuple(sorted(sentences, key=place))
 
 
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.methods.generalised_maxwell import Spectrum
-from fitting.readers.rheometer import Sweep
+from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
 #: How many standard deviations of the scatter a breach must exceed, and the part of the modulus that is never one.
 SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
@@ -34,38 +34,62 @@ class Consistency(NamedTuple):
     breaches: tuple[tuple[float, float, str], ...]  # intervals [rad/s] and the bound that they break
     onset: float | None  # last frequency [rad/s] before the instrument's mark, within half a decade of the end
 
-
-def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
-    """Relative standard deviation of points about a smooth curve, from four neighbours at a time (robust)."""
-    x, y = np.log(omega), np.log(modulus)
-    if len(x) < 6:
-        return math.inf
-    left = []
-    for k in range(len(x) - 3):
-        own = x[k : k + 4] - x[k]
-        _, _, Vt = np.linalg.svd(np.vander(own, 3, increasing=True).T)
-        left.append(Vt[-1] @ y[k : k + 4])  # what no parabola can follow, of unit variance
-    return float(np.median(np.abs(left)) / 0.6745)
+    @property
+    def far(self) -> bool:
+        """No linear material comes near the data."""
+        return self.misfit > max(FAR, FAR_RATIO * self.scatter)
 
 
 def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
     """Check the bounds and the spectrum; `dense` comes from `generalised_maxwell.spectrum`."""
-    omega, storage, loss = _merged(sweep)
+    omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noises = scatter(omega, storage), scatter(omega, loss)
     breaches = []
     for k in range(len(omega) - 1):
         why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], noises)
         if why:
             breaches.append((float(omega[k]), float(omega[k + 1]), why))
-    late = [low for low, _, why in breaches if why.startswith("G' ") and low > omega[-1] / math.sqrt(10)]
-    return Consistency(dense.misfit, max(noises), tuple(breaches), min(late) if late else None)
+    late = onset_of(sweep)
+    return Consistency(dense.misfit, max(noises), tuple(breaches), None if late is None else late[0])
 
 
-def _merged(sweep: Sweep) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One point a frequency: repeated ones are averaged."""
-    omega, place = np.unique(sweep.angular_frequency, return_inverse=True)
-    count = np.bincount(place)
-    return omega, np.bincount(place, sweep.storage) / count, np.bincount(place, sweep.loss) / count
+def without_instrument(sweep: Sweep) -> Sweep:
+    """The points before the instrument's mark; those behind it become `grey`, and a note names them.
+
+    The mark is looked for in what is left until there is none; all of it lies in the last half decade of the sweep.
+    """
+    here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
+    told = ""
+    while True:
+        found = onset_of(here)
+        if found is None or found[0] <= end or len(np.unique(here.angular_frequency)) <= 2 * FEWEST:
+            break
+        told = told or found[1]
+        here = some(here, here.angular_frequency <= found[0] * (1 + 1e-9))
+    lost = sweep.angular_frequency > here.angular_frequency[-1]
+    if not lost.any():
+        return sweep
+    low, high = (omega / (2 * np.pi) for omega in (here.angular_frequency[-1], sweep.angular_frequency[-1]))
+    note = (
+        f"{lost.sum()} of {len(lost)} points above {low:.4g} Hz {'is' if lost.sum() == 1 else 'are'} left out: {told}, "
+        "which is the mark of the instrument (its inertia adds a term that grows as frequency^2) and of no material "
+        f"that relaxes; --max-frequency {_rounded_up(high):.4g} keeps all points"
+    )
+    grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[lost]
+    grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
+    return here._replace(grey=grey, notes=(*sweep.notes, note))
+
+
+def onset_of(sweep: Sweep) -> tuple[float, str] | None:
+    """Last frequency [rad/s] before the instrument's mark within half a decade of the end, and the bound it breaks."""
+    omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
+    noises = scatter(omega, storage), scatter(omega, loss)
+    for k in range(len(omega) - 1):
+        if omega[k] > omega[-1] / math.sqrt(10):
+            why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], noises)
+            if why.startswith("G' "):
+                return float(omega[k]), why
+    return None
 
 
 def _breach(omega, storage, loss, noise) -> str:
@@ -104,12 +128,11 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
             f"between {low / (2 * np.pi):.3g} and {high / (2 * np.pi):.3g} Hz{more} {why}, by more than the scatter of "
             f"the points: no material that relaxes does so; look for {cause}"
         )
-    if found.misfit > max(FAR, FAR_RATIO * found.scatter):
+    if found.far:
         out.append(
             f"the data do not agree with themselves (Kramers-Kronig): the best spectrum of any shape stays "
             f"{100 * found.misfit:.2g} % away on average up to {last:.3g} Hz, the points scatter by "
-            f"{100 * found.scatter:.2g} %; drift, strain beyond the linear range or the instrument do that, and no "
-            "model comes closer"
+            f"{100 * found.scatter:.2g} %; look for drift, or strain beyond the linear range: no model comes closer"
         )
     return out
 
@@ -150,5 +173,5 @@ def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple
         return numbers, []
     return numbers, [
         f"structured misfit: the residuals {' and those '.join(told)}; the model misses something that is no noise, "
-        "and the standard errors do not know of it"
+        "and the standard errors do not know of it: take the total errors, or another --model"
     ]

@@ -172,7 +172,7 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     return out
 
 
-def cautions(sweep: Sweep, u: Estimate, found: Solution, model: str = "prony") -> list[str]:
+def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
     """Warnings on what the data do not tell, each with its number and a remedy."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
@@ -192,20 +192,17 @@ def cautions(sweep: Sweep, u: Estimate, found: Solution, model: str = "prony") -
             f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
             "from zero (a fluid); measure at lower frequencies"
         )
-    if sweep.storage_sd is not None:
-        r = np.asarray(found.residuals)
-        actual = float(np.sqrt(np.mean(r**2)))
-        if actual < 0.3:
-            out.append(
-                f"the fit is {1 / max(actual, 1e-12):.2g} times closer than the given deviations: they are "
-                "probably the spread between samples, common to all frequencies; the standard "
-                "errors take them as independent noise"
-            )
-        elif u.noise > 1.5:
-            out.append(
-                f"the residuals are {u.noise:.2g} times the given deviations: the model misses something or the "
-                "deviations are too small; the standard errors are enlarged by that factor"
-            )
+    if sweep.storage_sd is not None and not sweep.noise_given:
+        out.append(
+            f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are no noise: the points scatter by "
+            f"{100 * sweep.point_scatter:.2g} % only. They are taken as weights, and as the spread between samples: "
+            "the moduli of one sample differ by as much from these; give the files of the samples to fit each"
+        )
+    elif sweep.noise_given and u.noise > 1.5:
+        out.append(
+            f"the residuals are {u.noise:.2g} times the given deviations: the model misses something or the "
+            "deviations are too small; the standard errors are enlarged by that factor"
+        )
     return out
 
 

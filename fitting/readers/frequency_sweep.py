@@ -1,5 +1,6 @@
 """A measured frequency sweep, and the parts of it that can be used."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +10,9 @@ from liverjax.core.errors import InputError
 
 #: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
 FEWEST = 3
+#: Deviations above a tenth of the moduli, and above the scatter of the points by this factor, are the spread between
+#: samples, which all frequencies share: no rheometer is so noisy and so smooth.
+SHARED, LARGE = 3.0, 0.1
 
 
 class Sweep(NamedTuple):
@@ -36,9 +40,54 @@ class Sweep(NamedTuple):
         )
 
     @property
+    def noise_given(self) -> bool:
+        """There are deviations, and they are the noise of each point, not the spread between samples."""
+        if self.storage_sd is None:
+            return False
+        return self.relative_deviation < LARGE or not self.point_scatter < self.relative_deviation / SHARED
+
+    @property
+    def relative_deviation(self) -> float:
+        """Of the file, over the moduli, in the middle; NaN where there is none."""
+        if self.storage_sd is None or self.loss_sd is None:
+            return np.nan
+        return float(np.median(np.concatenate([self.storage_sd / self.storage, self.loss_sd / self.loss])))
+
+    @property
+    def point_scatter(self) -> float:
+        """How far points lie off a smooth curve, relative; infinite where too few points tell it."""
+        omega, *columns = merged(self.angular_frequency, self.storage, self.loss)
+        return max(scatter(omega, column) for column in columns)
+
+    @property
     def resolved(self) -> tuple[float, float]:
         """Shortest and longest relaxation time [s] that the frequencies resolve."""
         return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
+
+
+def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
+    """Relative standard deviation of points about a smooth curve, from four neighbours at a time (robust).
+
+    Args:
+        omega: different frequencies (n,), ascending.
+        modulus: (n,), positive.
+    """
+    x, y = np.log(omega), np.log(modulus)
+    if len(x) < 6:
+        return math.inf
+    left = []
+    for k in range(len(x) - 3):
+        own = x[k : k + 4] - x[k]
+        _, _, Vt = np.linalg.svd(np.vander(own, 3, increasing=True).T)
+        left.append(Vt[-1] @ y[k : k + 4])  # what no parabola can follow, of unit variance
+    return float(np.median(np.abs(left)) / 0.6745)
+
+
+def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
+    """One point a frequency: repeated ones are averaged."""
+    different, place = np.unique(omega, return_inverse=True)
+    count = np.bincount(place)
+    return different, *(np.bincount(place, column) / count for column in columns)
 
 
 def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:

@@ -48,6 +48,12 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     return _sweep(str(path), tables[chosen], notes)
 
 
+def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
+    """Every table of a file that is a sweep, with its name; as `read_sweep` reads one."""
+    tables = tables_of(str(path), text_of(Path(path)).splitlines())
+    return [(table.name, _sweep(str(path), table, [])) for table in tables]
+
+
 def _si(path: str, table: Table, j: int, notes: list[str]) -> np.ndarray:
     """Column j in rad/s or Pa."""
     column, unit = table.columns[j], table.columns[j].unit

@@ -84,3 +84,29 @@ def header_columns(cells: list[str]) -> list[Column]:
 def is_tensile(column: Column) -> bool:
     """Whether the heading names a modulus of tension or bending, E."""
     return bool(re.match(r"\s*e['′’_ ]|\s*epp?\b|\s*[(]?e\b|\s*tensile", column.name.lower().replace('"', "'")))
+
+
+#: Units of temperature: factor and offset to kelvin.
+_TEMPERATURE = {"c": (1.0, 273.15), "k": (1.0, 0.0), "f": (5 / 9, 459.67 * 5 / 9)}
+
+
+def condition_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float, float]]:
+    """Place, factor and offset to SI of `temperature` [K] and `shift_factor`, of the headings that name them.
+
+    Args:
+        cells: headings.
+        units: of a line of their own, or nothing.
+    """
+    found: dict[str, tuple[int, float, float]] = {}
+    for k, cell in enumerate(cells):
+        name = cell.strip().strip('"').lower()
+        heat = re.match(r"(?:temperature|temp|t)\b[\s._]*(.*)|(?:temperature|temp|t)_(.*)", name)
+        if heat and "temperature" not in found:
+            rest = next((part for part in heat.groups() if part), "") or (units[k] if k < len(units) else "")
+            plain = re.sub(r"deg(rees?)?|[^a-z]", "", rest.lower())
+            unit = _TEMPERATURE.get(plain[:1] if plain in ("celsius", "kelvin", "fahrenheit") else plain)
+            if unit:
+                found["temperature"] = (k, *unit)
+        if re.fullmatch(r"(shift[\s_]*factor|a[\s_]?t)s?[\s_]*([(\[]?1?[)\]]?)", name) and "shift_factor" not in found:
+            found["shift_factor"] = (k, 1.0, 0.0)
+    return found

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers import raw_torque
-from fitting.readers.sweep_columns import NEEDED, Column, header_columns
+from fitting.readers.sweep_columns import NEEDED, Column, condition_columns, header_columns
 from fitting.readers.text_tables import find_delimiter, split_cells, to_number
 from fitting.readers.units import MODULUS_UNITS
 from liverjax.core.errors import InputError
@@ -111,12 +111,13 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 
 
 def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
-    """Raw torque, angle and phase of the rows of a table, in SI. A column with a gap does not count."""
-    found = {}
-    for quantity, (place, factor) in raw_torque.known_columns(cells, unit_rows[-1] if unit_rows else []).items():
+    """Raw torque, angle, phase, temperature in SI, of the rows of a table; a column with a gap is none."""
+    found, units = {}, unit_rows[-1] if unit_rows else []
+    measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
+    for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = [to_number(row[place], delimiter) if place < len(row) else None for row in rows]
         if all(v is not None and np.isfinite(v) for v in values):
-            found[quantity] = factor * np.array(values, float)
+            found[quantity] = factor * np.array(values, float) + offset
     return found
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.fits import edges
+from fitting.fits.honesty import edges
 from fitting.fits.samples import Samples
 from fitting.reports.sweep_report import band_sensitivity, numbers, summary
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save

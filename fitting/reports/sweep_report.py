@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fitting.fits import edges, models
+from fitting.fits import models
+from fitting.fits.honesty import edges, total_error
 from fitting.fits.posterior import Posterior
 from fitting.fits.viscoelastic import Fit, largest_shift
 from fitting.methods.estimate import Estimate
@@ -22,6 +23,7 @@ from liverjax.core.versions import versions
 
 #: Part of a standard error up to which closed form and simulation say the same.
 AGREED = 0.1
+STEMS = ("ratios", "relaxation_times")
 MARK = "* moves by more than its error without the first or the last half decade"
 
 
@@ -90,16 +92,20 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, An
 
 
 def band_sensitivity(fit: Fit) -> dict[str, Any]:
-    """Changes by the names of `standard_errors`, lists for ratios and times; null where too few points were left."""
+    """Changes by the names of `standard_errors`; null where too few points were left."""
+    changes = fit.details.get("band_sensitivity", {})
+    return {part: None if found is None else by_stem(found) for part, found in changes.items()}
+
+
+def by_stem(flat: dict[str, float]) -> dict[str, Any]:
+    """Numbers by the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
     out: dict[str, Any] = {}
-    for part, changes in fit.details.get("band_sensitivity", {}).items():
-        out[part] = None if changes is None else {}
-        for name, change in (changes or {}).items():
-            stem = name.split("[")[0]
-            if stem == name:
-                out[part][name] = change
-            else:
-                out[part].setdefault(stem, []).append(change)
+    for name, value in flat.items():
+        stem = name.split("[")[0]
+        if stem == name:
+            out[name] = value
+        else:
+            out.setdefault(stem, []).append(value)
     return out
 
 
@@ -123,6 +129,8 @@ def write(
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
     content["band_sensitivity"] = band_sensitivity(fits[0])
+    content["total_errors"] = by_stem(total_error.total_errors(main))
+    content["error_shares"] = {source: by_stem(part) for source, part in total_error.error_shares(main).items()}
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
         content["largest_shift_over_standard_error"] = largest_shift(*fits)
@@ -206,11 +214,11 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
             top.plot(f, fitted, cross, color="black", ms=5, label=f"{symbol} simulated")
         rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
     top.set(xscale="log", yscale="log", ylabel="modulus [Pa]")
-    _legend_above(top, 2)
     if sweep.grey is not None:
         hertz = sweep.grey[:, 0] / (2 * np.pi)
-        top.plot(hertz, sweep.grey[:, 1], "o", color=GREY, ms=4, mfc="none", label="left out: inertia")
+        top.plot(hertz, sweep.grey[:, 1], "o", color=GREY, ms=4, mfc="none", label="left out: instrument")
         top.plot(hertz, sweep.grey[:, 2], "s", color=GREY, ms=4, mfc="none")
+    _legend_above(top, 2)
     doubtful = fits[0].details.get("consistency", {}).get("instrument_above_Hz")
     if doubtful is not None:
         for axes in (top, rest):
@@ -243,6 +251,7 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
     """
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
     axes.axvspan(low, high, color=GREY, alpha=0.12, label="resolved by the data")
+    whole = total_error.total_errors(fits[-1])
     for fit, colour, marker in zip(fits, (GREEN, "black"), "ox", strict=False):
         n, u = fit.modes, fit.uncertainty
         tau, g = u.values[n + 1 :], u.values[1 : n + 1]
@@ -252,6 +261,10 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
         axes.errorbar(
             tau, g, xerr=x, yerr=y, fmt=marker, color=colour, ms=5, capsize=2, lw=1, label=f"{fit.method}, 95 %"
         )
+    if fit.parameters is None:
+        wide = [np.array([u.quantile * whole[f"{name}[{k}]"] for k in range(n)]) for name in STEMS]
+        ends = [np.array([np.minimum(w, 0.95 * v), w]) for w, v in zip(wide, (g, tau), strict=True)]
+        axes.errorbar(tau, g, xerr=ends[1], yerr=ends[0], fmt="none", color=GREY, lw=0.8, label="with the ends, 95 %")
     axes.set(xscale="log", xlabel="relaxation time [s]", ylabel="ratio of G0 [1]")
     axes.set_ylim(0, 1.05 * axes.get_ylim()[1])  # room above the largest
     _legend_above(axes, columns)
@@ -268,12 +281,17 @@ def _parameter_rows(fit: Fit) -> list[str]:
     def mark(name):
         return "*" if name in decided else " "
 
+    whole = total_error.total_errors(fit)
     rows = [
-        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa {mark('shear_modulus')}".rstrip(),
-        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa {mark('equilibrium_modulus')}".rstrip(),
+        f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa {mark('shear_modulus')}",
+        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa {mark('equilibrium_modulus')}",
         "",
         f"{'mode':4s} {'ratio [1]':>20s} {'relaxation time [s]':>22s}",
     ]
+    for k, name in enumerate(("shear_modulus", "equilibrium_modulus")):
+        if np.isfinite(whole.get(name, np.inf)):
+            rows[k] += f" total ± {whole[name]:.2g}"
+    rows = [row.rstrip() for row in rows]
     for k in range(n):
         places = ((1 + k, f"ratios[{k}]"), (1 + n + k, f"relaxation_times[{k}]"))
         ratio, time = (f"{u.values[j]:.4g} ± {u.standard_errors[j]:.2g}{mark(name)}" for j, name in places)
@@ -340,7 +358,25 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
     width = max(len(r) for r in columns[0]) + 3
     rows = ["".join(f"{c:{width}s}" for c in row).rstrip() for row in zip_longest(*columns, fillvalue="")]
     decided = [MARK] if any(edges.moved(fit) for fit in fits) else []
-    return "\n".join([*rows, *decided, *_compression(fits), *_agreement(fits), *models.comparison(fits[0])])
+    return "\n".join(
+        [*rows, *decided, *_totals(fits[-1]), *_compression(fits), *_agreement(fits), *models.comparison(fits[0])]
+    )
+
+
+#: What a reader calls the sources of errors.
+SOURCES = {"noise": "noise", "geometry": "gap and radius", "band": "ends of the band", "mesh": "mesh"}
+
+
+def _totals(fit: Fit) -> list[str]:
+    """The whole error of the moduli, and its shares."""
+    whole, parts, known = total_error.total_errors(fit), total_error.error_shares(fit), edges.values(fit)
+    symbols = {"shear_modulus": "G0", "equilibrium_modulus": "G_inf"}
+    out = []
+    for name in (n for n in symbols if n in known and known[n][0] > 0 and np.isfinite(whole[n])):
+        value = known[name][0]
+        each = [f"{word} {100 * parts[s][name] / value:.2g} %" for s, word in SOURCES.items() if s in parts]
+        out.append(f"{symbols[name]} with all that is known: ± {whole[name]:.2g} Pa ({', '.join(each)})")
+    return out
 
 
 def _compression(fits: list[Fit]) -> list[str]:

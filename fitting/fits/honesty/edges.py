@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from fitting.fits import viscoelastic
-from fitting.fits.viscoelastic import FLUID, Fit
+from fitting.fits.viscoelastic import FLUID, MISSES, Fit
 from fitting.methods import generalised_maxwell, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts, levenberg_marquardt
@@ -13,6 +13,7 @@ from fitting.readers.rheometer import Sweep, some
 
 HALF_DECADE = float(np.sqrt(10))
 #: Names of the two parts that are left out, and of the moduli in words.
+KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 
@@ -33,9 +34,23 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         )
         details["residuals"] = runs
         told += structured
+    if found.far and any(w.startswith(MISSES) for w in warnings):
+        told = [w for w in told if KRAMERS_KRONIG not in w]
+        warnings = [w for w in warnings if not w.startswith(MISSES)] + [_nearest(fit, sweep, found.misfit)]
     changes = sensitivity(fit, sweep)
     details["band_sensitivity"] = changes
-    return fit._replace(details=details, warnings=(*warnings, *told, *_moved_most(fit, changes)))
+    sentences = (*warnings, *told, *_moved_most(fit, changes))
+    return fit._replace(details=details, warnings=viscoelastic.by_importance(sentences))
+
+
+def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
+    """A misfit that is mostly the data's own."""
+    errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
+    return (
+        f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most; the best "
+        f"spectrum of any shape still misses them by {100 * misfit:.2g} % ({KRAMERS_KRONIG}), so a part is in the "
+        f"data: look for drift, or strain beyond the linear range{'; --model auto shows what comes closer' * closer}"
+    )
 
 
 def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
@@ -119,4 +134,7 @@ def _moved_most(fit: Fit, changes: dict[str, Any]) -> list[str]:
             told.append(f"leaving out the {end} half decade moves {listed}{rest}")
     if not told:
         return []
-    return [f"{'; '.join(told)}: more than their standard errors, so the ends of the band decide them"]
+    return [
+        f"{'; '.join(told)}: more than their standard errors, so the ends of the band decide them: take the total "
+        "errors, or measure a wider band"
+    ]

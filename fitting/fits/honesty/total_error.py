@@ -1,0 +1,66 @@
+"""The whole error of every number: noise, and beside it what noise does not know of, each a share of its own.
+
+Shares are independent of each other, so the total is the root of the sum of their squares. The spread between samples
+is none of them: the numbers are of the curve that was measured.
+"""
+
+import numpy as np
+
+from fitting.fits.honesty import edges
+from fitting.fits.viscoelastic import Fit, Simulation
+
+#: What is commonly known of plates [m]: standard deviations of the gap that an instrument states, and of the radius.
+GAP, RADIUS = 50e-6, 10e-6
+
+
+def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
+    """Relative error of all moduli by the size of the sample between its plates; torque over twist is G pi R^4 / 2 h.
+
+    A `gap_error` [m] that is told is one of the standard errors already.
+    """
+    gap = 0.0 if gap_error is not None else GAP / simulation.height
+    return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
+
+
+def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
+    """Errors by their source, then by the names of `edges.values`.
+
+    The ends of the band: the larger of the two changes, as far as it exceeds the standard error.
+    """
+    known = edges.values(fit)
+    noise = {name: error for name, (_, error) in known.items()}
+    relative = fit.details.get("geometry_error", of_geometry(Simulation(), None))
+    moduli = _moduli(fit)
+    out = {
+        "noise": noise,
+        "geometry": {n: relative * abs(v) if n in moduli else 0.0 for n, (v, _) in known.items()},
+        "band": dict.fromkeys(known, 0.0),
+    }
+    for changes in (fit.details.get("band_sensitivity") or {}).values():
+        for name, change in (changes or {}).items():
+            beyond = np.sqrt(max(0.0, change**2 - noise[name] ** 2)) if np.isfinite(noise[name]) else 0.0
+            out["band"][name] = max(out["band"][name], float(beyond))
+    for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
+        if moved is not None and fit.parameters is None:
+            out[source] = _of_modes(fit, moved)
+    return out
+
+
+def total_errors(fit: Fit) -> dict[str, float]:
+    """Root of the sum of the squares of `error_shares`, by the names of `edges.values`."""
+    found = error_shares(fit)
+    return {name: float(np.sqrt(sum(part[name] ** 2 for part in found.values()))) for name in found["noise"]}
+
+
+def _moduli(fit: Fit) -> set[str]:
+    if fit.parameters is None:
+        return {"shear_modulus", "equilibrium_modulus"}
+    return {n for n, unit in zip(fit.kind.names, fit.kind.units, strict=True) if unit.startswith("Pa")}
+
+
+def _of_modes(fit: Fit, moved: np.ndarray) -> dict[str, float]:
+    """Size of what moves G0, ratios and times (P,), and with them the equilibrium modulus."""
+    n, G0, ratios = fit.modes, fit.uncertainty.values[0], fit.uncertainty.values[1 : fit.modes + 1]
+    out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
+    out["equilibrium_modulus"] = abs(float(moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()))
+    return {name: out[name] for name in edges.values(fit)}

@@ -1,0 +1,1 @@
+"""Sweeps at several temperatures, shifted to one: a master curve."""

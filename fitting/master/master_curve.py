@@ -1,0 +1,107 @@
+"""The master curve of sweeps at several temperatures: its points, and the laws of its shift factors."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fitting.master import shifts, temperature_laws
+from fitting.master.shifts import Shifts
+from fitting.master.temperature_laws import TemperatureLaw
+from fitting.master.temperature_sweeps import AtTemperatures, joined
+from fitting.readers.frequency_sweep import Sweep
+from liverjax.core.errors import InputError
+
+#: Distance of a sweep from the common curve that is worth a sentence, and the error [decades] of a loose factor.
+FAR_OFF, LOOSE = 0.05, 0.3
+
+
+class MasterCurve(NamedTuple):
+    """All sweeps at the reference temperature."""
+
+    sweep: Sweep
+    parts: list[Sweep]  # each one shifted, in the order of the temperatures
+    shifts: Shifts
+    laws: list[TemperatureLaw]  # nearest first
+
+
+def master_curve(data: AtTemperatures, reference: float | None, vertical: bool = False) -> MasterCurve:
+    """Shift all sweeps to one temperature.
+
+    Args:
+        data: two or more sweeps.
+        reference: temperature [K]; None: the middle one. The nearest one that was measured is taken.
+        vertical: find factors of the moduli too; not where the shift factors are given.
+    """
+    T = data.temperatures
+    place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
+    if reference is not None and not T.min() - 10 <= reference <= T.max() + 10:
+        raise InputError(
+            f"--master {reference - 273.15:.4g}: the sweeps are from {T[0] - 273.15:.4g} to {T[-1] - 273.15:.4g} °C; "
+            "give a temperature among them"
+        )
+    if data.shift_factors is not None:
+        log_a, none = np.log10(data.shift_factors), np.zeros(len(T))
+        if reference is None:  # the temperature that the given factors are of
+            place = int(np.argmin(np.abs(log_a)))
+        log_a = log_a - log_a[place]
+        found = Shifts(
+            T, place, log_a, none, none, none, shifts.distances_from_curve(data.sweeps, log_a, none), given=True
+        )
+    else:
+        found = shifts.found(data.sweeps, T, place, vertical)
+    parts = [_shifted_sweep(s, a, b) for s, a, b in zip(data.sweeps, found.log_a, found.log_b, strict=True)]
+    laws = temperature_laws.temperature_laws_of(found)
+    whole = joined(parts)
+    return MasterCurve(whole._replace(notes=(*whole.notes, *_sentences(found))), parts, found, laws)
+
+
+def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
+    a, b = 10.0**log_a, 10.0**log_b
+    moduli: dict[str, Any] = {q: getattr(sweep, q) for q in ("storage", "loss", "storage_sd", "loss_sd")}
+    moduli = {q: None if values is None else b * values for q, values in moduli.items()}
+    return sweep._replace(angular_frequency=a * sweep.angular_frequency, **moduli)
+
+
+def _sentences(found: Shifts) -> list[str]:
+    """What was made of the sweeps, and where superposition does not hold."""
+    T = found.temperatures - 273.15
+    out = [
+        f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "
+        f"{100 * found.apart:.2g} % from one smooth curve"
+    ]
+    far = [k for k in np.argsort(-found.misfit) if found.misfit[k] > FAR_OFF]
+    if far:
+        listed = ", ".join(f"{T[k]:.4g} °C {100 * found.misfit[k]:.2g} %" for k in far[:4])
+        more = f" and {len(far) - 4} more" if len(far) > 4 else ""
+        out.append(
+            f"superposition does not hold everywhere: sweeps lie off the common curve by ({listed}{more}); leave these "
+            "temperatures out, or try --vertical"
+        )
+    loose = [k for k in range(len(T)) if found.log_a_errors[k] > LOOSE]
+    if loose:
+        listed = ", ".join(f"{T[k]:.4g} °C (a factor of {10 ** found.log_a_errors[k]:.2g})" for k in loose[:4])
+        out.append(f"the data hardly determine the shift at {listed}: the curves are too flat to lie over each other")
+    return out
+
+
+def shift_numbers(found: MasterCurve) -> dict[str, Any]:
+    """The part `shift` of the details in fit.json."""
+    s = found.shifts
+    return {
+        "reference_temperature_C": float(s.temperatures[s.reference] - 273.15),
+        "given": s.given,
+        "temperatures_C": (s.temperatures - 273.15).tolist(),
+        "log10_a": s.log_a.tolist(),
+        "log10_a_standard_errors": s.log_a_errors.tolist(),
+        "log10_b": s.log_b.tolist(),
+        "log10_b_standard_errors": s.log_b_errors.tolist(),
+        "distance_from_the_curve": s.misfit.tolist(),
+        "laws": [
+            {
+                "law": law.name,
+                "distance_decades": law.apart,
+                "parameters": {n: {"value": v, "standard_error": e} for n, (v, e) in law.numbers.items()},
+            }
+            for law in found.laws
+        ],
+    }

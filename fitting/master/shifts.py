@@ -1,0 +1,165 @@
+"""Time-temperature superposition: shift factors that bring sweeps at several temperatures onto one smooth curve.
+
+A sweep at temperature T shows, at the frequency omega, what one at the reference shows at a_T omega, times 1 / b_T. The
+curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors by least squares:
+no model of the material is needed, and every factor has a standard error. Source: Ferry (1980), Viscoelastic properties
+of polymers, chapter 11.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from fitting.readers.frequency_sweep import Sweep
+from liverjax.core.errors import InputError
+
+#: Decades between two knots of the spline, and the weight of its third differences where no data hold it.
+KNOTS, SMOOTH = 0.4, 1e-3
+#: Longest step of a factor in one iteration [decades], and the step that counts as none.
+LONGEST, CONVERGED = 0.3, 1e-6
+#: Part of a sweep that must lie over its neighbour where shifts are looked for; where they are looked for [decades].
+OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
+
+
+class Shifts(NamedTuple):
+    """Factors of every sweep, in the order of the temperatures, and what the superposition leaves over."""
+
+    temperatures: np.ndarray  # (K,) [K], ascending
+    reference: int  # place of the sweep that stays where it is
+    log_a: np.ndarray  # (K,) log10 of a_T
+    log_a_errors: np.ndarray  # (K,) standard errors, 0 at the reference and for factors that were given
+    log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
+    log_b_errors: np.ndarray
+    misfit: np.ndarray  # (K,) root mean square distance from the curve, relative
+    given: bool = False
+
+    @property
+    def apart(self) -> float:
+        """Root mean square distance of all points from the curve, relative."""
+        return float(np.sqrt(np.mean(self.misfit**2)))
+
+
+def found(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, vertical: bool = False) -> Shifts:
+    """Shift factors by least squares.
+
+    Args:
+        sweeps: K of them.
+        temperatures: (K,) [K], ascending.
+        reference: which of them stays.
+        vertical: moduli have factors b_T too.
+
+    Raises:
+        InputError: a sweep does not lie over its neighbour at any shift.
+    """
+    columns = [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
+    log_a, log_b = _first_shifts(columns, temperatures, reference), np.zeros(len(sweeps))
+    free = np.ones((2, len(sweeps)), bool)
+    free[:, reference] = False
+    free[1] &= vertical
+    for _ in range(60):
+        A, b = _linear_problem(columns, log_a, log_b)
+        step = np.zeros((2, len(sweeps)))
+        kept = np.concatenate([free.ravel(), np.ones(A.shape[1] - free.size, bool)])
+        step[free] = np.linalg.lstsq(A[:, kept], b, rcond=None)[0][: free.sum()]
+        moved = np.clip(step, -LONGEST, LONGEST)
+        log_a, log_b = log_a + moved[0], log_b + moved[1]
+        if np.abs(moved).max() < CONVERGED:
+            break
+    spread = np.zeros((2, len(sweeps)))
+    spread[free] = _errors_of_shifts(A[:, kept], b, 2 * sum(len(c[0]) for c in columns))[: free.sum()]
+    misfit = distances_from_curve(sweeps, log_a, log_b)
+    return Shifts(temperatures, reference, log_a, spread[0], log_b, spread[1], misfit)
+
+
+def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray) -> np.ndarray:
+    """Root mean square distance (K,) of the shifted sweeps from their common curve, relative."""
+    columns = [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
+    x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
+    place = np.repeat(np.arange(len(columns)), [len(c[0]) for c in columns])
+    B = _basis(x, x)[0]
+    square = np.zeros(len(x))
+    for j in (1, 2):
+        y = np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)])
+        square += 0.5 * (B @ _smooth_coefficients(B, y) - y) ** 2
+    return np.sqrt(np.bincount(place, square) / np.bincount(place)) * np.log(10)
+
+
+def _basis(x: np.ndarray, over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values and slopes (n, C) of the cubic splines over the range of `over`, at x."""
+    low, high = over.min() - 1e-6, over.max() + 1e-6
+    count = max(2, int(np.ceil((high - low) / KNOTS)) + 1)
+    inner = np.linspace(low, high, count)
+    step = inner[1] - inner[0]
+    knots = np.concatenate([low - step * np.arange(3, 0, -1), inner, high + step * np.arange(1, 4)])
+    size = len(knots) - 4
+    spline = BSpline(knots, np.eye(size), 3)
+    return spline(x), spline.derivative()(x)
+
+
+def _smooth_coefficients(B: np.ndarray, y: np.ndarray) -> np.ndarray:
+    rows = _smoothness(B.shape[1])
+    return np.linalg.lstsq(np.vstack([B, rows]), np.concatenate([y, np.zeros(len(rows))]), rcond=None)[0]
+
+
+def _smoothness(size: int) -> np.ndarray:
+    return SMOOTH * np.diff(np.eye(size), min(3, size - 1), axis=0)
+
+
+def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and right-hand side of a Gauss-Newton step: of log a (K), log b (K), and of both curves' coefficients."""
+    K, counts = len(columns), [len(c[0]) for c in columns]
+    x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
+    own = np.repeat(np.eye(K), counts, axis=0)
+    B, slope = _basis(x, x)
+    size, rows, right = B.shape[1], [], []
+    for j in (1, 2):
+        y = np.concatenate([c[j] + b for c, b in zip(columns, log_b, strict=True)])
+        c = _smooth_coefficients(B, y)
+        part = [np.zeros((len(x), size)), np.zeros((len(x), size))]
+        part[j - 1] = B
+        rows.append(np.hstack([(slope @ c)[:, None] * own, -own, *part]))
+        right.append(y - B @ c)
+    smooth = np.kron(np.eye(2), _smoothness(size))
+    A = np.vstack([*rows, np.hstack([np.zeros((len(smooth), 2 * K)), smooth])])
+    return A, np.concatenate([*right, np.zeros(len(smooth))])  # the coefficients are at their minimum already
+
+
+def _errors_of_shifts(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
+    """Standard errors of all unknowns; the first `data` rows are measured, the others hold the curve."""
+    inverse = np.linalg.pinv(A)
+    noise = np.sqrt(np.sum(b[:data] ** 2) / max(1, data - A.shape[1]))
+    return noise * np.sqrt(np.sum(inverse[:, :data] ** 2, axis=1))
+
+
+def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
+    """Each sweep laid over its neighbour, from the reference on."""
+    log_a = np.zeros(len(columns))
+    for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
+        before = reference
+        for k in way:
+            s = _over(columns[before], columns[k])
+            if s is None:
+                raise InputError(
+                    f"the sweeps at {temperatures[before] - 273.15:.4g} and {temperatures[k] - 273.15:.4g} °C do not "
+                    "lie over each other at any shift of frequency: leave one end of the temperatures out, or give "
+                    "the factors in a column shift_factor"
+                )
+            log_a[k], before = log_a[before] + s, k
+    return log_a
+
+
+def _over(fixed: tuple, moving: tuple) -> float | None:
+    """The shift [decades] that brings one sweep nearest to its neighbour; None where there is none."""
+    best, where = np.inf, None
+    for s in REACH:
+        x = moving[0] + s
+        inside = (x >= fixed[0][0] - 1e-9) & (x <= fixed[0][-1] + 1e-9)
+        if inside.sum() < max(2, OVERLAP * len(x)):
+            continue
+        apart = [moving[j][inside] - np.interp(x[inside], fixed[0], fixed[j]) for j in (1, 2)]
+        score = float(np.mean(np.square(apart)))
+        if score < best:
+            best, where = score, float(s)
+    return where if best < 0.25 else None  # half a decade apart: nothing lies over anything

@@ -1,0 +1,82 @@
+"""How shift factors depend on temperature: WLF and Arrhenius, each with standard errors.
+
+WLF: log10 a_T = -C1 (T - T0) / (C2 + T - T0). Arrhenius: ln a_T = E / R (1 / T - 1 / T0). Temperatures are in kelvin.
+Source: Williams, Landel and Ferry (1955), J. Am. Chem. Soc. 77.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from fitting.master.shifts import Shifts
+
+#: Molar gas constant [J / (mol K)], and the least that a factor's error is taken to be [decades].
+GAS, LEAST = 8.314462618, 0.01
+
+
+class TemperatureLaw(NamedTuple):
+    """A law and how far the factors are from it."""
+
+    name: str
+    numbers: dict[str, tuple[float, float]]  # name with unit -> value and standard error
+    apart: float  # root mean square distance [decades]
+    at: Callable[[np.ndarray], np.ndarray]  # temperatures [K] -> log10 a_T
+
+
+def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
+    """The laws that enough temperatures determine, the nearest first; none of fewer than three temperatures."""
+    T = shifts.temperatures
+    T0 = T[shifts.reference]
+    if len(T) < 3:
+        return []
+    found = [_arrhenius(T, T0, shifts)]
+    if len(T) >= 4:
+        wlf = _wlf(T, T0, shifts)
+        found += [wlf] if wlf is not None else []
+    return sorted(found, key=lambda law: law.apart)
+
+
+def _weights_of_factors(shifts: Shifts) -> np.ndarray:
+    return 1 / np.hypot(shifts.log_a_errors, LEAST)
+
+
+def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
+    x, w = (1 / T - 1 / T0) / (GAS * np.log(10)), _weights_of_factors(shifts)
+    energy = float(np.sum(w**2 * x * shifts.log_a) / np.sum(w**2 * x**2))
+    off = energy * x - shifts.log_a
+    freedom = max(1, len(T) - 2)
+    error = float(np.sqrt(np.sum((w * off) ** 2) / freedom / np.sum(w**2 * x**2)))
+
+    def at(T: np.ndarray) -> np.ndarray:
+        return energy * (1 / T - 1 / T0) / (GAS * np.log(10))
+
+    numbers = {"activation_energy_J_per_mol": (energy, error)}
+    return TemperatureLaw("Arrhenius", numbers, float(np.sqrt(np.mean(off**2))), at)
+
+
+def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
+    """None where the factors do not bend as the law does: it then has no finite numbers."""
+    w = _weights_of_factors(shifts)
+
+    # C2 stays above the distance of the lowest temperature: there the law has its pole.
+    lowest = T0 - T.min()
+
+    def curve(u: np.ndarray, T: np.ndarray) -> np.ndarray:
+        return -u[0] * (T - T0) / (np.exp(u[1]) + lowest + T - T0)
+
+    best = None
+    for first in (np.log(5.0), np.log(50.0), np.log(300.0)):
+        got = scipy.optimize.least_squares(lambda u: w * (curve(u, T) - shifts.log_a), [10.0, first], method="lm")
+        best = got if best is None or got.cost < best.cost else best
+    assert best is not None
+    c1, c2 = float(best.x[0]), float(np.exp(best.x[1]) + lowest)
+    if not (0 < c1 < 1e3 and c2 < 1e4):
+        return None
+    noise = 2 * best.cost / max(1, len(T) - 3)
+    covariance = np.linalg.pinv(best.jac.T @ best.jac) * noise
+    errors = np.sqrt(np.diag(covariance)) * np.array([1.0, np.exp(best.x[1])])
+    off = curve(best.x, T) - shifts.log_a
+    numbers = {"C1": (c1, float(errors[0])), "C2_K": (c2, float(errors[1]))}
+    return TemperatureLaw("WLF", numbers, float(np.sqrt(np.mean(off**2))), lambda T: curve(best.x, T))

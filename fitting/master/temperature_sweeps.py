@@ -1,0 +1,96 @@
+"""Sweeps of one material at several temperatures, from one file or several."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fitting.readers.frequency_sweep import Sweep, some
+from fitting.readers.rheometer import read_all_sweeps
+from liverjax.core.errors import InputError
+
+#: Temperatures that are nearer than this [K] are one: an instrument holds its set point within some tenths.
+SAME = 1.0
+
+
+class AtTemperatures(NamedTuple):
+    """Sweeps in the order of their temperatures."""
+
+    sweeps: list[Sweep]
+    temperatures: np.ndarray  # (K,) [K], ascending
+    shift_factors: np.ndarray | None  # (K,) a_T, where the files give them
+
+
+def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
+    """Every sweep of the files, those of one temperature together.
+
+    The temperature is a column (`temperature_C`, `Temperature` with its unit), or stands in the name of the table. A
+    column `shift_factor` holds factors that are known already.
+
+    Raises:
+        InputError: a table without temperature, or fewer than two temperatures.
+    """
+    parts: list[tuple[float, float, Sweep]] = []
+    for path in paths:
+        for name, sweep in read_all_sweeps(path):
+            parts += _by_temperature(str(path), name, sweep)
+    parts.sort(key=lambda part: part[0])
+    groups: list[list[tuple[float, float, Sweep]]] = []
+    for part in parts:
+        if groups and part[0] - groups[-1][-1][0] < SAME:
+            groups[-1].append(part)
+        else:
+            groups.append([part])
+    if len(groups) < 2:
+        raise InputError(
+            f"{paths[0]}: --master needs sweeps at two or more temperatures, these are all at "
+            f"{parts[0][0] - 273.15:.4g} °C: give a file with several tables, or several files"
+        )
+    factors = np.array([float(np.exp(np.mean([np.log(p[1]) for p in g]))) for g in groups])
+    means = np.array([float(np.mean([p[0] for p in g])) for g in groups])
+    known = np.isfinite(factors).all()
+    return AtTemperatures([joined([p[2] for p in g]) for g in groups], means, factors if known else None)
+
+
+def joined(sweeps: Sequence[Sweep]) -> Sweep:
+    """All points of several sweeps, sorted by frequency."""
+    omega = np.concatenate([s.angular_frequency for s in sweeps])
+    order = np.argsort(omega, kind="stable")
+    storage, loss = (np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage", "loss"))
+    storage_sd = loss_sd = None
+    if all(s.storage_sd is not None and s.loss_sd is not None for s in sweeps):
+        storage_sd, loss_sd = (
+            np.concatenate([getattr(s, q) for s in sweeps])[order] for q in ("storage_sd", "loss_sd")
+        )
+    notes = tuple(dict.fromkeys(note for s in sweeps for note in s.notes))
+    return Sweep(omega[order], storage, loss, storage_sd, loss_sd, source=sweeps[0].source, notes=notes)
+
+
+def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
+    """Temperature [K], shift factor (NaN: not known) and points, of each temperature in a table."""
+    raw = sweep.raw or {}
+    if "temperature" in raw:
+        T = raw["temperature"]
+    else:
+        stated = re.search(r"(-?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
+        if stated is None:
+            raise InputError(
+                f"{path}: the table {name or 'of the file'!r} states no temperature: add a column temperature_C"
+            )
+        T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
+    if np.any(T <= 0):
+        raise InputError(f"{path}: a temperature of {T.min() - 273.15:.4g} °C is below absolute zero: check its unit")
+    order = np.argsort(T, kind="stable")
+    group = np.empty(len(T), int)
+    group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])
+    factors = raw.get("shift_factor", np.full(len(T), np.nan))
+    if np.any(factors <= 0):
+        raise InputError(f"{path}: a shift_factor of {factors.min():g} is none: it multiplies frequencies, above 0")
+    out = []
+    for k in range(group.max() + 1):
+        mine = group == k
+        factor = float(np.exp(np.mean(np.log(factors[mine]))))
+        out.append((float(np.mean(T[mine])), factor, some(sweep, mine)))
+    return out

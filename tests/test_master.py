@@ -1,0 +1,167 @@
+"""Sweeps at several temperatures: shift factors against the ones that made the data, laws, files, sentences."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import SHARED
+
+from fitting.__main__ import main
+from fitting.master import master_curve, shifts, temperature_laws, temperature_sweeps
+from fitting.readers.frequency_sweep import Sweep
+
+pytestmark = pytest.mark.quick_to_compile
+
+TEMPERATURES = 273.15 + np.linspace(-10.0, 90.0, 11)
+C1, C2, REFERENCE = 8.0, 150.0, 4
+OMEGA = np.geomspace(0.5, 80, 12)
+TRUE = -C1 * (TEMPERATURES - TEMPERATURES[REFERENCE]) / (C2 + TEMPERATURES - TEMPERATURES[REFERENCE])
+TRUE_B = -0.002 * (TEMPERATURES - TEMPERATURES[REFERENCE])
+
+
+def moduli_of_polymer(omega: np.ndarray) -> np.ndarray:
+    """A smooth wide spectrum: one mode for every third of a decade, weights of a power law with a plateau."""
+    times = np.geomspace(1e-9, 1e6, 46)
+    x = 1j * omega[:, None] * times
+    return 5e3 + (2e4 * (1 + (times / 1e-3) ** -0.45) / 3 * x / (1 + x)).sum(axis=1)
+
+
+def sweeps(noise: float, seed: int = 0, vertical: bool = False) -> list[Sweep]:
+    rng, out = np.random.default_rng(seed), []
+    for a, b in zip(10**TRUE, 10 ** (TRUE_B * vertical), strict=True):
+        G = moduli_of_polymer(a * OMEGA) / b
+        factor = 1 + noise * rng.standard_normal((2, len(OMEGA)))
+        out.append(Sweep(OMEGA, G.real * factor[0], G.imag * factor[1]))
+    return out
+
+
+def test_factors_of_exact_data_are_those_that_made_them():
+    found = shifts.found(sweeps(0.0), TEMPERATURES, REFERENCE)
+    # A cubic spline with knots 0.4 decades apart follows the curve to about 1e-4.
+    assert np.abs(found.log_a - TRUE).max() < 3e-3 and found.apart < 1e-3
+    assert found.log_a[REFERENCE] == 0 == found.log_a_errors[REFERENCE] and not found.log_b.any()
+
+
+def test_standard_errors_of_factors_are_right():
+    z = []
+    for seed in range(12):
+        found = shifts.found(sweeps(0.02, seed), TEMPERATURES, REFERENCE)
+        free = np.arange(11) != REFERENCE
+        z.append((found.log_a - TRUE)[free] / found.log_a_errors[free])
+        assert 0.015 < found.apart < 0.025
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4  # neighbours share errors: 12 sets of about 3 independent ones
+
+
+def test_vertical_factors_are_found_where_the_curve_has_a_shape():
+    found = shifts.found(sweeps(0.002, 1, vertical=True), TEMPERATURES, REFERENCE, vertical=True)
+    z = np.delete((found.log_b - TRUE_B) / np.maximum(found.log_b_errors, 1e-12), REFERENCE)
+    assert np.sqrt(np.mean(z**2)) < 2.5 and np.abs(found.log_b - TRUE_B).max() < 0.05
+    without = shifts.found(sweeps(0.002, 1, vertical=True), TEMPERATURES, REFERENCE)
+    assert without.apart > 2 * found.apart
+
+
+def test_laws_have_their_numbers_and_errors():
+    found = shifts.found(sweeps(0.01, 3), TEMPERATURES, REFERENCE)
+    wlf, arrhenius = temperature_laws.temperature_laws_of(found)
+    assert (wlf.name, arrhenius.name) == ("WLF", "Arrhenius") and wlf.apart < 0.02 < arrhenius.apart
+    for name, true in (("C1", C1), ("C2_K", C2)):
+        value, error = wlf.numbers[name]
+        assert abs(value - true) < 4 * error < 0.2 * true
+    energy = 8e4 / (8.314462618 * np.log(10))
+    exact = found._replace(log_a=energy * (1 / TEMPERATURES - 1 / TEMPERATURES[REFERENCE]))
+    (law,) = (law for law in temperature_laws.temperature_laws_of(exact) if law.name == "Arrhenius")
+    value, error = law.numbers["activation_energy_J_per_mol"]
+    assert value == pytest.approx(8e4, rel=1e-9) and error < 1 and law.apart < 1e-12
+
+
+def write_rows(path, unit: str = "C", factors: bool = False, tables=None, order: int = 1) -> None:
+    lines = [f"frequency_Hz,storage_modulus_kPa,loss_modulus_kPa,temperature_{unit}" + ",shift_factor" * factors]
+    offset = {"C": 273.15, "K": 0.0}[unit]
+    for k, s in enumerate(tables or sweeps(0.0)):
+        for w, p, q in zip(s.angular_frequency, s.storage, s.loss, strict=True):
+            row = [w / (2 * np.pi), p / 1e3, q / 1e3, TEMPERATURES[k] - offset + 0.03 * np.sin(w)]
+            lines.append(",".join(f"{v:.12g}" for v in row + [10 ** TRUE[k]] * factors))
+    path.write_text("\n".join([lines[0], *lines[1:][::order]]) + "\n")
+
+
+@pytest.mark.parametrize(("unit", "order"), [("C", 1), ("K", -1)])
+def test_a_file_with_a_column_of_temperature(tmp_path, unit, order):
+    write_rows(tmp_path / "a.csv", unit, order=order)
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    assert np.allclose(data.temperatures, TEMPERATURES, atol=0.05) and data.shift_factors is None
+    found = master_curve.master_curve(data, TEMPERATURES[REFERENCE] + 3)
+    assert found.shifts.reference == REFERENCE and np.abs(found.shifts.log_a - TRUE).max() < 3e-3
+    assert np.allclose(found.sweep.storage, moduli_of_polymer(found.sweep.angular_frequency).real, rtol=0.01)
+
+
+def test_given_factors_are_taken_as_they_are(tmp_path):
+    write_rows(tmp_path / "a.csv", factors=True)
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    found = master_curve.master_curve(data, None)
+    assert found.shifts.given and found.shifts.reference == REFERENCE and np.allclose(found.shifts.log_a, TRUE)
+    assert np.allclose(found.sweep.storage, moduli_of_polymer(found.sweep.angular_frequency).real, rtol=1e-9)
+
+
+def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
+    paths = []
+    for k, s in enumerate(sweeps(0.0)[2:7]):
+        paths.append(tmp_path / f"{k}.csv")
+        T = TEMPERATURES[2 + k] - 273.15
+        rows = [f"{w},{p},{q},{T}" for w, p, q in zip(s.angular_frequency, s.storage, s.loss, strict=True)]
+        head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,Temperature (°C)"
+        paths[-1].write_text("\n".join([head, *rows]) + "\n")
+    out = tmp_path / "out"
+    assert main([*map(str, paths), "--master", "30", "--model", "spectrum", "--out", str(out)]) == 0
+    content = json.loads((out / "fit.json").read_text())
+    shift = content["details"]["shift"]
+    assert shift["reference_temperature_C"] == pytest.approx(30.0) and len(shift["log10_a"]) == 5
+    assert content["method"] == "closed-form" and content["mean_relative_error"] < 0.02
+    again = np.genfromtxt(out / "master_curve.csv", delimiter=",", names=True)
+    assert len(again) == 60 and np.all(np.diff(again["frequency_Hz"]) >= 0)
+    table = np.genfromtxt(out / "shift_factors.csv", delimiter=",", names=True)
+    assert np.allclose(np.log10(table["shift_factor"]), TRUE[2:7], atol=5e-3)
+    assert "reference" in capsys.readouterr().out and (out / "shift.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "sentence"),
+    [
+        ("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n1,2,1\n2,3,1\n3,4,1\n", [], "states no temperature"),
+        (
+            "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n1,2,1,20\n2,3,1,20\n3,4,1,20\n",
+            [],
+            "two or more temperatures, these are all at 20",
+        ),
+        (
+            "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"
+            + "".join(f"{f},{m * (1 + f)},{m * f},{T}\n" for T, m in ((20, 1e-6), (30, 1e9)) for f in (1, 2, 3)),
+            [],
+            "do not lie over each other",
+        ),
+        ("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_K\n1,2,1,-3\n2,3,1,20\n", [], "absolute zero"),
+        ("", ["--with", "a.csv"], "leave out --with"),
+    ],
+)
+def test_what_cannot_be_shifted_gets_one_sentence(tmp_path, capsys, text, options, sentence):
+    file = tmp_path / "a.csv"
+    file.write_text(text)
+    assert main([str(file), *options, "--master", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and "Traceback" not in error and error.count("\n") == 1
+
+
+def test_twenty_measured_tables_make_one_curve():
+    file = SHARED / "data" / "rheology" / "rheojax" / "frequency_sweep_tts.txt"
+    if not file.exists():
+        pytest.skip("the tables of twenty temperatures are not here")
+    data = temperature_sweeps.read_temperatures([file])
+    found = master_curve.master_curve(data, 333.15)
+    assert len(data.sweeps) == 20 and np.ptp(np.log10(found.sweep.angular_frequency)) > 14
+    # All but the two coldest sweeps, which are glassy, lie within 1 % of one curve.
+    assert np.all(found.shifts.misfit[2:] < 0.01)
+    wlf = found.laws[0]
+    assert wlf.name == "WLF" and wlf.apart < 0.1
+    # Of another reference the law is the same where C2 moves by the difference of the temperatures (Ferry, 11-22).
+    other = master_curve.master_curve(data, 293.15).laws[0]
+    apart = found.shifts.temperatures[found.shifts.reference] - 293.15
+    assert other.numbers["C2_K"][0] == pytest.approx(wlf.numbers["C2_K"][0] - apart, rel=0.03)
