@@ -3,7 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
@@ -146,8 +146,9 @@ def run(options: argparse.Namespace) -> int:
 
         return together.run(options)
     options.method = options.method or "torsion"
+    shift: dict[str, Any] = {}
     if options.master is None:
-        sweep, shift = shared_options.usable_sweep(options, options.sweep[0]), {}
+        sweep = shared_options.usable_sweep(options, options.sweep[0])
     else:
         sweep, shift = _master(options)
     for note in sweep.notes:
