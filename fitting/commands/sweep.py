@@ -304,11 +304,11 @@ def _check_together(options: argparse.Namespace) -> None:
         ("--samples", options.samples is not None),
         ("--report", options.report),
         ("--predict", bool(options.predict)),
-        (f"--model {options.model}", options.model != "prony"),
+        ("--model spectrum", options.model == "spectrum"),
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--with fits Prony modes to one sample in closed form: leave out {name}")
+            raise InputError(f"--with fits modes or springpots to one sample in closed form: leave out {name}")
 
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":

@@ -16,7 +16,7 @@ def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form; 1 if the fit did not converge."""
     from tqdm import tqdm
 
-    from fitting.fits import together
+    from fitting.fits import springpots_in_time
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
             bar.set_postfix_str(text)
             bar.update()
 
-        found = together.fit(tests, options.modes, told)
+        found = springpots_in_time.choose_together(tests, options.model, options.modes, told)
     together_report.write(options.out, found)
     print(together_report.table(found))
     if options.cards:

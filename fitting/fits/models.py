@@ -12,6 +12,7 @@ import numpy as np
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
+from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import Solution, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import Sweep
@@ -125,17 +126,16 @@ def _undetermined(fit: Fit) -> list[str]:
     """Numbers of a fractional model that the data leave free."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
-    free = [n for n, ok in zip(fit.kind.names, _determined(fit), strict=True) if not ok]
+    free = [n for n, ok in zip(fit.kind.names, determined(fit.parameters), strict=True) if not ok]
     return (
         [f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model"] if free else []
     )
 
 
-def _determined(fit: Fit) -> np.ndarray:
-    """Whether each number has an error below half its value. Exponents may also be 0 or 1 (spring, dashpot)."""
-    assert fit.parameters is not None
-    values, errors = fit.parameters.values, fit.parameters.standard_errors
-    bound = np.array(["exponent" in name for name in fit.kind.names]) & ((values < 1e-3) | (values > 1 - 1e-3))
+def determined(own: Estimate) -> np.ndarray:
+    """Which numbers of a model have an error below half their value; exponents may also be 0 or 1 (spring, dashpot)."""
+    values, errors = own.values, own.standard_errors
+    bound = np.array(["exponent" in name for name in own.names]) & ((values < 1e-3) | (values > 1 - 1e-3))
     return (errors < 0.5 * np.abs(values)) | bound
 
 
@@ -143,7 +143,7 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
     """Whether the fit converged and the data determine every number of the model. A spectrum has a prior."""
     if fit.parameters is None:
         return viscoelastic.identifiable(fit, sweep)
-    return fit.converged and (fit.kind.effective is not None or bool(np.all(_determined(fit))))
+    return fit.converged and (fit.kind.effective is not None or bool(np.all(determined(fit.parameters))))
 
 
 def fluid(sweep: Sweep, dense: Spectrum) -> Fit:

@@ -37,6 +37,7 @@ class TimeFit(NamedTuple):
     run_time: float
     compile_time: float
     details: dict[str, Any]
+    parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
 
     @property
     def modes(self) -> int:
@@ -230,14 +231,21 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     for k, tau in enumerate(chosen.model.relaxation_times):
         if not low <= tau <= high:
             out.append(f"relaxation_times[{k}] = {tau:.3g} s lies outside the {low:.3g}-{high:.3g} s of the test")
-    residuals = chosen.fitted - chosen.measured
-    runs, chance = kramers_kronig.runs_probability(np.sign(residuals))
-    if chance < kramers_kronig.CHANCE and chosen.relative_errors.max() > viscoelastic.EXACT:
-        out.append(
-            f"structured misfit: the residuals change sign {runs - 1} times over {len(residuals)} answers (by chance: "
-            f"{chance:.1g}); the model misses something, or neighbouring answers share their noise"
-        )
-    details = {"tried": sorted(table, key=lambda row: row["above_the_lowest"]), "answers_fitted": len(residuals)}
+    out += structured_misfit(chosen)
+    runs, chance = kramers_kronig.runs_probability(np.sign(chosen.fitted - chosen.measured))
+    details = {"tried": sorted(table, key=lambda row: row["above_the_lowest"]), "answers_fitted": len(chosen.measured)}
     details["residuals"] = {"runs": runs, "probability": chance}
     seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
+
+
+def structured_misfit(fit: TimeFit) -> list[str]:
+    """A sentence where the residuals keep their sign over many answers."""
+    residuals = fit.fitted - fit.measured
+    runs, chance = kramers_kronig.runs_probability(np.sign(residuals))
+    if chance >= kramers_kronig.CHANCE or fit.relative_errors.max() <= viscoelastic.EXACT:
+        return []
+    return [
+        f"structured misfit: the residuals change sign {runs - 1} times over {len(residuals)} answers (by chance: "
+        f"{chance:.1g}); the model misses something, or neighbouring answers share their noise"
+    ]

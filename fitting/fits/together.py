@@ -67,6 +67,7 @@ class Together(NamedTuple):
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
+    parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
 
     @property
     def modes(self) -> int:
@@ -124,14 +125,14 @@ def fit(
     top = min(uncertainty.supported_modes(band), largest)
     numbers = range(1, top + 1) if modes == "auto" else range(int(modes), int(modes) + 1)
     tried = _raised_together(tests, band, numbers, Kind(), progress)
-    solid = min(tried, key=_criterion)
+    solid = min(tried, key=criterion_of_all)
     stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
     if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the tests may be of a fluid
         tried += _raised_together(
             tests, band, range(max(numbers.start, solid.modes - 1), numbers.stop), FLUID, progress
         )
     able = [f for f in tried if _able(f, band)] or tried
-    chosen = min(able, key=_criterion)
+    chosen = min(able, key=criterion_of_all)
     progress("what each test adds")
     return _told_of_all(chosen, tried, band)
 
@@ -150,8 +151,8 @@ def _raised_together(
     for n in numbers:
         progress(f"{n} modes")
         tried.append(_one_test(tests, band, n, kind))
-        lower = _criterion(tried[-1]) < best and (len(tried) == 1 or _able(tried[-1], band))
-        best, failures = (_criterion(tried[-1]), 0) if lower else (best, failures + 1)
+        lower = criterion_of_all(tried[-1]) < best and (len(tried) == 1 or _able(tried[-1], band))
+        best, failures = (criterion_of_all(tried[-1]), 0) if lower else (best, failures + 1)
         if failures == 2:
             break
     return tried
@@ -161,7 +162,7 @@ def _able(fit: Together, band: ResolvedBand) -> bool:
     return fit.converged and not uncertainty.superfluous(band, fit.uncertainty)
 
 
-def _criterion(fit: Together) -> float:
+def criterion_of_all(fit: Together) -> float:
     """Bayesian information criterion with the noise of each test estimated."""
     total = sum(s.points for s in fit.shares)
     return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + len(fit.solution.u) * np.log(total))
@@ -178,22 +179,30 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
         found, compiled, ran = viscoelastic.timed(best, starts, data)
         compiling, running = compiling + compiled, running + ran
-        noise = _noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
+        noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
         starts = np.tile(np.asarray(found.u), (STARTS, 1))  # near already; the program is that of all starts
     modes_found = kind.maxwell(found.u)
     spreads = uncertainty.estimate(found, False, kind.maxwell)
-    left = np.split(np.asarray(found.residuals), np.cumsum([len(y) for _, y, _ in parts])[:-1])
-    fitted = [r * scales + y for r, (_, y, scales) in zip(left, data, strict=True)]
-    shares = [
-        Share(name_of(t), t.source, len(y), float(s), np.nan, float(np.mean(np.abs(f - y) / scales)), np.array([]))
-        for t, (_, y, scales), s, f in zip(tests, parts, noise, fitted, strict=True)
-    ]
+    shares, fitted = misfits(tests, parts, data, np.asarray(found.residuals), noise)
     model = Maxwell(*(np.asarray(v) for v in modes_found))
     converged = bool(found.converged)
     return Together(tests, kind, model, found, spreads, converged, shares, fitted, [], (), running, compiling)
 
 
-def _noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: int) -> np.ndarray:
+def misfits(
+    tests: list[Measured], parts: list, data: list, residuals: np.ndarray, noise: np.ndarray
+) -> tuple[list[Share], list[np.ndarray]]:
+    """What a fit leaves of each test, and what it says each test measures."""
+    left = np.split(residuals, np.cumsum([len(y) for _, y, _ in parts])[:-1])
+    fitted = [r * scales + y for r, (_, y, scales) in zip(left, data, strict=True)]
+    shares = [
+        Share(name_of(t), t.source, len(y), float(s), np.nan, float(np.mean(np.abs(f - y) / scales)), np.array([]))
+        for t, (_, y, scales), s, f in zip(tests, parts, noise, fitted, strict=True)
+    ]
+    return shares, fitted
+
+
+def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: int) -> np.ndarray:
     """Relative noise of each test: root mean square of its residuals, less its share of the degrees of freedom."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
@@ -254,18 +263,18 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     """Add the shares of the tests, the table of the fits tried, and the warnings."""
     begin = time.perf_counter()
     chosen = chosen._replace(shares=_shares(chosen))
-    lowest = min(map(_criterion, tried))
+    lowest = min(map(criterion_of_all, tried))
     table = [
         {
             "model": f.kind.name,
             "modes": f.modes,
-            "above_the_lowest": _criterion(f) - lowest,
+            "above_the_lowest": criterion_of_all(f) - lowest,
             "identifiable": _able(f, band),
         }
         for f in tried
     ]
     out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
-    out += [_apart(s) for s in chosen.shares if s.noise > APART * s.alone and s.noise > 0.01]
+    out += disagreements(chosen.shares)
     out += uncertainty.superfluous(band, chosen.uncertainty)
     low, high = band.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
@@ -279,11 +288,14 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     )
 
 
-def _apart(share: Share) -> str:
-    return (
-        f"the tests do not agree: {share.source or share.name} is missed by {100 * share.noise:.2g} % in the common "
-        f"fit and by {100 * share.alone:.2g} % by itself; look for another temperature, strain or sample"
-    )
+def disagreements(shares: list[Share]) -> list[str]:
+    """A sentence on each test that the common fit misses by more than a fit of its own."""
+    return [
+        f"the tests do not agree: {s.source or s.name} is missed by {100 * s.noise:.2g} % in the common fit and by "
+        f"{100 * s.alone:.2g} % by itself; look for another temperature, strain or sample"
+        for s in shares
+        if s.noise > APART * s.alone and s.noise > 0.01
+    ]
 
 
 def _shares(fit: Together) -> list[Share]:
@@ -292,23 +304,39 @@ def _shares(fit: Together) -> list[Share]:
     Tests without weight are taken out by infinite deviations: the program is there already.
     """
     parts = [reported_numbers(t) for t in fit.tests]
-    counts = [len(y) for _, y, _ in parts]
-    place = np.repeat(np.arange(len(parts)), counts)
     function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
     best = viscoelastic.best_of(levenberg_marquardt, function)
     u = np.asarray(fit.solution.u)
-    starts = np.concatenate(
-        [u[None], _starts_of_all(fit.tests, ResolvedBand(_resolved(fit.tests)), fit.modes, fit.kind)[1:]]
-    )
+    band = ResolvedBand(_resolved(fit.tests))
+    starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])
     vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
-    jacobian = np.asarray(fit.solution.jacobian)
+
+    def alone(k: int) -> float:
+        data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
+        return float(viscoelastic.timed(best, starts, data)[0].cost)
+
+    return shares_by_rows(fit, np.asarray(fit.solution.jacobian), vector, fit.uncertainty.values, alone)
+
+
+def shares_by_rows(
+    fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], float]
+) -> list[Share]:
+    """The shares with the errors that the other tests' rows leave, and with the misfit of each test by itself.
+
+    Args:
+        fit: the common fit.
+        jacobian: of the residuals of all tests by u.
+        slope: derivative of the reported numbers by u.
+        values: of the reported numbers.
+        alone: place of a test -> cost of a fit to it alone.
+    """
+    counts, free = [s.points for s in fit.shares], jacobian.shape[1]
+    place = np.repeat(np.arange(len(counts)), counts)
     out = []
     for k, share in enumerate(fit.shares):
-        root, _ = spread(jacobian[place != k], 1.0, vector)
+        root, _ = spread(jacobian[place != k], 1.0, slope)
         without = errors_and_correlation(root)[0]
-        data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
-        alone = viscoelastic.timed(best, starts, data)[0]
-        square = 2 * float(alone.cost) / max(1.0, counts[k] - min(len(u), counts[k] / 2))
-        unknown = ~(without < 1e3 * np.abs(fit.uncertainty.values))
+        square = 2 * alone(k) / max(1.0, counts[k] - min(free, counts[k] / 2))
+        unknown = ~(without < 1e3 * np.abs(values))
         out.append(share._replace(alone=float(np.sqrt(square)), errors_without=np.where(unknown, np.inf, without)))
     return out

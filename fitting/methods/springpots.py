@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep
 
 #: Places in u: log E, logit gamma / alpha, log V, logit alpha, log W, logit beta / alpha.
@@ -49,16 +50,55 @@ def _orders(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return alpha, alpha * jax.nn.sigmoid(u[5]), alpha * jax.nn.sigmoid(u[1])
 
 
-def modulus(u: jax.Array, switches: jax.Array, x: jax.Array) -> jax.Array:
-    """G* (n,) [Pa] of all six numbers u at x = omega / reference (n,)."""
+def modulus(u: jax.Array, switches: jax.Array, x: jax.Array, angle: float = 0.5 * np.pi) -> jax.Array:
+    """G* (n,) [Pa] of all six numbers u at s = x e^(i angle), x = |s| / reference (n,); by default at i omega."""
 
-    def power(exponent):  # (i x)^exponent
-        return x**exponent * jnp.exp(0.5j * jnp.pi * exponent)
+    def power(exponent):  # s^exponent
+        return x**exponent * jnp.exp(1j * angle * exponent)
 
     alpha, beta, gamma = _orders(u)
     beside = switches[0] * jnp.exp(u[0]) * power(switches[1] * gamma)
     compliance = power(-alpha) * jnp.exp(-u[2]) + switches[2] * power(-switches[3] * beta) * jnp.exp(-u[4])
     return beside + 1 / compliance
+
+
+#: Times a decade of `as_modes`, and the decades that they reach beyond the shortest and the longest time looked at.
+DENSE, BEYOND = 6, (3.0, 3.0)
+
+
+def times_of_modes(low: float, high: float) -> np.ndarray:
+    """Relaxation times (K,) [s], descending, for answers from `low` to `high` [s]."""
+    decades = np.log10(high / low) + sum(BEYOND)
+    return np.logspace(np.log10(high) + BEYOND[1], np.log10(low) - BEYOND[0], int(np.ceil(decades * DENSE)) + 1)
+
+
+def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: float) -> Maxwell:
+    """Prony modes of the model's own relaxation spectrum, for responses in time.
+
+    The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
+    exponentially; what lies beyond the times is two lumps, which make G* exact at one slow and one fast real s.
+
+    Args:
+        u, switches: as of `modulus`.
+        times: (K,) [s], descending, of equal ratio, as of `times_of_modes`.
+        reference: frequency [rad/s] that u is measured in.
+    """
+    step = jnp.log(times[0] / times[1])
+    H = step * modulus(u, switches, 1 / (times * reference), np.pi).imag / np.pi
+    ends = jnp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: there each lump is whole
+    fast = times[-1] / 3
+
+    def of_modes(s):
+        x = jnp.outer(s, times)
+        return (x / (1 + x)) @ H
+
+    left = modulus(u, switches, ends / reference, 0.0).real - of_modes(ends)
+    share = ends * fast / (1 + ends * fast)
+    lump = (left[1] - left[0]) / (share[1] - share[0])
+    rest = jnp.maximum(left[0] - lump * share[0], 0.0)
+    strengths = jnp.concatenate([H, jnp.maximum(lump, 1e-12 * jnp.sum(H))[None]])
+    total = rest + jnp.sum(strengths)
+    return Maxwell(total, strengths / total, jnp.concatenate([times, jnp.atleast_1d(fast)]))
 
 
 def springpot_residuals(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterable
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from fitting.fits import models
 from fitting.fits.honesty import edges, total_error
 from fitting.fits.posterior import Posterior
-from fitting.fits.viscoelastic import Fit, largest_shift
+from fitting.fits.viscoelastic import Fit, Kind, largest_shift
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell, moduli, weighed
 from fitting.methods.uncertainty import equilibrium_error
@@ -60,7 +61,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
         },
         "mesh_bias": _bias_by_name(u, n, u.mesh_bias),
         "time_step_bias": _bias_by_name(u, n, u.time_step_bias),
-        **_own(fit),
+        **own_numbers(fit.parameters, fit.kind),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
         "correlation_names": list(u.names),
@@ -109,13 +110,31 @@ def by_stem(flat: dict[str, float]) -> dict[str, Any]:
     return out
 
 
-def _own(fit: Fit) -> dict[str, Any]:
-    """Parameters of a model that is not made of modes."""
-    p = fit.parameters
+def own_numbers(p: Estimate | None, kind: Kind) -> dict[str, Any]:
+    """Parameters of a model that is not made of modes, for fit.json."""
     if p is None:
         return {}
-    rows = zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True)
+    rows = zip(p.names, p.values, p.standard_errors, kind.units, strict=True)
     return {"parameters": {n: {"value": v, "standard_error": e, "unit": unit} for n, v, e, unit in rows}}
+
+
+def own_rows(p: Estimate, kind: Kind, details: dict[str, Any], marked: Iterable[str] = ()) -> list[str]:
+    """The same for a terminal, and how near the Prony modes come; those in `marked` have a star."""
+    rows = []
+    for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):
+        if not name.startswith("strengths["):
+            star = " *" if name in marked else ""
+            rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}{star}".rstrip())
+    found = details.get("spectrum")
+    if found:
+        times = found["relaxation_times"]
+        rows.append(f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,")
+        rows.append(f"on a grid of {found['times_per_decade']} times a decade;")
+        rows.append(f"the data carry {found['decades_carried']:.2g} decades of them,")
+        rows.append(f"{found['effective_parameters']:.2g} parameters in effect")
+    made = details["conversion"]
+    apart = 100 * made["largest_relative_error"]
+    return [*rows, f"as {made['modes']} Prony modes (largest", f"difference {apart:.2g} %): see fit.json"]
 
 
 def write(
@@ -274,7 +293,7 @@ def _parameter_rows(fit: Fit) -> list[str]:
     """The moduli and one line a mode, or the numbers of another model."""
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
-        return _own_lines(fit)
+        return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
     equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
     decided = edges.moved(fit)
 
@@ -299,30 +318,10 @@ def _parameter_rows(fit: Fit) -> list[str]:
     return [*rows, "* ends of the band decide it"] if decided else rows
 
 
-def _own_lines(fit: Fit) -> list[str]:
-    """Numbers of a model without modes. A spectrum has a summary; its strengths are in fit.json."""
-    p = fit.parameters
-    assert p is not None
-    rows = []
-    for name, value, error, unit in zip(p.names, p.values, p.standard_errors, fit.kind.units, strict=True):
-        if not name.startswith("strengths["):
-            mark = " *" if name in edges.moved(fit) else ""
-            rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}{mark}".rstrip())
-    found = fit.details.get("spectrum")
-    if found:
-        times = found["relaxation_times"]
-        rows.append(f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,")
-        rows.append(f"on a grid of {found['times_per_decade']} times a decade;")
-        rows.append(f"the data carry {found['decades_carried']:.2g} decades of them,")
-        rows.append(f"{found['effective_parameters']:.2g} parameters in effect")
-    apart = fit.details["conversion"]["largest_relative_error"]
-    return [*rows, f"as {fit.modes} Prony modes (largest", f"difference {100 * apart:.2g} %): see fit.json"]
-
-
 def _lines(fit: Fit) -> list[str]:
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
-        return _own_lines(fit)
+        return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
 
     decided = edges.moved(fit)
 

@@ -12,7 +12,7 @@ from fitting.methods import time_response
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.time_tests import TimeTest
 from fitting.reports import posterior_report
-from fitting.reports.sweep_report import numbers
+from fitting.reports.sweep_report import numbers, own_numbers, own_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.versions import versions
 
@@ -55,6 +55,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             "data": test.source,
             "notes": list(test.notes),
             "versions": versions(),
+            **own_numbers(fit.parameters, fit.kind),
             **sampled,
         }
     )
@@ -68,21 +69,27 @@ def _equilibrium_in_time(fit: TimeFit) -> float:
 
 
 def table(test: TimeTest, fit: TimeFit) -> str:
-    """Parameters ± standard error, and the criterion of each number of modes."""
-    u, n = fit.uncertainty, fit.modes
+    """Parameters ± standard error, and what the choice of the number of modes rests on."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
+    rows += _rows_of_modes(fit) if fit.parameters is None else own_rows(fit.parameters, fit.kind, fit.details)
+    errors = fit.relative_errors
+    rows.append(f"mean error {100 * errors.mean():.3g} %, largest {100 * errors.max():.3g} %")
+    for row in fit.details["tried"] if len(fit.details["tried"]) > 1 else []:
+        free = "" if row["identifiable"] else "   numbers left free"
+        modes = f"{row['modes']:2d} modes, " if row["model"].startswith("prony") else 10 * " "
+        rows.append(f"{row['model']:24s} {modes}criterion +{row['above_the_lowest']:.1f}{free}")
+    return "\n".join(rows)
+
+
+def _rows_of_modes(fit: TimeFit) -> list[str]:
+    u, n, rows = fit.uncertainty, fit.modes, []
     rows.append(f"G0    {u.values[0]:11.5g} ± {u.standard_errors[0]:<9.2g} Pa")
     if fit.kind.name == "prony":
         rows.append(f"G_inf {_equilibrium_in_time(fit):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
     for k in range(n):
         rows.append(f"g{k + 1:<4d} {u.values[1 + k]:11.5g} ± {u.standard_errors[1 + k]:<9.2g}".rstrip())
         rows.append(f"tau{k + 1:<2d} {u.values[1 + n + k]:11.5g} ± {u.standard_errors[1 + n + k]:<9.2g} s")
-    errors = fit.relative_errors
-    rows.append(f"mean error {100 * errors.mean():.3g} %, largest {100 * errors.max():.3g} %")
-    for row in fit.details["tried"] if len(fit.details["tried"]) > 1 else []:
-        free = "" if row["identifiable"] else "   numbers left free"
-        rows.append(f"{row['model']:12s} {row['modes']:2d} modes, criterion +{row['above_the_lowest']:.1f}{free}")
-    return "\n".join(rows)
+    return rows
 
 
 def figure(test: TimeTest, fit: TimeFit) -> Any:

@@ -11,7 +11,7 @@ from fitting.fits.together import Share, Together
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
-from fitting.reports.sweep_report import numbers
+from fitting.reports.sweep_report import numbers, own_numbers
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
@@ -50,11 +50,12 @@ def write(out: Path, found: Together) -> dict[str, Any]:
             "mean_relative_error": float(errors @ points / points.sum()),
             "max_relative_error": max(_largest(found)),
             "shear_waves": _waves(found),
-            "tests": [_share_of_test(s, n) for s in found.shares],
+            "tests": [_share_of_test(s, found) for s in found.shares],
             "warnings": list(found.warnings),
             "run_time_s": found.run_time,
             "compile_time_s": found.compile_time,
             "details": {"tried": found.tried},
+            **own_numbers(found.parameters, found.kind),
             "versions": versions(),
         }
     )
@@ -83,7 +84,9 @@ def _by_name(values: np.ndarray, n: int) -> dict[str, Any]:
     }
 
 
-def _share_of_test(share: Share, n: int) -> dict[str, Any]:
+def _share_of_test(share: Share, found: Together) -> dict[str, Any]:
+    own, without = found.parameters, share.errors_without
+    named = _by_name(without, found.modes) if own is None else dict(zip(own.names, without.tolist(), strict=True))
     return {
         "test": share.name,
         "data": share.source,
@@ -91,7 +94,7 @@ def _share_of_test(share: Share, n: int) -> dict[str, Any]:
         "mean_relative_error": share.mean_relative_error,
         "misfit": share.noise,
         "misfit_by_itself": share.alone,
-        "standard_errors_without_it": _by_name(share.errors_without, n),
+        "standard_errors_without_it": named,
     }
 
 
@@ -113,23 +116,31 @@ def _largest(found: Together) -> list[float]:
 
 def table(found: Together) -> str:
     """Parameters ± standard error, and beside them the errors that would be left without each of the tests."""
-    u, n = found.uncertainty, found.modes
+    u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
-    rows.append(f"{'':32s}" + "".join(f"{h:>12s}" for h in heads))
+    rows.append(
+        f"{'':{32 if own is None else 26 + max(len(name) + 1 for name in own.names)}s}"
+        + "".join(f"{h:>12s}" for h in heads)
+    )
     units = ["Pa", *[""] * n, *["s"] * n]
     labels = ["G0", *(f"g{k + 1}" for k in range(n)), *(f"tau{k + 1}" for k in range(n))]
+    if own is not None:
+        u, labels, units = own, list(own.names), ["" if unit == "1" else unit for unit in found.kind.units]
+    wide = max(6, *(len(label) + 1 for label in labels))
+    rows.append(" " * (wide + 26) + "".join(f"{h:>12s}" for h in heads))
     for j, (label, unit) in enumerate(zip(labels, units, strict=True)):
         without = "".join(f"{_error(s.errors_without[j]):>12s}" for s in found.shares)
-        own = f"{u.values[j]:11.5g} ± {_error(u.standard_errors[j]):8s} {unit}"
-        rows.append(f"{label:6s}{own:26s}{without}".rstrip())
+        value = f"{u.values[j]:11.5g} ± {_error(u.standard_errors[j]):8s} {unit}"
+        rows.append(f"{label:{wide}s}{value:26s}{without}".rstrip())
     if found.kind.name == "prony":
         rows.append(f"G_inf {_equilibrium(found):11.5g} ± {_error(equilibrium_error(u))} Pa")
     for k, s in enumerate(found.shares, 1):
         rows.append(f"{k}: misfit {100 * s.noise:.2g} %, by itself {100 * s.alone:.2g} %")
     for row in found.tried if len(found.tried) > 1 else []:
         free = "" if row["identifiable"] else "   numbers left free"
-        rows.append(f"{row['model']:12s} {row['modes']:2d} modes, criterion +{row['above_the_lowest']:.1f}{free}")
+        modes = f"{row['modes']:2d} modes, " if row["model"].startswith("prony") else 10 * " "
+        rows.append(f"{row['model']:24s} {modes}criterion +{row['above_the_lowest']:.1f}{free}")
     return "\n".join(rows)
 
 

@@ -1,0 +1,282 @@
+"""Springpot models of tests in time, and of several tests together; the choice between them and Prony modes.
+
+A springpot model answers through the modes of its own relaxation spectrum (`springpots.as_modes`), so drive, ramp and
+creep are computed as for Prony modes. Its own few numbers are what is fitted and reported.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits import models, time_tests, together, viscoelastic
+from fitting.fits.time_tests import TimeFit
+from fitting.fits.together import Measured, Share, Together
+from fitting.fits.viscoelastic import Kind
+from fitting.methods import as_prony_modes, generalised_maxwell, springpots, uncertainty
+from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.methods.springpots import FRACTIONAL, Fractional
+from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.time_tests import TimeTest
+
+#: Starts of each model, how far the random ones lie from the one that follows the Prony modes, and iterations.
+STARTS, AROUND, MOST_STEPS = 4, 0.7, 80
+
+
+class Spans(NamedTuple):
+    """What springpots are computed with: times of their modes [s], and the frequency [rad/s] of their numbers."""
+
+    low: float  # shortest time [s] that is looked at
+    high: float
+    times: np.ndarray
+    reference: float
+
+
+def spans_of(tests: Sequence[Measured]) -> Spans:
+    """Of all times that the tests resolve."""
+    ends = np.array([t.resolved for t in tests])
+    low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
+    return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
+
+
+@lru_cache(maxsize=16)
+def _residuals_of_tests(kinds: tuple[str, ...]) -> Callable[..., jax.Array]:
+    """(all six numbers, switches, times, reference, data of every test) -> residuals, one test below the other."""
+
+    def residuals(u, switches, times, reference, data):
+        model, rows = springpots.as_modes(u, switches, times, reference), []
+        for kind, (at, measured, scales) in zip(kinds, data, strict=True):
+            rows.append((time_tests.response_in_time(kind, model, *at) - measured) / scales)
+        return jnp.concatenate(rows)
+
+    return residuals
+
+
+@lru_cache(maxsize=16)
+def _each_model(kinds: tuple[str, ...]) -> Callable[..., Solution]:
+    """The best minimum of each model over its starts (M, S, 6)."""
+    residuals = _residuals_of_tests(kinds)
+
+    def minima(starts, switches, *data):
+        def of_model(starts, switches):
+            def minimum(u):
+                return levenberg_marquardt(residuals, u, switches, *data, max_iterations=MOST_STEPS)
+
+            found = jax.vmap(minimum)(starts)
+            k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
+            return jax.tree.map(lambda leaf: leaf[k], found)
+
+        return jax.vmap(of_model)(starts, switches)
+
+    return minima
+
+
+def _starts_near(model: Maxwell, spans: Spans) -> np.ndarray:
+    """Starts (M, STARTS, 6): each model fitted to the moduli of Prony modes, and points around it."""
+    omega = np.geomspace(1 / spans.high, 1 / spans.low, 24)
+    storage, loss = generalised_maxwell.moduli(model, omega)
+    like = Sweep(omega, np.asarray(storage), np.asarray(loss))
+    rng, out = np.random.default_rng(0), []
+    for case, fit in zip(FRACTIONAL, models.fractional(like), strict=True):
+        first = np.asarray(springpots.full(case, jnp.asarray(fit.solution.u)))
+        free = np.isin(np.arange(springpots.SIZE), case.free)
+        out.append(first + AROUND * free * np.vstack([np.zeros(6), rng.standard_normal((STARTS - 1, 6))]))
+    return np.stack(out)
+
+
+class _Found(NamedTuple):
+    """One springpot model at its minimum."""
+
+    case: Fractional
+    kind: Kind
+    model: Maxwell  # few Prony modes that stand for it
+    solution: Solution
+    spread: Estimate  # of the Prony modes
+    own: Estimate  # of its own numbers
+    sentences: tuple[str, ...]
+    error: float  # of the few modes over the band
+
+
+def _finished(case: Fractional, whole: Solution, spans: Spans) -> _Found:
+    free = jnp.array(case.free)
+    solution = whole._replace(u=whole.u[free], jacobian=whole.jacobian[:, free])
+
+    def at(u, omega):
+        return springpots.modulus(springpots.full(case, u), case.switches, omega / spans.reference)
+
+    def values(u):
+        return case.values(springpots.full(case, u), spans.reference)
+
+    def moduli(omega):
+        G = np.asarray(at(solution.u, jnp.asarray(omega)))
+        return G.real + 1j * np.maximum(G.imag, 1e-12 * np.abs(G))  # a model that ran away may have no loss left
+
+    made = as_prony_modes.convert(moduli, 1 / spans.high, 1 / spans.low, case.solid)
+    kind = Kind(case.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), case.names, case.units, values)
+    sentences = []
+    numbers, times = springpots.full(case, solution.u), jnp.asarray(spans.times)
+    dense = springpots.as_modes(numbers, jnp.asarray(case.switches), times, spans.reference)
+    storage, loss = generalised_maxwell.moduli(Maxwell(*(np.asarray(v) for v in dense)), made.omega)
+    apart = float(np.max(np.abs((storage + 1j * loss) / moduli(made.omega) - 1)))
+    for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes that computed it")):
+        if error > as_prony_modes.ALLOWED:
+            sentences.append(f"{what} follow the model {case.name} to {100 * error:.2g} % only: take another --model")
+    own = estimated(case.names, values, solution, len(solution.residuals), False)
+    spread = uncertainty.estimate(solution, False, kind.maxwell)
+    model = Maxwell(*(np.asarray(v) for v in kind.maxwell(solution.u)))
+    return _Found(case, kind, model, solution, spread, own, tuple(sentences), made.error)
+
+
+def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
+    """Converged, and the data determine every number."""
+    if fit.parameters is not None:
+        return fit.converged and bool(np.all(models.determined(fit.parameters)))
+    return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
+
+
+def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
+    """Every springpot model of a relaxation or creep test; `near`: Prony modes to begin from."""
+    spans = spans_of([test])
+    _, (at, driven, rows, answer, scales) = time_tests.residuals_in_time(test, Kind())
+    data = [((at, driven, rows), answer, scales)]
+    switches = np.stack([case.switches for case in FRACTIONAL])
+    given = (_starts_near(near, spans), switches, spans.times, spans.reference, data)
+    whole, compiling, running = viscoelastic.timed(_each_model((test.kind,)), *given)
+    out = []
+    for k, case in enumerate(FRACTIONAL):
+        found = _finished(case, jax.tree.map(lambda leaf, k=k: leaf[k], whole), spans)
+        fitted = np.asarray(found.solution.residuals) * scales + answer
+        where = (test.time[time_tests.thinned(test)], answer, fitted, scales)
+        seconds = (running * (k == 0), compiling * (k == 0))
+        details = {"conversion": {"modes": len(found.model.ratios), "largest_relative_error": found.error}}
+        own = (found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
+        out.append(TimeFit(*own, *where, found.sentences, *seconds, details, found.own))
+    return out
+
+
+def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> TimeFit:
+    """The model of the lowest criterion among those whose numbers the test determines.
+
+    Args:
+        test: data.
+        model: "prony", "fractional" or "auto".
+        modes: of Prony modes.
+    """
+    prony = time_tests.fit(test, modes)
+    if model == "prony":
+        return prony
+    tried = fractional_in_time(test, prony.model) + ([prony] if model == "auto" else [])
+    fits = [f for f in tried if able(f, test)] or tried
+    best = min(fits, key=time_tests.criterion)
+    rows = _compared_models(tried, time_tests.criterion, test)
+    sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
+    seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
+    return best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds)
+
+
+def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[dict[str, Any]]:
+    """What the choice rests on, best first."""
+    best = min(map(criterion, tried))
+    rows: list[dict[str, Any]] = [
+        {
+            "model": f.kind.name,
+            "modes": f.modes,
+            "above_the_lowest": criterion(f) - best,
+            "identifiable": able(f, data),
+        }
+        for f in tried
+    ]
+    return sorted(rows, key=lambda row: row["above_the_lowest"])
+
+
+#: Fields that hold seconds.
+TIMES = ("run_time", "compile_time")
+
+
+def _cautions_in_time(fit: TimeFit) -> list[str]:
+    out = [] if fit.converged else ["the fit did not converge; its best point is given: take another --model"]
+    assert fit.parameters is not None
+    mean = float(fit.relative_errors.mean())
+    if mean > 0.05:
+        out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try another --model")
+    free = [n for n, ok in zip(fit.kind.names, models.determined(fit.parameters), strict=True) if not ok]
+    if free:
+        out.append(f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model")
+    return out + time_tests.structured_misfit(fit)
+
+
+def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
+    """Every springpot model of several tests, each test with noise of its own; `near`: Prony modes to begin from."""
+    spans, kinds = spans_of(tests), tuple(map(together.name_of, tests))
+    parts = [together.reported_numbers(t) for t in tests]
+    starts, minima = _starts_near(near, spans), _each_model(kinds)
+    out = []
+    for k, case in enumerate(FRACTIONAL):
+        first, noise, seconds = starts[k : k + 1], np.full(len(tests), 0.03), np.zeros(2)
+        for _ in range(together.ROUNDS):
+            data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
+            given = (first, case.switches[None], spans.times, spans.reference, data)
+            whole, *took = viscoelastic.timed(minima, *given)
+            whole, seconds = jax.tree.map(lambda leaf: leaf[0], whole), seconds + took
+            noise = together.noises(tests, parts, np.asarray(whole.residuals), noise, len(case.free))
+            first = np.tile(np.asarray(whole.u), (1, STARTS, 1))
+        found = _finished(case, whole, spans)
+        shares, fitted = together.misfits(tests, parts, data, np.asarray(whole.residuals), noise)
+        own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
+        out.append(Together(*own, shares, fitted, [], found.sentences, seconds[1], seconds[0], found.own))
+    return out
+
+
+def choose_together(
+    tests: list[Measured],
+    model: str,
+    modes: int | str = "auto",
+    progress: Callable[[str], None] = lambda text: None,
+) -> Together:
+    """The model of the lowest criterion for several tests; arguments as of `choose_in_time` and `together.fit`."""
+    prony = together.fit(tests, modes, progress)
+    if model == "prony":
+        return prony
+    progress("springpots")
+    band = together.ResolvedBand(spans_of(tests)[:2])
+    tried = fractional_together(tests, prony.model) + ([prony] if model == "auto" else [])
+    fits = [f for f in tried if able(f, band)] or tried
+    best = min(fits, key=together.criterion_of_all)
+    rows = _compared_models(tried, together.criterion_of_all, band)
+    seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
+    if best is prony:
+        return best._replace(tried=rows, **seconds)
+    progress("what each test adds")
+    best = best._replace(shares=_shares_of_springpots(best))
+    out = [*best.warnings] if best.converged else ["the fit did not converge: take another --model", *best.warnings]
+    out += together.disagreements(best.shares)
+    assert best.parameters is not None
+    free = [n for n, ok in zip(best.kind.names, models.determined(best.parameters), strict=True) if not ok]
+    if free:
+        out.append(f"the data leave {' and '.join(free)} of the model {best.kind.name} free: take a simpler model")
+    return best._replace(tried=rows, warnings=tuple(out), **seconds)
+
+
+def _shares_of_springpots(fit: Together) -> list[Share]:
+    """Errors of the model's own numbers without each test, and what a fit to each test alone leaves."""
+    (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
+    spans, parts = spans_of(fit.tests), [together.reported_numbers(t) for t in fit.tests]
+    assert fit.kind.values is not None and fit.parameters is not None
+    u, jacobian = jnp.asarray(fit.solution.u), np.asarray(fit.solution.jacobian)
+    slope = np.asarray(jax.jacfwd(fit.kind.values)(u))
+    starts = np.tile(np.asarray(springpots.full(case, u)), (1, STARTS, 1))
+    free = np.isin(np.arange(springpots.SIZE), case.free)
+    starts = starts + AROUND * free * np.random.default_rng(1).standard_normal(starts.shape)
+    minima = _each_model(tuple(map(together.name_of, fit.tests)))
+
+    def alone(k: int) -> float:
+        data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
+        given = (starts, case.switches[None], spans.times, spans.reference, data)
+        return float(viscoelastic.timed(minima, *given)[0].cost[0])
+
+    return together.shares_by_rows(fit, jacobian, slope, fit.parameters.values, alone)

@@ -1,0 +1,138 @@
+"""Springpot models of tests in time and of several tests, against inverse Laplace transforms by mpmath."""
+
+import json
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from conftest import SHARED
+from test_models import FORMULAS, TRUTHS
+
+from fitting.__main__ import main
+from fitting.fits import springpots_in_time
+from fitting.methods import generalised_maxwell, springpots, time_response
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers import time_tests
+
+pytestmark = pytest.mark.quick_to_compile
+
+CASES = {model.name: model for model in springpots.FRACTIONAL}
+TIMES = np.geomspace(0.1, 1000, 25)
+
+
+def logit(p: float) -> float:
+    return float(np.log(p / (1 - p)))
+
+
+def places(name: str) -> np.ndarray:
+    """The six numbers of the code (reference 1 rad/s) of the literature's parameters."""
+    v = TRUTHS[name]
+    u = np.zeros(springpots.SIZE)
+    if name == "fractional_zener":
+        e, m, tau, a = v
+        u[[0, 2, 3, 4]] = np.log(e), np.log(m) + a * np.log(tau), logit(a), np.log(m)
+    elif name == "fractional_maxwell":
+        pot, a, other, b = v
+        u[[2, 3, 4, 5]] = np.log(pot), logit(a), np.log(other), logit(b / a)
+    elif name == "fractional_parallel":
+        other, b, pot, a = v
+        u[[0, 1, 2, 3]] = np.log(other), logit(b / a), np.log(pot), logit(a)
+    else:
+        u[[2, 3]] = np.log(v[-2]), logit(v[-1])
+        u[0] = np.log(v[0]) if len(v) == 3 else 0.0
+    return u
+
+
+def inverse_laplace(name: str, creep: bool, times: np.ndarray = TIMES) -> np.ndarray:
+    """G(t) [Pa] or J(t) [1/Pa] after a step: what Mittag-Leffler functions give, by Talbot's contour."""
+
+    def transformed(s):
+        G = FORMULAS[name](s, *TRUTHS[name])
+        return 1 / (s * G) if creep else G / s
+
+    return np.array([float(mpmath.invertlaplace(transformed, t, method="talbot")) for t in times])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_modes_of_a_springpot_answer_as_mittag_leffler_functions(name):
+    times = springpots.times_of_modes(TIMES[0], TIMES[-1])
+    made = springpots.as_modes(jnp.asarray(places(name)), CASES[name].switches, jnp.asarray(times), 1.0)
+    model = Maxwell(*(np.asarray(v) for v in made))
+    # The trapezium rule converges exponentially; what is left is of the spectrum beyond its ends.
+    few = TIMES[::4]
+    assert np.allclose(time_response.relaxation_modulus(model, few), inverse_laplace(name, False, few), rtol=5e-4)
+    assert np.allclose(time_response.creep_compliance(model, few), inverse_laplace(name, True, few), rtol=5e-4)
+    omega = 1 / few[::-1]
+    storage, loss = generalised_maxwell.moduli(model, omega)
+    assert np.allclose(storage + 1j * loss, FORMULAS[name](1j * omega, *TRUTHS[name]), rtol=5e-4)
+
+
+def test_a_relaxation_test_gives_the_numbers_of_a_springpot_model_back(tmp_path, capsys):
+    answer = inverse_laplace("fractional_zener", False) * (1 + 0.005 * np.random.default_rng(0).standard_normal(25))
+    rows = [f"{t:.12g},{g:.12g}" for t, g in zip(TIMES, answer, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["time_s,relaxation_modulus_Pa", *rows]) + "\n")
+    assert main(["relaxation", str(tmp_path / "a.csv"), "--model", "auto", "--out", str(tmp_path / "out")]) == 0
+    content = json.loads((tmp_path / "out" / "fit.json").read_text())
+    # A step long ago shows how the model ends; tau = 0.05 s is before the first answer, so two numbers are left free.
+    tried = {row["model"]: row for row in content["details"]["tried"]}
+    assert set(CASES) < set(tried) and content["mean_relative_error"] < 0.006
+    assert tried["fractional_zener"]["above_the_lowest"] < 10 and "Prony modes" in capsys.readouterr().out
+    own = content["parameters"]["equilibrium_modulus"]
+    assert abs(own["value"] - 300) < 4 * own["standard_error"] < 60
+
+
+@pytest.mark.slow
+def test_creep_gives_them_too(tmp_path):
+    answer = inverse_laplace("fractional_kelvin_voigt", True)
+    rows = [f"{t:.12g},{g:.12g}" for t, g in zip(TIMES, answer, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["time_s,creep_compliance_1/Pa", *rows]) + "\n")
+    test = time_tests.read_time_test(tmp_path / "a.csv", "creep", time_tests.Sample(None, None), 0.0, 0.0)
+    near = Maxwell(np.float64(500.0), np.array([0.2, 0.2]), np.array([30.0, 0.5]))
+    found = {f.kind.name: f for f in springpots_in_time.fractional_in_time(test, near)}
+    own = found["fractional_kelvin_voigt"].parameters
+    assert np.allclose(own.values, TRUTHS["fractional_kelvin_voigt"], rtol=3e-3)
+
+
+@pytest.mark.slow
+def test_a_sweep_and_a_relaxation_test_together(tmp_path, capsys):
+    """The relaxation time of this model, 0.05 s, is within the sweep's band, its equilibrium within the other's."""
+    rng, omega = np.random.default_rng(1), np.geomspace(0.5, 300, 20)
+    G = FORMULAS["fractional_zener"](1j * omega, *TRUTHS["fractional_zener"])
+    factor = 1 + 0.01 * rng.standard_normal((2, 20))
+    rows = [f"{w},{a},{b}" for w, a, b in zip(omega, G.real * factor[0], G.imag * factor[1], strict=True)]
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    (tmp_path / "sweep.csv").write_text("\n".join([head, *rows]) + "\n")
+    answer = inverse_laplace("fractional_zener", False) * (1 + 0.003 * rng.standard_normal(25))
+    rows = [f"{t},{g}" for t, g in zip(TIMES, answer, strict=True)]
+    (tmp_path / "b.csv").write_text("\n".join(["time_s,relaxation_modulus_Pa", *rows]) + "\n")
+    args = [str(tmp_path / "sweep.csv"), "--with", str(tmp_path / "b.csv"), "--out", str(tmp_path / "out")]
+    assert main([*args, "--model", "auto"]) == 0
+    content = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert content["model"] == "fractional_zener"
+    for name, true in zip(CASES["fractional_zener"].names, TRUTHS["fractional_zener"], strict=True):
+        own = content["parameters"][name]
+        assert abs(own["value"] - true) < 4 * own["standard_error"] < 0.4 * true, name
+    sweep, relaxation = content["tests"]
+    assert 0.005 < sweep["misfit"] < 0.02 and 0.0015 < relaxation["misfit"] < 0.006
+    without = relaxation["standard_errors_without_it"]["equilibrium_modulus"]
+    assert without > 2 * content["parameters"]["equilibrium_modulus"]["standard_error"]
+    assert "without 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("more", [["--modes", "2"], ["--samples", "1000"]])
+def test_what_springpots_do_not_have_is_refused(more, tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("time_s,relaxation_modulus_Pa\n1,2\n2,1.5\n3,1.2\n4,1.1\n")
+    assert main(["relaxation", str(tmp_path / "a.csv"), "--model", "auto", *more]) == 2
+    assert f"{more[0]} is of --model prony" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_fish_muscle_relaxes_as_two_springpots_in_a_row():
+    """pyRheo shows its fractional Maxwell model on this record; modes need eleven numbers and follow it less well."""
+    file = SHARED / "data" / "rheology" / "pyrheo" / "stressrelaxation_fishmuscle_data.csv"
+    if not file.exists():
+        pytest.skip("the record of fish muscle is not here")
+    test = time_tests.read_time_test(file, "relaxation", time_tests.Sample(None, None), 0.0, 0.0)
+    found = springpots_in_time.choose_in_time(test, "auto")
+    assert found.kind.name == "fractional_maxwell" and found.relative_errors.mean() < 0.004
