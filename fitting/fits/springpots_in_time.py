@@ -89,7 +89,7 @@ def _starts_near(model: Maxwell, spans: Spans) -> np.ndarray:
     return np.stack(out)
 
 
-class _Found(NamedTuple):
+class _Springpot(NamedTuple):
     """One springpot model at its minimum."""
 
     case: Fractional
@@ -102,7 +102,7 @@ class _Found(NamedTuple):
     error: float  # of the few modes over the band
 
 
-def _finished(case: Fractional, whole: Solution, spans: Spans) -> _Found:
+def _springpot_at(case: Fractional, whole: Solution, spans: Spans) -> _Springpot:
     free = jnp.array(case.free)
     solution = whole._replace(u=whole.u[free], jacobian=whole.jacobian[:, free])
 
@@ -129,7 +129,7 @@ def _finished(case: Fractional, whole: Solution, spans: Spans) -> _Found:
     own = estimated(case.names, values, solution, len(solution.residuals), False)
     spread = uncertainty.estimate(solution, False, kind.maxwell)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(solution.u)))
-    return _Found(case, kind, model, solution, spread, own, tuple(sentences), made.error)
+    return _Springpot(case, kind, model, solution, spread, own, tuple(sentences), made.error)
 
 
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
@@ -149,7 +149,7 @@ def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
     whole, compiling, running = viscoelastic.timed(_each_model((test.kind,)), *given)
     out = []
     for k, case in enumerate(FRACTIONAL):
-        found = _finished(case, jax.tree.map(lambda leaf, k=k: leaf[k], whole), spans)
+        found = _springpot_at(case, jax.tree.map(lambda leaf, k=k: leaf[k], whole), spans)
         fitted = np.asarray(found.solution.residuals) * scales + answer
         where = (test.time[time_tests.thinned(test)], answer, fitted, scales)
         seconds = (running * (k == 0), compiling * (k == 0))
@@ -225,7 +225,7 @@ def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
             whole, seconds = jax.tree.map(lambda leaf: leaf[0], whole), seconds + took
             noise = together.noises(tests, parts, np.asarray(whole.residuals), noise, len(case.free))
             first = np.tile(np.asarray(whole.u), (1, STARTS, 1))
-        found = _finished(case, whole, spans)
+        found = _springpot_at(case, whole, spans)
         shares, fitted = together.misfits(tests, parts, data, np.asarray(whole.residuals), noise)
         own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
         out.append(Together(*own, shares, fitted, [], found.sentences, seconds[1], seconds[0], found.own))
