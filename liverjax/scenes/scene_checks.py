@@ -100,8 +100,6 @@ def _body(body: Body, nodes: int) -> None:
 
 def _mixed(scene: Scene) -> None:
     name = "[solve] volumetric = 'mixed'"
-    if scene.solve.linear_solver == "direct":
-        raise InputError(f"{name} iterates with a solver of its own: leave linear_solver = 'direct' out")
     if scene.solve.robust != "off":
         raise InputError(f"{name} has no energy that a solution makes least, which robust needs: leave one of them out")
     for law in regions.laws_of(scene.law, scene.region):

@@ -207,6 +207,8 @@ def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> 
     elif e.mixed is not None:
         g = mesh.weights * e.mixed.border(determinant(F))
         A = A._replace(border=stored([scale(g, v) for v in volume_gradients(mesh, F)[1:]]))
+        if e.scene.solve.linear_solver == "direct":
+            A = A._replace(pressures=e.mixed.matrix(mesh, determinant(F), kind != "true"))
     own = point_matrix.levels(mesh, A, bulk)
     more = _attached(e, x, s, kind)
     near = _symmetric(e, more)
@@ -325,15 +327,20 @@ def solve(
 
 def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
     """The same by a factorisation. Where pressures depend on motion, it is of the coupled matrix."""
-    free, load, volume = e.free.mask.T, b.reshape(3, -1), _coupled(e)
+    n, volume, nothing = 3 * e.mesh.number_of_nodes, _coupled(e), jnp.ones(0)
+    # The factorised matrix is of pressures that push inwards, and of minus their balance.
+    unit = None if e.mixed is None else -e.mixed.unit
+    free, load, balance = e.free.mask.T, b[:n].reshape(3, -1), nothing if unit is None else b[n:] / unit
     if isinstance(K.matrix, PointMatrix):
-        known = jnp.ones(0) if volume is None or volume.flow is None else volume.flow.mask
-        return direct.solve_points(e.mesh, K.matrix, (free, known), load, e.free.normals, K.attached).ravel()
-    if volume is not None:
-        known = jnp.ones_like(free[:1]) if volume.flow is None else volume.flow.mask[None]
-        free = jnp.concatenate([free, known])
-        load = jnp.concatenate([load, jnp.zeros_like(load[:1])])
-    return direct.solve(K.matrix, free, load, e.free.normals, K.attached)[:3].ravel()
+        known = nothing if volume is None or volume.flow is None else volume.flow.mask
+        x = direct.solve_points(e.mesh, K.matrix, (free, known), (load, balance), e.free.normals, K.attached)
+    else:
+        if volume is not None or unit is not None:
+            known = jnp.ones_like(free[:1]) if volume is None or volume.flow is None else volume.flow.mask[None]
+            free = jnp.concatenate([free, known])
+            load = jnp.concatenate([load, jnp.zeros_like(load[:1]) if unit is None else balance[None]])
+        x = direct.solve(K.matrix, free, load, e.free.normals, K.attached).ravel()
+    return x[:n] if unit is None else jnp.concatenate([x[:n], x[n:] / unit])
 
 
 def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int) -> tuple[jax.Array, jax.Array]:

@@ -37,24 +37,25 @@ def solve(
 def solve_points(
     mesh: TetMesh,
     A: PointMatrix,
-    free: Any,
-    b: jax.Array,
+    free: tuple[jax.Array, jax.Array],
+    b: tuple[jax.Array, jax.Array],
     normals: Number | None = None,
     attached: tuple[Attached, ...] = (),
 ) -> jax.Array:
-    """The same for quadratic elements; b and the solution are (3, V), positions alone.
+    """The same of quadratic elements, flat: positions (3 V,), and pressures of the vertices where A has them.
 
-    Pressures of the vertices, where A has them, are unknowns beside the positions; their row of the balance is 0.
-    `free` are two masks, of positions (3, V) and of pressures.
+    `free` and `b` are two arrays each, of positions (3, V) and of pressures. Without numbers, pressures are free and
+    their part of `b` is 0.
     """
     blocks = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in sorted(A.blocks)])
-    own = None if A.own is None else _filled(A.own, b[0])
+    own = None if A.own is None else _filled(A.own, b[0][0])
     coupled = None
     if A.border is not None and A.pressures is not None:
         C = A.pressures
         coupled = (jnp.stack([jnp.stack(g) for g in A.border]), C.rows[0][0], C.diagonal[0][0], C.nodes)
     nodes = jnp.stack(mesh.element_nodes)
-    shape = jax.ShapeDtypeStruct(b.shape, b.dtype)
+    size = b[0].size + (0 if coupled is None else mesh.number_of_vertices)
+    shape = jax.ShapeDtypeStruct((size,), b[0].dtype)
     host = partial(_solve_points, mesh.order)
     given = (blocks, nodes, own, coupled, free, b, normals, attached)
     return jax.pure_callback(host, shape, *given, vmap_method="sequential")
@@ -108,7 +109,7 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
     import scipy.sparse
 
     blocks, nodes, own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
-    n, c = b.shape[1], basis(order).c
+    n, c = b[0].shape[1], basis(order).c
     pairs = [(a, b) for a in (1, 2, 3) for b in (1, 2, 3) if a <= b]
     K = np.zeros((4, 4, 3, 3, *blocks.shape[-2:]))
     for (a, k), block in zip(pairs, blocks, strict=True):
@@ -121,7 +122,7 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
     if own is not None:
         every = np.arange(n)
         entries += [(own[r, s], r * n + every, s * n + every) for r in range(3) for s in range(3)]
-    known, load = free[0].ravel(), b.ravel()
+    known, load = free[0].ravel(), b[0].ravel()
     if coupled is not None:
         border, rows, diagonal, near = coupled
         g = np.concatenate([-border.sum(axis=0)[None], border])
@@ -130,14 +131,12 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
         every = 3 * n + np.arange(len(diagonal))
         entries += [(G, at[:, None], balance[None]), (G, balance[None], at[:, None])]
         entries += [(-rows, every[None], 3 * n + near), (-diagonal, every, every)]
-        pressures = free[1] if len(free[1]) else np.ones(len(diagonal))
-        known = np.concatenate([known, pressures])
-        load = np.concatenate([load, np.zeros(len(diagonal))])
+        known = np.concatenate([known, free[1] if len(free[1]) else np.ones(len(diagonal))])
+        load = np.concatenate([load, b[1] if len(b[1]) else np.zeros(len(diagonal))])
     parts = [[a.ravel() for a in np.broadcast_arrays(*entry)] for entry in entries]
     values, lines, columns = (np.concatenate(a) for a in zip(*parts, strict=True))
     A = scipy.sparse.coo_array((values, (lines, columns)), shape=(len(known), len(known))).tocsr()
-    x = _one_solution(A, known, load, normals, abs(element[0, 0]).mean())
-    return x[: 3 * n].reshape(3, n).astype(b.dtype)
+    return _one_solution(A, known, load, normals, abs(element[0, 0]).mean()).astype(b[0].dtype)
 
 
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, normals: Number, mean: float) -> np.ndarray:

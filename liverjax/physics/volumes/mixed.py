@@ -25,7 +25,8 @@ from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.nodal import gathered, integrals, interpolated, to_nodes
+from liverjax.mesh.basis import basis
+from liverjax.mesh.nodal import gathered, integrals, interpolated, summed
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
 from liverjax.solvers.block_matrix import BlockMatrix, off_diagonal
@@ -145,10 +146,19 @@ class Mixed(VolumeStress):
         return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
-        """`compliance` of linear elements as a matrix."""
-        soft, held = (jnp.broadcast_to(mesh.volumes / (20 * a), mesh.volumes.shape) for a in (self.rest, self.shear))
-        rows = off_diagonal(mesh, dict.fromkeys(PAIRS, ((soft - held / 4,),)))
-        return BlockMatrix(rows, ((to_nodes(mesh, 2 * soft + 0.75 * held),),), mesh.pattern.row_nodes)
+        """`compliance` as a matrix."""
+
+        def block(a: int, b: int) -> jax.Array:
+            same = float(a == b)
+            if mesh.order == 1:
+                return mesh.volumes * ((1 + same) / self.rest + (same - 0.25) / self.shear) / 20
+            L = basis(mesh.order).L
+            return summed(mesh, mesh.weights * jnp.asarray(L[a] * L[b])[:, None] / self.rest)
+
+        rows = off_diagonal(mesh, {(a, b): ((block(a, b),),) for a, b in PAIRS})
+        own = jnp.stack([block(a, a) for a in range(4)])
+        zero = jnp.zeros(mesh.number_of_vertices, own.dtype)
+        return BlockMatrix(rows, ((given(zero, mesh.tetrahedra.T, own),),), mesh.pattern.row_nodes)
 
     def schur(self, mesh: TetMesh) -> jax.Array:
         """Near the matrix of the pressures alone (V,) [m^3/Pa], displacements eliminated: lumped."""
