@@ -20,6 +20,9 @@ from liverjax.simulation.unloaded import resting
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import harmonic_mesh_error
 
+#: A time [s] after which nothing flows any more.
+_FOR_LONG = 1e12
+
 
 class Waves(NamedTuple):
     """Amplitudes of a scene, and the time and iterations of the solve."""
@@ -53,7 +56,9 @@ def _under_its_weight(scene: Scene) -> jax.Array | None:
     if scene.body is None or not np.any(np.asarray(scene.body.gravity)):
         return None
     still = resting(replace(scene, traction=(), body=replace(scene.body, times=None, history=None)))
-    solve = replace(still.solve, dt=None, steps=4, frequencies=None)
+    # Of a sponge the steps are so long that its fluid has flowed.
+    dt = None if scene.porosity is None else _FOR_LONG
+    solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
     try:
         return simulate(replace(still, solve=solve)).check().positions[-1]
     except RuntimeError as error:
@@ -76,10 +81,12 @@ def _last_positions(file: Path, scene: Scene) -> jax.Array:
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
-    """Frequencies, complex displacements and reactions (F, V, 3), and the mesh as datasets; `attributes` as such."""
+    """Frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh; `attributes` as such."""
     import h5py
 
     arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}
+    if waves.found.pressure is not None:
+        arrays["pressure"] = (waves.found.pressure, "Pa")
     arrays["reference"] = (scene.mesh.points, "m")
     if waves.mesh_error is not None:
         arrays["mesh_error/displacement"] = (waves.mesh_error, "m")
@@ -104,6 +111,9 @@ def write_waves_vtu(folder: Path, scene: Scene, found: Harmonic) -> Path:
     for k, u in enumerate(np.asarray(found.displacement)):
         name = f"frequency_{k + 1:03d}.vtu"
         data = {"displacement_real": u.real, "displacement_imaginary": u.imag}
+        if found.pressure is not None:
+            p = np.asarray(found.pressure[k])
+            data |= {"pressure_real": p.real, "pressure_imaginary": p.imag}
         meshio.Mesh(np.asarray(scene.mesh.points), [meshio_cells(scene.mesh)], point_data=data).write(folder / name)
         entries.append({"name": name, "time": float(found.frequencies_Hz[k])})
     series = folder / "result.vtu.series"

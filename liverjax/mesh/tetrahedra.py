@@ -97,7 +97,7 @@ class TetMesh:
             first, *others = [[taken(column, n) for column in columns] for n in self.element_nodes]
             return [tuple(a - b for a, b in zip(corner, first, strict=True)) for corner in others]
         nodes = jnp.stack(self.element_nodes)
-        values = self._oriented(jnp.stack([taken(column, nodes) for column in columns], axis=1))
+        values = self.oriented(jnp.stack([taken(column, nodes) for column in columns], axis=1))
         y = jnp.tensordot(self._slopes(), values, axes=(1, 0)).reshape(3, -1, *values.shape[1:])
         return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
 
@@ -110,7 +110,7 @@ class TetMesh:
         else:
             whole = jnp.stack([jnp.stack(force, axis=1) for force in forces])
             values = jnp.tensordot(self._slopes().T, whole.reshape(-1, *whole.shape[2:]), axes=(1, 0))
-            values = self._oriented(values)
+            values = self.oriented(values)
             shares = [[values[:, i]] for i in range(count)]
         nodes = jnp.concatenate(self.element_nodes)
         columns = []
@@ -124,7 +124,7 @@ class TetMesh:
         c = basis(self.order).c
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
-    def _oriented(self, values: jax.Array) -> jax.Array:
+    def oriented(self, values: jax.Array) -> jax.Array:
         """Functions of order 3 on edges, among values (n, C, E), point to the higher vertex: they change their sign."""
         if self.order < 3:
             return values

@@ -21,7 +21,7 @@ from liverjax.solvers.preconditioner import Coarse
 from liverjax.tensors.matrices import Matrix, dot
 
 #: Flat and inverted elements store and conduct fluid as elements of this J.
-_LEAST_J = 1e-3
+LEAST_J = 1e-3
 
 
 class Flow(NamedTuple):
@@ -48,7 +48,7 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tole
         if inlet.nodes is not None:
             mask = mask.at[inlet.nodes].set(0.0, mode="drop")
     # Everything times dt: the storage term stays of the size of a volume whatever the step.
-    J = jnp.maximum(J, _LEAST_J)
+    J = jnp.maximum(J, LEAST_J)
     by_element = jnp.ndim(porosity.limit_bulk) > 0
     store = integrals(mesh, J / porosity.limit_bulk) if by_element else integrals(mesh, J) / porosity.limit_bulk
     g = volume_gradients(mesh, F)

@@ -10,15 +10,16 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, struct
+from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
 from liverjax.physics.loads import follows, nodal_tractions
+from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import prescribed
-from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
 from liverjax.waves import sparse
-from liverjax.waves.operator import Operator, forces_of_motion, operator
+from liverjax.waves.operator import Operator, free_part, operator
 
 MASSES = ("consistent", "lumped")
 #: What the equations of one instant need of [solve].
@@ -28,7 +29,7 @@ _STILL = {
     "dt": None,
     "steps": 1,
     "linear_solver": "cg",
-    "volumetric": "element",
+    "robust": "off",
 }
 
 
@@ -40,6 +41,7 @@ class Harmonic:
     displacement: jax.Array = param("m", "u, complex (F, V, 3)")
     reactions: jax.Array = param("N", "complex (F, V, 3), force of the support on the body where motion is given")
     residual: jax.Array = param("1", "(F,) what is out of balance where the body is free, over the forces at work")
+    pressure: jax.Array | None = param("Pa", "of the fluid, complex (F, V), of a porous scene", default=None)
 
     def check(self) -> "Harmonic":
         """The result itself, or `RuntimeError` with advice where a frequency has no answer; host side."""
@@ -60,18 +62,20 @@ def harmonic(
     motion: Any = None,
     mass: str = "consistent",
 ) -> Harmonic:
-    """Small motion of the scene at these frequencies, driven by its tractions and prescribed motions as amplitudes.
+    """Small motion of the scene at these frequencies, driven by its tractions, prescribed motions and inlets.
 
-    Law, viscosity, density, supports, held nodes and regions act; gravity and time steps have no part. May be
-    differentiated in both modes and jitted; every derivative costs one more solve a frequency.
+    Their numbers are amplitudes. Law, viscosity, porosity, density, supports, held nodes and regions act; gravity and
+    time steps have no part. May be differentiated in both modes and jitted; every derivative costs one more solve a
+    frequency, without a factorisation of its own.
 
     Args:
         scene: `Scene`. What `displaced` prescribes is the amplitude of a motion in phase.
         frequencies_Hz: (F,), above 0; default: those of scene.solve.
         factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
-            default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or 1 without one.
+            default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or 1 without one. Where
+            volumes have pressures of their own (volumetric "mixed", "nodal"), or a sponge has them, they do not relax.
         about: positions (V, 3) [m] of an equilibrium that has rested for long, as of `simulate`; default: the
-            reference shape. The law's stress there stiffens the body.
+            reference shape. The law's stress there stiffens the body. A fluid has flowed until its pressure is 0.
         motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
         mass: "consistent" (each element's integrals), or "lumped" as in runs in time.
 
@@ -79,8 +83,8 @@ def harmonic(
         `Harmonic`. A matrix without an inverse leaves NaN at its frequency.
 
     Raises:
-        InputError: what has no harmonic motion here (porosity, pressures that follow, rigid plates, mixed or averaged
-            volumes), shapes and values that cannot be used.
+        InputError: what has no harmonic motion here (pressures that follow, friction, rigid plates), shapes and values
+            that cannot be used.
     """
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
     scene = _small(scene, mass)
@@ -94,6 +98,8 @@ def harmonic(
     motion = jnp.asarray(motion, complex)
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
         raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape} or one more axis of frequencies")
+    if about is not None and scene.porosity is not None and not _drains(scene.porosity):
+        raise InputError("a sealed sponge under load keeps a pressure that about does not tell: give porosity.drained")
     if about is not None and jnp.shape(about) != mesh.points.shape:
         raise InputError(f"about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}")
     motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
@@ -110,7 +116,9 @@ def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "
 
 
 def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
-    still = replace(scene, viscosity=None, displaced=tuple(replace(d, by=jnp.zeros(3)) for d in scene.displaced))
+    solve = replace(scene.solve, volumetric="element")
+    unmoved = tuple(replace(d, by=jnp.zeros(3)) for d in scene.displaced)
+    still = replace(scene, viscosity=None, porosity=None, displaced=unmoved, solve=solve)
     none = jnp.zeros(())
     e = equations(still, initial_state(still), 1.0, Sizes(none, none))
     if e.free.tied:
@@ -120,22 +128,45 @@ def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
 
 @partial(jax.jit, static_argnames="mass")
 def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, about: Any, mass: str) -> Harmonic:
-    """Motion, reactions and residual forces; `at` are factors and angular frequencies."""
-    A = _operator(scene, about, mass)
-    held = (1 - A.free.mask)[None] * motion
-    load = jnp.asarray(nodal_tractions(scene.mesh, scene.traction), complex)[None]
-    forced = jax.lax.map(lambda one: forces_of_motion(A, one[0], one[1], one[2]), (*at, held))
-    u = held + sparse.motions(A, *at, load - forced)
-    f = jax.lax.map(lambda one: forces_of_motion(A, one[0], one[1], one[2]), (*at, u)) - load
-    out = jax.vmap(A.free.vectors)(f)
-    size = jnp.linalg.norm(f - out, axis=(1, 2)) + jnp.linalg.norm(load, axis=(1, 2))
-    residual = jnp.linalg.norm(out, axis=(1, 2)) / jnp.where(size > 0, size, 1.0)
+    """Motion, reactions and residuals; `at` are factors and angular frequencies."""
+    A, omegas = _operator(scene, about, mass), at[1]
+    held, load = _prescribed_and_loads(A, omegas, motion, nodal_tractions(scene.mesh, scene.traction))
+    moved = sparse.motions(A, *at, jax.tree.map(jnp.subtract, load, sparse.at_every(A, *at, held)))
+    u, p = jax.tree.map(jnp.add, held, moved)
+    f, balance = jax.tree.map(jnp.subtract, sparse.at_every(A, *at, (u, p)), load)
+    out, unbalanced = jax.vmap(lambda *m: free_part(A, m))(f, balance)
+    residual = _part(out, jnp.abs(f - out) + jnp.abs(load[0]))
+    if unbalanced is not None and p is not None:
+        # What the motion takes from the pressures' volumes, or the fluid that enters.
+        taken: Any = sparse.at_every(A, *at, (u, jnp.zeros_like(p)))[1]
+        residual = jnp.maximum(residual, _part(unbalanced, jnp.abs(taken) + jnp.abs(load[1])))
     return Harmonic(
-        frequencies_Hz=at[1] / (2 * jnp.pi),
+        frequencies_Hz=omegas / (2 * jnp.pi),
         displacement=u,
         reactions=f - out,
         residual=jax.lax.stop_gradient(residual),
+        pressure=None if scene.porosity is None else jax.vmap(lambda own: on_middles(scene.mesh, own))(p),
     )
+
+
+def _prescribed_and_loads(
+    A: Operator, omegas: jax.Array, motion: jax.Array, traction: jax.Array
+) -> tuple[sparse.Motions, Any]:
+    """What is prescribed, and the loads, of every frequency."""
+    number, own = len(omegas), A.pressures
+    held = (1 - A.free.mask)[None] * motion
+    force = jnp.broadcast_to(jnp.asarray(traction, complex)[None], motion.shape)
+    if own is None:
+        return (held, None), (force, None)
+    pressure = jnp.broadcast_to(jnp.asarray(own.given, complex), (number, *own.given.shape))
+    enters = jnp.zeros_like(pressure) if own.enters is None else -own.enters[None] / (1j * omegas[:, None])
+    return (held, pressure), (force, enters)
+
+
+def _part(out: jax.Array, work: jax.Array) -> jax.Array:
+    """(F,) norms of what is out of balance, over those of what is at work."""
+    sizes = [jnp.linalg.norm(a.reshape(len(a), -1), axis=1) for a in (out, work)]
+    return sizes[0] / jnp.where(sizes[1] > 0, sizes[1], 1.0)
 
 
 def _frequencies(frequencies_Hz: Any) -> jax.Array:
@@ -160,6 +191,11 @@ def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
     return 1 - jnp.sum(ratios, axis=0)
 
 
+def _drains(porosity: Porosity) -> bool:
+    """Whether the fluid can leave the sponge at a pressure of 0."""
+    return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
+
+
 def _small(scene: Scene, mass: str) -> Scene:
     """The scene without time and weight, for small motion. Physics that have no small motion are refused."""
     if mass not in MASSES:
@@ -168,22 +204,17 @@ def _small(scene: Scene, mass: str) -> Scene:
         raise InputError(
             '[mesh] is = "loaded" has no harmonic motion: take the scene of lj.unloaded(scene), and its run as about'
         )
-    if scene.porosity is not None:
-        raise InputError("porosity has no harmonic motion here: leave it out, or run the scene in time")
     if not all(physics.conservative for physics in scene.physics):
         raise InputError(
             "friction and pressed obstacles have no harmonic motion here: leave them out, or run the scene in time"
         )
     if follows(scene.traction):
         raise InputError("a pressure that follows the body has no harmonic motion here: give a traction as value")
-    if scene.solve.volumetric in ("nodal", "mixed"):
-        raise InputError(f"volumetric = {scene.solve.volumetric!r} has no harmonic motion here: use 'element'")
     solve = replace(scene.solve, **_STILL)
     traction = tuple(replace(t, times=None, history=None) for t in scene.traction)
     body = None if scene.body is None else replace(scene.body, gravity=jnp.zeros(3), times=None, history=None)
-    viscous = scene.viscosity
-    if viscous is not None:
-        viscous = regions.viscosity_of_elements(viscous, scene.region, scene.mesh.number_of_elements)
-    elastic = tuple(replace(region, viscosity=None) for region in scene.region)
-    still = replace(scene, viscosity=None, region=elastic, traction=traction, body=body, solve=solve)
-    return replace(prepared(still), viscosity=viscous)
+    sponge = scene.porosity
+    if sponge is not None:
+        inlets = tuple(replace(inlet, times=None, history=None) for inlet in sponge.inlet)
+        sponge = replace(sponge, inlet=inlets)
+    return prepared(replace(scene, traction=traction, body=body, solve=solve, porosity=sponge))

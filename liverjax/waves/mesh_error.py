@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.enriched import enriched
@@ -19,8 +20,9 @@ def harmonic_mesh_error(
     """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
 
     Quadratic elements are solved where the result is of linear ones, cubic where it is of quadratic ones. Too few
-    elements a wave show as an error of the size of the motion: the phase of the waves is wrong then. It costs as much
-    as a mesh with eight times the unknowns (quadratic elements: three times).
+    elements a wave show as an error of the size of the motion: the phase of the waves is wrong then. The cost is that
+    of a mesh with eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is
+    left out.
 
     Args:
         scene, factors, about, motion: as of `harmonic`.
@@ -35,6 +37,11 @@ def harmonic_mesh_error(
             f"the result has {found.displacement.shape[1]} nodes, the scene {nodes}: give the scene of the result"
         )
     rich = enriched(scene)
+    if rich.mesh.order == 3:
+        # Cubic elements do not lock.
+        rich = replace(rich, solve=replace(rich.solve, volumetric="element"))
+    elif scene.solve.volumetric == "nodal":
+        rich = replace(rich, solve=replace(rich.solve, volumetric="mixed"))
     if motion is not None:
         motion = _padded(rich.mesh, jnp.asarray(motion, complex))
     if about is not None:

@@ -6,8 +6,8 @@ part of the tangent apart (superposed small motion: Lockett 1972, Nonlinear Visc
 
     K(omega) = m(omega) (K_h - K_geometric) + m_inf K_geometric + K_rest,
 
-where K_rest is of what does not relax: the volumetric part of the law where only the isochoric part does, supports,
-membranes and springs.
+where K_rest is of what does not relax: the volumetric part of the law where only the isochoric part does, a sponge,
+supports, membranes and springs. Pressures that are unknowns beside the motion: `liverjax.waves.pressures`.
 """
 
 from functools import cache
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.elements import mjed
-from liverjax.laws.base import volumetric_part
+from liverjax.laws.base import Law, volumetric_part
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.basis import FACES, basis
@@ -35,7 +35,8 @@ from liverjax.solvers import attached
 from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block
 from liverjax.tensors.material_axes import symmetric
-from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, dot, matvec, scale_matrix
+from liverjax.tensors.matrices import Matrix, Vector, add_matrices, deformation_gradient, dot, matvec, scale_matrix
+from liverjax.waves.pressures import Pressures, law_beside, scalars_and_pressures
 
 _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
@@ -43,6 +44,7 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 class Operator(NamedTuple):
     """Matrices of every element with n nodes, and what acts at nodes."""
 
+    points: jax.Array  # (V, 3) [m] where the nodes are
     nodes: jax.Array  # (n, E)
     relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] is multiplied by m(omega)
     rest: jax.Array | None  # (n, 3, n, 3, E) [N/m]
@@ -50,6 +52,7 @@ class Operator(NamedTuple):
     springs: Block | None  # diagonal blocks 3 x 3 of (V,) [N/m]
     attached: tuple[Attached, ...]
     free: Free
+    pressures: Pressures | None = None
 
 
 def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
@@ -60,20 +63,29 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
         loaded: x is not the reference shape; there is stress.
         mass: "consistent" or "lumped", as in runs in time.
     """
-    scene, mesh = e.scene, e.mesh
-    relaxing, rest = _blocks(scene, deformation_gradient(mesh, x), loaded)
+    scene, mesh, F = e.scene, e.mesh, deformation_gradient(e.mesh, x)
+    volume, pressures = scalars_and_pressures(scene, x, F)
+    relaxing, rest = _blocks(scene, law_beside(scene), F, loaded)
+    if volume is not None:
+        own = invariant_terms.blocks(invariant_terms.state_of(volume, F), _shape_vectors(mesh), _OWN)
+        rest = own if rest is None else [add_matrices(a, b) for a, b in zip(rest, own, strict=True)]
     springs = node_blocks(e)
     more = tuple(own for own in (a.attached(mesh, x, 1.0) for a in e.nodal) if own is not None)
     nodes = jnp.stack(mesh.element_nodes)
     heavy = None if scene.body is None else _mass(mesh, jnp.asarray(scene.body.density), nodes, mass)
     whole = None if rest is None else _element_matrices(mesh, rest)
-    return Operator(nodes, _element_matrices(mesh, relaxing), whole, heavy, springs, more, e.free)
+    return Operator(
+        mesh.points, nodes, _element_matrices(mesh, relaxing), whole, heavy, springs, more, e.free, pressures
+    )
 
 
-def _blocks(scene: Scene, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
+def _shape_vectors(mesh: TetMesh) -> list[Vector]:
+    return [tuple(mesh.gradients[a]) for a in range(3)]
+
+
+def _blocks(scene: Scene, law: Law, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
     """Blocks per volume of the corners 1, 2, 3 (`_OWN`) that m(omega) multiplies, and of those that it does not."""
-    mesh, law, prony = scene.mesh, scene.law, scene.viscosity
-    D = [tuple(mesh.gradients[a]) for a in range(3)]
+    mesh, prony, D = scene.mesh, scene.viscosity, _shape_vectors(scene.mesh)
     if prony is None:
         return invariant_terms.blocks(invariant_terms.state(law, F), D, _OWN), None
     own = viscosity.relaxing(prony, law)
@@ -102,7 +114,19 @@ def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
     if mesh.order == 1:
         return jnp.transpose(corners, (0, 2, 1, 3, 4))
     c = jnp.asarray(basis(mesh.order).c, corners.dtype)
-    return jnp.einsum("akq,klrsqe,blq->arbse", c, corners, c, optimize=True)
+    return _both_ways(mesh, jnp.einsum("akq,klrsqe,blq->arbse", c, corners, c, optimize=True))
+
+
+def _both_ways(mesh: TetMesh, K: jax.Array) -> jax.Array:
+    """Matrices (n, …, n, …, E) of functions as the nodes have them: those of order 3 have a direction on an edge."""
+    if mesh.order < 3:
+        return K
+    n, E, half = len(K), K.shape[-1], K.ndim // 2
+    rows = mesh.oriented(K.reshape(n, -1, E)).reshape(K.shape)
+    turned = jnp.moveaxis(rows, range(half, 2 * half), range(half))
+    return jnp.moveaxis(
+        mesh.oriented(turned.reshape(n, -1, E)).reshape(turned.shape), range(half), range(half, 2 * half)
+    )
 
 
 def _stacked(K: Matrix) -> jax.Array:
@@ -113,7 +137,8 @@ def _mass(mesh: TetMesh, density: jax.Array, nodes: jax.Array, kind: str) -> jax
     if kind == "lumped":
         return density * nodal_volumes(mesh)
     own = density if density.ndim == 0 else jnp.mean(density[nodes], axis=0)
-    return jnp.asarray(_products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
+    M = jnp.asarray(_products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
+    return _both_ways(mesh, M)
 
 
 @cache
@@ -144,8 +169,20 @@ def _exponents(vertex: list[tuple], *which: int) -> tuple:
     return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))
 
 
-def forces_of_motion(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.Array:
-    """(K - omega^2 M) u, (V, 3) complex [N], for a motion u (V, 3); `factor` is m at omega [rad/s], () or (E,)."""
+#: Displacements (V, 3) [m], and pressures (P,) [Pa] or None.
+Motion = tuple[jax.Array, jax.Array | None]
+
+
+def forces_of_motion(A: Operator, factor: Any, omega: Any, motion: Motion) -> Motion:
+    """Forces (V, 3) complex [N] of a motion, and the balance (P,) [m^3] where there are pressures.
+
+    Args:
+        A: `Operator`.
+        factor: m at omega, () or (E,).
+        omega: [rad/s].
+        motion: amplitudes.
+    """
+    u, p = motion
     own = u[A.nodes]  # (n, E, 3)
     factor = jnp.asarray(factor)
     factor = factor[None, None] if factor.ndim else factor
@@ -154,7 +191,25 @@ def forces_of_motion(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.
         force = force + jnp.einsum("arbse,bes->are", A.rest, own)
     if A.mass is not None and A.mass.ndim == 3:
         force = force - omega**2 * jnp.einsum("abe,ber->are", A.mass, own)
+    balance = None
+    if A.pressures is not None and p is not None:
+        near = p[A.pressures.nodes]
+        force = force + jnp.einsum("arve,ve->are", A.pressures.pull, near)
+        own_balance = jnp.einsum("arve,aer->ve", A.pressures.pull, own) - _stored(A.pressures, omega, near)
+        balance = jnp.zeros_like(p).at[A.pressures.nodes].add(own_balance)
     total = jnp.zeros_like(u).at[A.nodes].add(jnp.swapaxes(force, 1, 2))
+    return total + _of_nodes_alone(A, omega, u), balance
+
+
+def _stored(own: Pressures, omega: Any, near: jax.Array) -> jax.Array:
+    """(store + flow / (i omega)) p of every element's vertices, (4, E) [m^3]."""
+    stored = jnp.einsum("vwe,we->ve", own.store, near)
+    return stored if own.flow is None else stored + jnp.einsum("vwe,we->ve", own.flow, near) / (1j * omega)
+
+
+def _of_nodes_alone(A: Operator, omega: Any, u: jax.Array) -> jax.Array:
+    """Forces (V, 3) [N] of lumped masses, springs and elements between nodes."""
+    total = jnp.zeros_like(u)
     if A.mass is not None and A.mass.ndim == 1:
         total = total - (omega**2 * A.mass)[:, None] * u
     if A.springs is not None:
@@ -163,3 +218,9 @@ def forces_of_motion(A: Operator, factor: Any, omega: Any, u: jax.Array) -> jax.
     for K in A.attached:
         total = total + jnp.stack(attached.product(K, tuple(u.T)), axis=1)
     return total
+
+
+def free_part(A: Operator, motion: Motion) -> Motion:
+    """What of a motion, or of forces, is along free directions."""
+    u, p = motion
+    return A.free.vectors(u), None if A.pressures is None or p is None else A.pressures.mask * p

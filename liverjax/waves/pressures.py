@@ -1,0 +1,151 @@
+"""Pressures of the vertices in harmonic motion: of a fluid that flows, or of volumes that hardly change.
+
+With the volume B^T u that a motion u takes from what a pressure pushes on, both are one symmetric system,
+
+    K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega).
+
+In a sponge (`liverjax.physics.porosity`) B is minus the change of the vertices' volumes, and the second line is Darcy's
+law over i omega: (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), volumes those of the state that moves. Where a law
+keeps its volume (`liverjax.physics.volumes`) nothing flows, and store is the compliance of the pressures.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.elements.gradients import volume_gradients
+from liverjax.laws.base import isochoric_part
+from liverjax.laws.terms.invariant_terms import Scalars
+from liverjax.mesh.basis import basis
+from liverjax.mesh.nodal import integrals, summed
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.base import Free, Step
+from liverjax.physics.darcy import LEAST_J
+from liverjax.physics.porosity import Porosity, inflow, law_in_force, volumetric_slope, volumetric_stress
+from liverjax.physics.volumes.averaged import Averaged
+from liverjax.physics.volumes.mixed import Mixed, MixedVolume
+from liverjax.scenes.scene import Scene
+from liverjax.tensors.matrices import Matrix, determinant, dot, scale
+from liverjax.tensors.places import given
+
+
+class Pressures(NamedTuple):
+    """Matrices of every element with n nodes, and what is known of the P pressures."""
+
+    nodes: jax.Array  # (4, E) vertices
+    pull: jax.Array  # (n, 3, 4, E) [m^2]: B
+    store: jax.Array  # (4, 4, E) [m^3/Pa]
+    flow: jax.Array | None  # (4, 4, E) [m^3/(Pa s)]; None: nothing flows
+    mask: jax.Array  # (P,) 0 where the pressure is given
+    given: jax.Array  # (P,) [Pa] amplitudes where it is given, 0 elsewhere
+    enters: jax.Array | None  # (P,) [m^3/s] amplitude of what enters; None: nothing does
+
+
+def law_beside(scene: Scene) -> Any:
+    """The law without what pressures stand for."""
+    if scene.solve.volumetric in ("nodal", "mixed"):
+        return isochoric_part(scene.law)
+    return law_in_force(scene.porosity, scene.law)
+
+
+def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars | None, Pressures | None]:
+    """Stress and slope of volumes at given pressures about positions x (V, 3) [m], and the pressures' part; or None."""
+    mesh, J = scene.mesh, determinant(F)
+    if scene.porosity is not None:
+        own = scene.porosity
+        # At rest for long the fluid has flowed until it pushes no more.
+        found = Scalars({"J": volumetric_stress(own, J)}, {("J", "J"): volumetric_slope(own, J)})
+        return found, _of_sponge(own, mesh, F)
+    if scene.solve.volumetric == "mixed":
+        return _of_mixed(scene, x, F)
+    if scene.solve.volumetric == "nodal":
+        return _of_averaged(scene, F)
+    return None, None
+
+
+def _of_sponge(porosity: Porosity, mesh: TetMesh, F: Matrix) -> Pressures:
+    J, g = jnp.maximum(determinant(F), LEAST_J), volume_gradients(mesh, F)
+    mask = jnp.ones(mesh.number_of_vertices, J.dtype)
+    if porosity.drained is not None:
+        mask = mask.at[porosity.drained].set(0.0, mode="drop")
+    for inlet in porosity.inlet:
+        if inlet.nodes is not None:
+            mask = mask.at[inlet.nodes].set(0.0, mode="drop")
+    pressures, enters = inflow(porosity, mesh, 0.0, 1.0)
+    weight = porosity.permeability * mesh.weights / J
+    flow = jnp.stack([jnp.stack([summed(mesh, weight * dot(a, b)) for b in g]) for a in g])
+    store = _lumped(mesh, J / porosity.limit_bulk)
+    pulled = _pull(mesh, [scale(-1.0, own) for own in g])
+    flux = any(inlet.flux is not None for inlet in porosity.inlet)
+    return Pressures(mesh.tetrahedra.T, pulled, store, flow, mask, pressures, enters if flux else None)
+
+
+def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures]:
+    mesh, J = scene.mesh, determinant(F)
+    none = jnp.zeros(mesh.number_of_vertices, J.dtype)
+    volume = MixedVolume(law=scene.law).freeze(none, Step(mesh, x, 1, 1, None, False, None, Free(jnp.ones_like(x))))
+    border = volume.border(J)
+    store = _compliance(mesh, volume)
+    pull = _pull(mesh, [scale(border, g) for g in volume_gradients(mesh, F)])
+    pressure = _pressures_of_state(mesh, volume, store, J)
+    return volume.scalars(mesh, pressure, F), _sealed(mesh, pull, store)
+
+
+def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
+    """(4, 4, E) of every element: see `Mixed.compliance`."""
+    if mesh.order > 1:
+        L = jnp.asarray(basis(mesh.order).L, mesh.volumes.dtype)
+        return jnp.einsum("aq,bq,qe->abe", L, L, mesh.weights / volume.rest, optimize=True)
+    one, every = jnp.eye(4)[:, :, None], jnp.ones((4, 4, 1))
+    soft, held = (jnp.broadcast_to(mesh.volumes / (20 * a), mesh.volumes.shape) for a in (volume.rest, volume.shear))
+    return (every + one) * soft[None, None] + (one - every / 4) * held[None, None]
+
+
+def _pressures_of_state(mesh: TetMesh, volume: Mixed, store: jax.Array, J: jax.Array) -> jax.Array:
+    """Pressures (P,) [Pa] that balance volume ratios J."""
+    none = jnp.zeros(mesh.number_of_vertices, J.dtype)
+    diagonal = given(none, mesh.tetrahedra.T, jnp.einsum("aae->ae", store))
+
+    def solve(apply: Any, b: jax.Array) -> jax.Array:
+        return jax.scipy.sparse.linalg.cg(apply, b, tol=1e-14, maxiter=200, M=lambda r: r / diagonal)[0]
+
+    def compliance(p: jax.Array) -> jax.Array:
+        return volume.compliance(mesh, p)
+
+    return jax.lax.custom_linear_solve(compliance, volume.balance(mesh, none, J), solve, symmetric=True)
+
+
+def _of_averaged(scene: Scene, F: Matrix) -> tuple[Scalars, Pressures]:
+    mesh, J = scene.mesh, determinant(F)
+    volume = Averaged(law=scene.law)
+    volumes = integrals(mesh, jnp.ones_like(J))
+    compliance = volume.matrix(mesh, J, False).diagonal[0][0] / volumes
+    share = (mesh.volumes / 4)[None] * compliance[mesh.tetrahedra.T]
+    store = jnp.eye(4)[:, :, None] * share[None]
+    found = volume.scalars(mesh, volume.pressure(mesh, J), F)
+    return found, _sealed(mesh, _pull(mesh, volume_gradients(mesh, F)), store)
+
+
+def _sealed(mesh: TetMesh, pull: jax.Array, store: jax.Array) -> Pressures:
+    P = mesh.number_of_vertices
+    return Pressures(mesh.tetrahedra.T, pull, store, None, jnp.ones(P, pull.dtype), jnp.zeros(P, pull.dtype), None)
+
+
+def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
+    """(4, 4, E): each element's share of `integrals` of a density at the points, at its vertices alone."""
+    if mesh.order == 1:
+        share = jnp.broadcast_to(mesh.volumes * density / 4, (4, mesh.number_of_elements))
+    else:
+        share = jnp.asarray(basis(mesh.order).L, density.dtype) @ (mesh.weights * density)
+    return jnp.eye(4)[:, :, None] * share[None]
+
+
+def _pull(mesh: TetMesh, g: list) -> jax.Array:
+    """(n, 3, 4, E): forces on the nodes of pressures of the corners, from forces g (3,) of 1 Pa on the corners."""
+    own = mesh.weights[None, None] * jnp.stack([jnp.stack(vector) for vector in g])  # (4, 3, E), or (4, 3, Q, E)
+    if mesh.order == 1:
+        return jnp.broadcast_to(own[:, :, None] / 4, (4, 3, 4, mesh.number_of_elements))
+    N = basis(mesh.order)
+    pull = jnp.einsum("akq,krqe,vq->arve", N.c, own, N.L, optimize=True)
+    return mesh.oriented(pull.reshape(len(N.c), 12, -1)).reshape(pull.shape)

@@ -1,0 +1,98 @@
+"""Factorisation by nested dissection: against dense solutions, in both precisions, and kept for derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+
+import liverjax as lj
+from liverjax.solvers import multifrontal
+from liverjax.waves import sparse
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def system(kind: type) -> tuple[scipy.sparse.csr_array, list[multifrontal.Front]]:
+    """A symmetric matrix of two unknowns a node, neither definite nor well scaled, and its fronts."""
+    rng = np.random.default_rng(1)
+    box = lj.shapes.box((1.0, 1.0, 2.0), (5, 5, 10))
+    tets, points = np.asarray(box.tetrahedra).T, np.asarray(box.points)
+    at = np.concatenate([2 * tets, 2 * tets + 1])
+    blocks = rng.normal(size=(8, 8, tets.shape[1])) + (
+        1j * rng.normal(size=(8, 8, tets.shape[1])) if kind is complex else 0
+    )
+    blocks = (blocks + np.swapaxes(blocks, 0, 1)) * 10.0 ** (6 * (np.arange(8) // 4))[:, None, None]
+    blocks = blocks * 10.0 ** (6 * (np.arange(8) // 4))[None, :, None]
+    lines, columns = np.broadcast_arrays(at[:, None], at[None])
+    n = 2 * len(points)
+    A = scipy.sparse.coo_array((blocks.ravel(), (lines.ravel(), columns.ravel())), shape=(n, n)).tocsr()
+    return A, multifrontal.fronts(A, multifrontal.dissected(tets, points), np.arange(n) // 2)
+
+
+@pytest.mark.parametrize("kind", [float, complex])
+@pytest.mark.parametrize("single", [False, True])
+def test_against_a_dense_solution(kind, single):
+    A, plan = system(kind)
+    assert len(plan) > 8 and sorted(np.concatenate([front.own for front in plan])) == list(range(A.shape[0]))
+    known = np.random.default_rng(2).normal(size=A.shape[0]).astype(kind)
+    found, error = multifrontal.refined_solution(multifrontal.factorised(A, plan, single), A @ known)
+    assert error < 1e-15
+    dense = np.linalg.solve(A.toarray(), A @ known)
+    # As far from the truth as a dense solution may be.
+    assert np.linalg.norm(found - known) < 10 * np.linalg.norm(dense - known) + 1e-12 * np.linalg.norm(known)
+
+
+def test_a_matrix_without_an_inverse_is_told():
+    A, plan = system(complex)
+    A.data[:] = 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        multifrontal.factorised(A, plan, False)
+    A.data[:] = np.nan
+    with pytest.raises(np.linalg.LinAlgError):
+        multifrontal.factorised(A, plan, False)
+
+
+def scene() -> lj.Scene:
+    mesh = lj.shapes.box((0.03, 0.02, 0.02), (3, 2, 2))
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=3000.0, bulk=3e4),
+        viscosity=lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.003])),
+        body=lj.Body(density=1000.0),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["x_min"], by=jnp.array([0.0, 1e-5, 0.0])),),
+    )
+
+
+def test_derivatives_take_the_factors_of_the_values(monkeypatch):
+    made = []
+
+    def counted(A, plan, single):
+        made.append(single)
+        return original(A, plan, single)
+
+    original = multifrontal.factorised
+    monkeypatch.setattr(multifrontal, "factorised", counted)
+    body = scene()
+    jax.value_and_grad(
+        lambda mu: jnp.sum(lj.harmonic(lj.with_parameters(body, {"law.mu": mu}), [40.0, 60.0]).displacement.imag)
+    )(3100.0)
+    assert made == [False, False]
+    monkeypatch.setattr(sparse, "KEPT", 0.0)
+    sparse._factors.clear()
+    lj.harmonic(body, [40.0])
+    assert not sparse._factors
+
+
+def test_other_ways_where_the_first_fails(monkeypatch):
+    """Single precision, double precision and pivots in the whole matrix have the same answer."""
+    monkeypatch.setattr(sparse, "KEPT", 0.0)
+    sparse._factors.clear()
+    double = lj.harmonic(scene(), [40.0]).displacement
+    monkeypatch.setattr(multifrontal, "SINGLE_FROM", 0)
+    single = lj.harmonic(scene(), [40.0]).displacement
+    monkeypatch.setattr(multifrontal, "WRONG", -1.0)
+    pivoted = lj.harmonic(scene(), [40.0]).displacement
+    for other in (single, pivoted):
+        assert np.linalg.norm(other - double) < 1e-11 * np.linalg.norm(double)
+        assert not np.array_equal(other, double)
