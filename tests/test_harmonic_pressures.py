@@ -80,12 +80,13 @@ def test_quadratic_elements_and_fluid_that_is_pumped():
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_porous_run_in_time_comes_to_it(order):
     """A viscous sponge is pressed until nothing flows, then swings: the error falls with dt, as implicit Euler's."""
-    hertz, errors = FAST, []
-    for per_cycle in (16, 32, 64):
-        dt, cycles, at_rest = 1 / hertz / per_cycle, 4, 12
+    # A cycle is a time of diffusion: what lags behind falls to 0.08 in each.
+    hertz, errors = 2 * SLOW, []
+    for per_cycle in (20, 40):
+        dt, cycles, at_rest = 1 / hertz / per_cycle, 4, 8
         rest_steps = at_rest * per_cycle
         times = np.arange(rest_steps + cycles * per_cycle + 1) * dt
-        pull = np.minimum(times / (rest_steps * dt / 6), 1.0)
+        pull = np.minimum(times * hertz, 1.0)
         wave = 1e-3 * np.sin(2 * np.pi * hertz * np.maximum(times - rest_steps * dt, 0.0))
         prony = lj.Prony(ratios=jnp.array([0.4]), relaxation_times=jnp.array([0.2 / hertz]))
         scene = replace(column(4, 1, 1.0), viscosity=prony)
@@ -101,8 +102,8 @@ def test_a_porous_run_in_time_comes_to_it(order):
         exact = lj.harmonic(small, [hertz], about=before).check()
         pairs = ((amplitude, exact.displacement[0]), (pressure, exact.pressure[0]))
         errors.append([float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs])
-    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert np.all(np.array(errors[-1]) < 0.06) and np.all(orders > 0.8), (errors, orders)
+    orders = np.log2(np.array(errors[0]) / np.array(errors[1]))
+    assert np.all(np.array(errors[1]) < 0.1) and np.all(abs(orders - 1) < 0.15), (errors, orders)
     # The pressed sponge is another one than the sponge at rest.
     bare = lj.harmonic(small, [hertz]).displacement[0]
     assert np.abs(bare - exact.displacement[0]).max() > 0.05 * np.abs(bare).max()
@@ -137,7 +138,7 @@ def test_waves_that_keep_the_volume(verified):
     verified("swinging sphere, K = 100,000 G, mixed quadratic elements", "closed form", errors[1], 3e-3, order)
 
 
-@pytest.mark.parametrize(("volumetric", "order"), [("mixed", 2), ("nodal", 1)])
+@pytest.mark.parametrize(("volumetric", "order"), [("mixed", 2), ("mixed", 1), ("nodal", 1)])
 def test_about_a_stretched_state_with_pressures(volumetric, order):
     """The pressure of the state stiffens the slab too: its modulus there from derivatives of the energy alone."""
     n = 30 if order == 2 else 160
