@@ -14,6 +14,7 @@ import numpy as np
 from fitting.fits.field import Field, start_of
 from fitting.fits.scene_numbers import Problem, Unknowns, fit
 from fitting.methods.estimate import Estimate
+from liverjax.core.struct import Number
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -28,7 +29,7 @@ def edge_width(mesh: TetMesh) -> float:
     return _EDGE * size / mesh.order
 
 
-def factor(mesh: TetMesh, centre: jax.Array, radius: Any, width: Any) -> jax.Array:
+def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> jax.Array:
     """The part of each element (E,) inside the sphere: 1 inside, 0 outside, smooth between; a mean over its points."""
     corners = mesh.points[mesh.tetrahedra]
     L = np.full((4, 1), 0.25) if mesh.order == 1 else basis(mesh.order).L

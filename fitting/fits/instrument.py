@@ -77,7 +77,7 @@ def _cent(value: float) -> str:
     return f"{100 * value:.2g} %"
 
 
-def inertia_numbers(found: InertiaError) -> dict[str, Any]:
+def inertia_numbers(found: InertiaError) -> dict[str, object]:
     """The part `instrument` of fit.json."""
     return {
         "inertia_off_by": found.value,
@@ -162,7 +162,7 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
     return fit._replace(model=model, kind=kind, uncertainty=spread, warnings=warnings)
 
 
-def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[str, Any]:
+def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[str, object]:
     """The part `precompression` of fit.json, of `of_compressed_sample` or of the simulation after it."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"

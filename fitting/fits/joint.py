@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from fitting.rigs import glued, torsion
 from liverjax import laws
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Number, Numbers
 from liverjax.laws import Law
 from liverjax.physics.viscosity import Prony
 
@@ -47,7 +48,7 @@ def sweep(data: Sweep) -> Test:
     return Test("sweep", predict, np.concatenate([data.storage, data.loss]), np.concatenate(data.deviations))
 
 
-def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Any, drive: torsion.Drive = torsion.Drive()) -> Test:
+def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
     """The same through the torsion simulation, of fixed or free height, at torque amplitudes [N m]."""
     omega = jnp.asarray(data.angular_frequency)
 
@@ -58,7 +59,7 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Any, drive: torsion.Dri
     return Test("torsion", predict, np.concatenate([data.storage, data.loss]), np.concatenate(data.deviations))
 
 
-def through(name: str, rig: glued.Rig, measured: Any, sd: Any) -> Test:
+def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
     """A test in a rig of `fitting.rigs.glued`: readings (T,) [N] or [m] and their noise, a number or (T,).
 
     Raises:

@@ -16,6 +16,7 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import Solution, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import Sweep
+from liverjax.core.struct import Content
 
 MODELS = ("prony", "fractional", "spectrum", "auto")
 #: Difference of the criterion that counts as strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90).
@@ -193,7 +194,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
     )
 
 
-def _compared(sweep: Sweep, tried: list[Fit]) -> list[dict[str, Any]]:
+def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
     """The criterion of each model, best first."""
     best = min(information_criterion(fit) for fit in tried)
     rows = [

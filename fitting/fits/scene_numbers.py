@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,7 @@ from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.readers.displacements import Displacements, weighted_differences
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 from liverjax.scenes.scene import Scene, numbers_at
 
 
@@ -30,7 +31,7 @@ class Problem(NamedTuple):
         return sum(d.components for d in self.data)
 
 
-def misfit(problem: Problem, values: dict[str, Any], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
+def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
     """Residuals of all scenes (n,), and the worst code of each, with their numbers replaced by `values`."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
@@ -44,7 +45,7 @@ class Unknowns(NamedTuple):
     """What Gauss-Newton varies, u (n,), and what it stands for."""
 
     start: np.ndarray  # first u (n,)
-    values_of: Callable[[jax.Array], dict[str, Any]]  # u -> numbers of the scenes by dotted name
+    values_of: Callable[[jax.Array], Content]  # u -> numbers of the scenes by dotted name
     natural_of: Callable[[jax.Array], jax.Array]  # u -> the parameters to report (m,)
     names: Sequence[str]  # of these
 
@@ -94,7 +95,7 @@ def fit(
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
 
 
-def missing(problem: Problem, values: dict[str, Any]) -> np.ndarray:
+def missing(problem: Problem, values: Content) -> np.ndarray:
     """Errors of the residuals (n,) by the meshes, with the scenes' numbers replaced by `values`."""
     rows = []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
@@ -110,7 +111,7 @@ def missing(problem: Problem, values: dict[str, Any]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def missing_or_none(problem: Problem, values: dict[str, Any]) -> np.ndarray | None:
+def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
     """`missing`, or None with a warning where a scene has no estimate of its mesh's error."""
     try:
         return missing(problem, values)

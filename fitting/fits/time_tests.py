@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 #: Answers that are fitted at most: of longer records those nearest to equal steps of log time.
 MOST = 300
@@ -212,7 +213,7 @@ def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int
 def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     """Add the table of the fits tried, and the warnings."""
     lowest = min(map(criterion, tried))
-    table: list[dict[str, Any]] = [
+    table: list[Content] = [
         {
             "model": f.kind.name,
             "modes": f.modes,

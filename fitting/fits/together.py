@@ -8,7 +8,7 @@ Every test has noise of its own. Its size is found with the fit, from the residu
 import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 #: Rounds of fit and weights, smallest relative noise that a test is given, and starts.
 ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
@@ -63,7 +64,7 @@ class Together(NamedTuple):
     converged: bool
     shares: list[Share]
     fitted: list[np.ndarray]  # of each test: G' then G'' [Pa], velocities then attenuations, or the answers
-    tried: list[dict[str, Any]]
+    tried: list[Content]
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float

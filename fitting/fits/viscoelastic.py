@@ -20,6 +20,7 @@ from liverjax import laws
 from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 from liverjax.physics.viscosity import Prony
 
 OPTIMIZERS = ("levenberg-marquardt", "bfgs")
@@ -50,7 +51,7 @@ class Fit(NamedTuple):
     warnings: tuple[str, ...]
     run_time: float  # [s]
     compile_time: float
-    details: dict[str, Any]
+    details: Content
     kind: Kind = Kind()
     parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
 
@@ -138,7 +139,7 @@ def residuals_of(kind: Kind) -> Callable[..., Array]:
     return generalised_maxwell.fluid_residuals if kind.name == FLUID.name else generalised_maxwell.residuals
 
 
-def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: dict[str, Any]) -> Fit:
+def fitted(sweep: Sweep, found: Solution, kind: Kind, running: float, compiling: float, details: Content) -> Fit:
     """The fit in closed form at a minimum over u of `kind`, whose first residuals are those of the data."""
     scales, measured = np.concatenate(sweep.deviations), np.concatenate([sweep.storage, sweep.loss])
     storage, loss = np.split(np.asarray(found.residuals)[: len(measured)] * scales + measured, 2)
@@ -156,7 +157,7 @@ class Simulated(NamedTuple):
     advice: tuple[str, ...] = ()  # where the simulation broke down
 
 
-def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], details: dict[str, Any]) -> Fit:
+def _fit(sweep: Sweep, at: Simulated, kind: Kind, seconds: tuple[float, float], details: Content) -> Fit:
     found, storage, loss = at.solution, at.storage, at.loss
     spread = uncertainty.estimate(found, sweep.noise_given, kind.maxwell, (2 * len(storage), kind.effective))
     own = None
@@ -528,7 +529,9 @@ def _of_finer_mesh(
     return meshless, meshless + exact - fine
 
 
-def _simulation_details(simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli) -> dict[str, Any]:
+def _simulation_details(
+    simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli
+) -> dict[str, object]:
     """Settings and statistics of the simulation, for the report."""
     whole = simulation.part == "all"  # then the bias is the same at every frequency, and known
     return {

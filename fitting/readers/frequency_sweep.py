@@ -7,6 +7,7 @@ import numpy as np
 
 from fitting.readers import raw_torque
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 #: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
 FEWEST = 3
@@ -121,7 +122,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     """The points where `kept` (n,) is true."""
     names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia")
-    columns: dict[str, Any] = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
+    columns: Content = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
     raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
     return sweep._replace(**columns, raw=raw)
 

@@ -6,7 +6,6 @@ of units below it, and numbers below that. Everything leaves in rad/s and Pa, so
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from fitting.readers.text_tables import text_of
 from fitting.readers.text_tables import to_number as to_number
 from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 #: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.
 SMALLEST, LARGEST = 1e-30, 1e30
@@ -152,8 +152,6 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
         notes.append(f"{repeated} frequencies are repeated; each line counts as a measurement of its own")
-    get: dict[str, Any] = {
-        q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")
-    }
+    get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)

@@ -5,7 +5,6 @@ key -> name and unit, `Rows` of key -> value, and the steps of the test by their
 """
 
 import json
-from typing import Any
 
 #: Key of a row that says which step it belongs to.
 STEP = "Results Step Id"
@@ -33,9 +32,9 @@ def tables(text: str) -> str | None:
     return "\n".join(lines)
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _cell(text: Any) -> str:
+def _cell(text: object) -> str:
     return " ".join(str(text).split())

@@ -2,7 +2,6 @@
 
 import io
 from pathlib import Path
-from typing import Any
 
 from liverjax.core.errors import InputError
 
@@ -51,6 +50,6 @@ def refuse_workbook(path: Path, data: bytes, wanted: str) -> None:
         raise InputError(f"{path} is a spreadsheet workbook, not text: open it, export {wanted} as CSV, and give that")
 
 
-def _line(cell: Any) -> str:
+def _line(cell: object) -> str:
     """A cell without the characters that end a cell or a line; numbers with all their digits."""
     return " ".join(str(cell).split())

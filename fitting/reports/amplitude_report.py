@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +11,14 @@ from fitting.amplitude.strain_sweep import StrainSweep
 from fitting.reports import curves_report
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import BLUE, COLOURS, ORANGE, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> dict[str, Any]:
+
+def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> Content:
     """fit.json and fit.png in the folder `out`, which exists; the best fit comes first."""
     content = {
         "error_is": "root mean square of the relative misfit of G' and G''",
@@ -47,7 +51,7 @@ def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
     return "\n".join([curves_report.table([f.law for f in fits]), said])
 
 
-def figure(sweep: StrainSweep, fits: list[StrainFit]) -> Any:
+def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
     """Moduli against strain with the best laws on the left, the third harmonics that they foretell on the right."""
     fig = pyplot().figure(figsize=(10, 4.2), layout="constrained")
     left, right = fig.subplots(1, 2)

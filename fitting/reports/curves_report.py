@@ -3,7 +3,7 @@
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -12,8 +12,13 @@ from fitting.fits.stress_stretch import LawFit, unfollowed
 from fitting.readers.curves import Curve
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import COLOURS, GREY, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 from liverjax.laws import homogeneous
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: Points of a drawn line.
 FINE = 200
@@ -26,7 +31,7 @@ def best_first(fits: list[LawFit]) -> list[LawFit]:
     return sorted(fits, key=lambda f: f.aicc)
 
 
-def summary(fit: LawFit) -> dict[str, Any]:
+def summary(fit: LawFit) -> Content:
     """One law's entry of curves.json."""
     return {
         "law": fit.label,
@@ -67,7 +72,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
     save(figure(curves, ordered), out / "curves.png")
 
 
-def figure(curves: list[Curve], ordered: list[LawFit]) -> Any:
+def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
     """Every curve with the best laws, and below the error of each law beside its number of parameters."""
     shown = ordered[: len(COLOURS)]
     columns = min(4, len(curves))

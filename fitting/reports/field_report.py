@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -13,12 +13,16 @@ from fitting.readers.displacements import locate
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.status import NAMES
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 from liverjax.mesh.files import write_mesh
 from liverjax.mesh.tetrahedra import TetMesh
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def of_numbers(found: Estimate) -> dict[str, Any]:
+
+def of_numbers(found: Estimate) -> Content:
     """The content of field.json for a few numbers."""
     return {
         "values": dict(zip(found.names, found.values.tolist(), strict=True)),
@@ -35,7 +39,7 @@ def of_numbers(found: Estimate) -> dict[str, Any]:
     }
 
 
-def of_field(found: Field) -> dict[str, Any]:
+def of_field(found: Field) -> Content:
     """The content of field.json for a map."""
     return {
         "name": found.name,
@@ -54,7 +58,7 @@ def of_field(found: Field) -> dict[str, Any]:
     }
 
 
-def write(out: Path, mesh: TetMesh, content: dict[str, Any], found: Field | None) -> None:
+def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> None:
     """Write all files into the folder `out`."""
     (out / "field.json").write_text(json.dumps(numbers(content | {"versions": versions()}), indent=1) + "\n")
     if found is None:
@@ -85,7 +89,7 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
     return shown.reshape(n, n), tuple(100 * v for v in (low[a], high[a], low[b], high[b]))
 
 
-def map_figure(mesh: TetMesh, found: Field) -> Any:
+def map_figure(mesh: TetMesh, found: Field) -> "Figure":
     """Sections through the place of the largest departure: the factor on the scene's number, and its uncertainty."""
     middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")

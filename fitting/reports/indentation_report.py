@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,13 +12,18 @@ from fitting.readers.indentation_curves import IndentationCurve
 from fitting.reports.sweep_report import numbers
 from fitting.rigs.thin_layer import Indenter, half_space
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: Contact over the radius of a sphere, and depth over the thickness, beyond which small strains are in doubt.
 _WIDE, _DEEP = 0.4, 0.2
 
 
-def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> dict[str, Any]:
+def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> Content:
     """Write both files; returns the JSON."""
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
@@ -79,7 +84,7 @@ def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit
     return told
 
 
-def table(rig: Indenter, fit: ContactFit, content: dict[str, Any]) -> str:
+def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
     """Modulus and contact point ± standard error."""
     e = content["standard_errors"]
     return "\n".join(
@@ -93,7 +98,7 @@ def table(rig: Indenter, fit: ContactFit, content: dict[str, Any]) -> str:
     )
 
 
-def figure(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> Any:
+def figure(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> "Figure":
     """The curve and its residuals."""
     fig, (above, below) = pyplot().subplots(
         2, 1, figsize=(6, 5), sharex=True, height_ratios=(3, 1), layout="constrained"

@@ -2,12 +2,17 @@
 
 import textwrap
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from fitting.fits.viscoelastic import Fit
 from fitting.readers.rheometer import Sweep
 from fitting.reports import sweep_report
 from liverjax.core.plotting import pyplot, save
+from liverjax.core.struct import Content
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: A4 [inch], the part of its height that is text, and the margin.
 WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
@@ -15,7 +20,7 @@ WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
 CHARACTERS, SIZE = 104, 8.0
 
 
-def write(file: Path, sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> None:
+def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
     """Write the page as PDF (or what else the name of the file says).
 
     Args:
@@ -25,7 +30,7 @@ def write(file: Path, sweep: Sweep, fits: list[Fit], content: dict[str, Any]) ->
     save(page(sweep, fits, content), file)
 
 
-def page(sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> Any:
+def page(sweep: Sweep, fits: list[Fit], content: Content) -> "Figure":
     """The page as a figure."""
     figure = pyplot().figure(figsize=(WIDTH, HEIGHT))
     place = {"left": 0.12, "right": 0.96, "top": 0.91, "bottom": TEXT + 0.04, "wspace": 0.3}
@@ -42,7 +47,7 @@ def page(sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> Any:
     return figure
 
 
-def text_of_page(sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> list[str]:
+def text_of_page(sweep: Sweep, fits: list[Fit], content: Content) -> list[str]:
     """The lines below the pictures."""
     f = content["shear_waves"]["frequency_Hz"]
     rows = [

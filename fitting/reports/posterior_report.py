@@ -1,17 +1,17 @@
 """Files of a posterior's samples: a part of fit.json, posterior.csv, and lines on the terminal."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fitting.fits.posterior import Posterior
+from liverjax.core.struct import Content
 
 #: Quantiles that are reported.
 QUANTILES = (0.025, 0.5, 0.975)
 
 
-def summary(p: Posterior) -> dict[str, Any]:
+def summary(p: Posterior) -> Content:
     """The part `posterior` of fit.json."""
     flat = p.draws.reshape(-1, p.draws.shape[-1])
     rows = zip(p.names, flat.mean(axis=0), flat.std(axis=0, ddof=1), *np.quantile(flat, QUANTILES, axis=0), strict=True)

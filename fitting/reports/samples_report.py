@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,10 +10,14 @@ from fitting.fits.honesty import edges
 from fitting.fits.samples import Samples
 from fitting.reports.sweep_report import band_sensitivity, numbers, summary
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def write(out: Path, found: Samples) -> dict[str, Any]:
+
+def write(out: Path, found: Samples) -> Content:
     """Write all three files; returns the JSON."""
     out.mkdir(parents=True, exist_ok=True)
     content = numbers(_json_content(found))
@@ -23,7 +27,7 @@ def write(out: Path, found: Samples) -> dict[str, Any]:
     return content
 
 
-def _json_content(found: Samples) -> dict[str, Any]:
+def _json_content(found: Samples) -> Content:
     """The sample in the middle of the population comes first; the population and all samples follow."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own = (
@@ -58,11 +62,11 @@ def _pairs(found: Samples) -> zip:
     return zip(found.fits, found.sweeps, strict=True)
 
 
-def _known_errors(found: Samples) -> dict[str, Any]:
+def _known_errors(found: Samples) -> Content:
     return {name: p for name, p in found.populations.items() if p is not None}
 
 
-def _population(p: Any) -> dict[str, Any] | None:
+def _population(p: Any) -> Content | None:
     if p is None:
         return None
     return {
@@ -73,7 +77,7 @@ def _population(p: Any) -> dict[str, Any] | None:
     }
 
 
-def _sample_entry(found: Samples, k: int) -> dict[str, Any]:
+def _sample_entry(found: Samples, k: int) -> Content:
     """The fit of one sample by itself, and its numbers drawn towards the population."""
     fit, sweep = found.fits[k], found.sweeps[k]
     pooled = {
@@ -141,7 +145,7 @@ def table(found: Samples) -> str:
     return "\n".join(rows)
 
 
-def figure(found: Samples) -> Any:
+def figure(found: Samples) -> "Figure":
     """Moduli of all samples on the left; every number of every sample, and its population, on the right."""
     fig = pyplot().figure(figsize=(10, max(5.0, 0.7 * len(found.populations) + 1.5)), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(5.6, 4.4))
@@ -179,7 +183,7 @@ def _inside(value: float, limits: tuple[float, float]) -> bool:
     return limits[0] <= value <= limits[1]
 
 
-def _store_samples(path: Path, found: Samples, content: dict[str, Any]) -> None:
+def _store_samples(path: Path, found: Samples, content: Content) -> None:
     import h5py
 
     with h5py.File(path, "w") as file:

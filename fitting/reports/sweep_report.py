@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,12 @@ from fitting.readers.rheometer import Sweep
 from fitting.reports import posterior_report
 from fitting.waves import shear_waves
 from liverjax.core.plotting import BLUE, GREEN, GREY, ORANGE, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: Part of a standard error up to which closed form and simulation say the same.
 AGREED = 0.1
@@ -39,7 +44,7 @@ def numbers(values: Any) -> Any:
     return values.item() if isinstance(values, np.generic) else values
 
 
-def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
+def summary(fit: Fit, sweep: Sweep) -> Content:
     """The content of fit.json for one method."""
     u, n = fit.uncertainty, fit.modes
     errors = fit.relative_errors(sweep)
@@ -78,7 +83,7 @@ def summary(fit: Fit, sweep: Sweep) -> dict[str, Any]:
     }
 
 
-def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> dict[str, Any] | None:
+def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | None:
     """Bias by the names of `standard_errors`; null where it is not known."""
     if moved is None:
         return None
@@ -138,8 +143,8 @@ def own_rows(p: Estimate, kind: Kind, details: dict[str, Any], marked: Iterable[
 
 
 def write(
-    out: Path, sweep: Sweep, fits: list[Fit], profile: dict[str, Any] | None, posterior: Posterior | None = None
-) -> dict[str, Any]:
+    out: Path, sweep: Sweep, fits: list[Fit], profile: Content | None, posterior: Posterior | None = None
+) -> Content:
     """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others stand beside it); returns the JSON.
 
     If there is a posterior, its summary is in the JSON and its draws are in posterior.csv.
@@ -166,7 +171,7 @@ def write(
     return content
 
 
-def _store(path: Path, sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -> None:
+def _store(path: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -185,7 +190,7 @@ def _store(path: Path, sweep: Sweep, fits: list[Fit], content: dict[str, Any]) -
             group["covariance"].attrs["order"] = list(fit.uncertainty.names)
 
 
-def figure(sweep: Sweep, fits: list[Fit]) -> Any:
+def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
     """Moduli and residuals on the left; time constants and the table of parameters on the right.
 
     Lengths are inches: the picture grows with the table, so that no panel shrinks and no line is lost.

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,15 +14,19 @@ from fitting.readers.time_tests import TimeTest
 from fitting.reports import posterior_report
 from fitting.reports.sweep_report import numbers, own_numbers, own_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> dict[str, Any]:
+
+def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> Content:
     """Write both files, and the draws of a posterior. Return the JSON; its names are those of a sweep."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors
-    sampled: dict[str, Any] = {}
+    sampled: Content = {}
     if posterior is not None:
         sampled = {"posterior": posterior_report.summary(posterior)}
         posterior_report.write_draws(out / "posterior.csv", posterior)
@@ -92,7 +96,7 @@ def _rows_of_modes(fit: TimeFit) -> list[str]:
     return rows
 
 
-def figure(test: TimeTest, fit: TimeFit) -> Any:
+def figure(test: TimeTest, fit: TimeFit) -> "Figure":
     """The test and its fit on the left, G(t) and J(t) of the model on the right."""
     fig = pyplot().figure(figsize=(10, 4.6), layout="constrained")
     left, right = fig.subplots(1, 2)

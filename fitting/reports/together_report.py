@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,12 @@ from fitting.reports.sweep_report import numbers, own_numbers
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: Curves of a test over frequency, and what its panel shows.
 CURVES = {"sweep": ("G'", "G''"), "dispersion": ("phase velocity [m/s]", "attenuation [1/m]")}
@@ -27,7 +32,7 @@ QUANTITIES = {
 }
 
 
-def write(out: Path, found: Together) -> dict[str, Any]:
+def write(out: Path, found: Together) -> Content:
     """Write both files. Return the JSON; its names are those of a sweep, and `tests` is added."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
@@ -64,7 +69,7 @@ def write(out: Path, found: Together) -> dict[str, Any]:
     return content
 
 
-def _waves(found: Together) -> dict[str, Any]:
+def _waves(found: Together) -> Content:
     """Shear waves over the band of all tests, four a decade."""
     high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
@@ -76,7 +81,7 @@ def _equilibrium(found: Together) -> float:
     return max(0.0, float(found.model.shear_modulus * (1 - found.model.ratios.sum())))
 
 
-def _by_name(values: np.ndarray, n: int) -> dict[str, Any]:
+def _by_name(values: np.ndarray, n: int) -> Content:
     return {
         "shear_modulus": float(values[0]),
         "ratios": values[1 : n + 1].tolist(),
@@ -148,7 +153,7 @@ def _error(value: float) -> str:
     return f"{value:.2g}" if np.isfinite(value) else "free"
 
 
-def figure(found: Together) -> Any:
+def figure(found: Together) -> "Figure":
     """One panel a test, measured and fitted."""
     count = len(found.tests)
     fig = pyplot().figure(figsize=(max(6.0, 3.6 * count), 4.4), layout="constrained")

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import h5py
 import meshio
@@ -15,7 +15,12 @@ from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import WaveMap
 from liverjax.core.plotting import pyplot, save
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 #: chi^2 over the number of equations beyond which something is missing.
 TOO_FAR = 1.5
@@ -25,7 +30,7 @@ FEWEST = 3
 TOLD = 3.0
 
 
-def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: np.ndarray) -> dict[str, Any]:
+def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: np.ndarray) -> Content:
     """Write all files into the folder `out`; returns the content of waves.json.
 
     Args:
@@ -59,7 +64,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     return content
 
 
-def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarray | None) -> list[dict[str, Any]]:
+def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarray | None) -> list[Content]:
     """One dictionary a region, lists over the frequencies. Errors are of noise, of elements and of edges together."""
     omega, rows = organ.waves.omega, []
     for r in range(found.modulus.shape[1]):
@@ -95,7 +100,7 @@ def _complex_parts(*values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarr
     return [v.real for v in values], [v.imag for v in values]
 
 
-def _springpots(sweeps: dict[str, Path]) -> dict[str, Any] | None:
+def _springpots(sweeps: dict[str, Path]) -> Content | None:
     """The springpot model of lowest criterion of each sweep, with its numbers; None where there are none."""
     if not sweeps:
         return None
@@ -117,7 +122,7 @@ def _springpots(sweeps: dict[str, Path]) -> dict[str, Any] | None:
     return found
 
 
-def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> dict[str, Path]:
+def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
     """A frequency sweep of the whole and of every region, for ``python -m fitting``, where frequencies are enough."""
     if len(organ.field.frequencies) < FEWEST:
         return {}
@@ -137,14 +142,14 @@ def _sweeps(out: Path, organ: Organ, content: dict[str, Any]) -> dict[str, Path]
     return files
 
 
-def _by_label(organ: Organ, found: Found) -> dict[str, Any] | None:
+def _by_label(organ: Organ, found: Found) -> Content | None:
     if found.parts is None or found.labels is None:
         return None
     rows = _of_regions(organ, found.parts, found.mesh_bias, found.by_edges)
     return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
 
 
-def _direct(organ: Organ, found: Found, usual: np.ndarray) -> dict[str, Any]:
+def _direct(organ: Organ, found: Found, usual: np.ndarray) -> Content:
     """Medians of the direct inversion over the whole and over the regions; null where no voxel has one."""
     labels = organ.field.labels
     places = {"whole": organ.field.mask}
@@ -160,7 +165,7 @@ def _direct(organ: Organ, found: Found, usual: np.ndarray) -> dict[str, Any]:
     return out
 
 
-def _of_map(drawn: WaveMap) -> dict[str, Any]:
+def _of_map(drawn: WaveMap) -> Content:
     return {
         "prior_deviation": drawn.deviation,
         "correlation_length_m": drawn.length,
@@ -206,7 +211,7 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     return told
 
 
-def table(content: dict[str, Any]) -> str:
+def table(content: Content) -> str:
     """Moduli of the whole and of the regions at every frequency, with the direct inversion beside them."""
     rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>7s}   direct [Pa]"]
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
@@ -265,7 +270,7 @@ def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
     meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
 
 
-def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> Any:
+def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
     """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))

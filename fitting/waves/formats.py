@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 NAMES = (
     "displacement",
@@ -28,7 +29,7 @@ NAMES = (
 HDF5 = (".h5", ".hdf5", ".mat")
 
 
-def arrays(path: Path) -> dict[str, Any]:
+def arrays(path: Path) -> Content:
     """The named arrays of a file.
 
     Raises:
@@ -71,7 +72,7 @@ def single(path: Path, name: str) -> np.ndarray:
     return a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
 
 
-def _numpy(path: Path) -> dict[str, Any]:
+def _numpy(path: Path) -> Content:
     if path.suffix.lower() == ".npy":
         return {"displacement": np.load(path, allow_pickle=False)}
     with np.load(path, allow_pickle=False) as file:
@@ -79,11 +80,11 @@ def _numpy(path: Path) -> dict[str, Any]:
     return found | ({"unit": str(found["unit"])} if "unit" in found else {})
 
 
-def _hdf5(path: Path) -> dict[str, Any]:
+def _hdf5(path: Path) -> Content:
     import h5py
 
     with h5py.File(path) as file:
-        found: dict[str, Any] = {name: file[name][()] for name in NAMES if name in file}
+        found: Content = {name: file[name][()] for name in NAMES if name in file}
         found |= {name: file.attrs[name] for name in NAMES if name in file.attrs}
     for name, value in found.items():
         a = np.asarray(value)
@@ -97,7 +98,7 @@ def _hdf5(path: Path) -> dict[str, Any]:
 COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_im_z")
 
 
-def _voxel_table(path: Path) -> dict[str, Any]:
+def _voxel_table(path: Path) -> Content:
     """x, y, z [m], real and imaginary parts, with or without frequency [Hz] and label, on a regular grid."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         numbered = [(k, row) for k, row in enumerate(csv.reader(file), 1)]
@@ -150,7 +151,7 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return at, spacing, origin, tuple(int(n) for n in at.max(axis=0) + 1)
 
 
-def _nifti(path: Path) -> dict[str, Any]:
+def _nifti(path: Path) -> Content:
     """Complex data (nx, ny, nz, 3) or (nx, ny, nz, F, 3); real data are a mask or labels. Voxel sizes are in mm."""
     try:
         import nibabel

@@ -4,15 +4,15 @@ A wave exp(i omega t - i k z) has k^2 = rho omega^2 / G*, with k = omega / c - i
 Acoust. Soc. Am. 116, 3734).
 """
 
-from typing import Any
-
 import numpy as np
+
+from liverjax.core.struct import Array, Content, Number
 
 #: Of soft tissue [kg/m^3], where none is given.
 DENSITY = 1060.0
 
 
-def velocity_and_attenuation(storage: Any, loss: Any, omega: Any, density: Any) -> tuple[Any, Any]:
+def velocity_and_attenuation(storage: Number, loss: Number, omega: Number, density: Number) -> tuple[Array, Array]:
     """Phase velocity c [m/s] and attenuation alpha [1/m] of the amplitude, of moduli (n,) [Pa]; NumPy or JAX.
 
     Args:
@@ -26,7 +26,7 @@ def velocity_and_attenuation(storage: Any, loss: Any, omega: Any, density: Any) 
     return velocity, omega * loss * (density / (2 * (size + storage))) ** 0.5 / size
 
 
-def moduli_of(velocity: Any, attenuation: Any, omega: Any, density: Any) -> tuple[Any, Any]:
+def moduli_of(velocity: Array, attenuation: Array, omega: Array, density: Number) -> tuple[Array, Array]:
     """G' and G'' [Pa] of waves: the inverse of `velocity_and_attenuation`."""
     real, imaginary = omega / velocity, attenuation
     square = (real**2 + imaginary**2) ** 2
@@ -34,7 +34,7 @@ def moduli_of(velocity: Any, attenuation: Any, omega: Any, density: Any) -> tupl
     return scale * (real**2 - imaginary**2), scale * 2 * real * imaginary
 
 
-def waves_of_moduli(storage: np.ndarray, loss: np.ndarray, omega: np.ndarray, density: float | None) -> dict[str, Any]:
+def waves_of_moduli(storage: np.ndarray, loss: np.ndarray, omega: np.ndarray, density: float | None) -> Content:
     """The part `shear_waves` of fit.json: waves of a fitted model with moduli (n,) [Pa]."""
     density = DENSITY if density is None else density
     velocity, attenuation = velocity_and_attenuation(storage, loss, omega, density)

@@ -11,7 +11,7 @@ uncertainty comes from the Hessian H = I + J^H J/n, where n is chi^2 over its ex
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -25,6 +25,7 @@ from fitting.waves.regions import MeasuredWaves
 from fitting.waves.voxels import VoxelBody
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
+from liverjax.core.struct import Content
 
 #: Standard deviations of c to try, from a nearly uniform organ to a free one.
 DEVIATIONS = (0.2, 0.4, 0.8)
@@ -263,7 +264,7 @@ def _write(file: Path | None, course: Course, point: _Reached, history: list[dic
         f.attrs["balances"], f.attrs["size"] = course.m.balances, float(np.linalg.norm(course.waves.motion))
 
 
-def _first_or_resumed(course: Course, file: Path | None) -> tuple[_Reached, list[dict[str, Any]]]:
+def _first_or_resumed(course: Course, file: Path | None) -> tuple[_Reached, list[Content]]:
     """A uniform organ, or the point of an earlier run."""
     if file is None or not file.is_file():
         return _reached(course, np.zeros(len(course.p.root_mass), complex), 0), []

@@ -9,6 +9,7 @@ import numpy as np
 from fitting.waves import formats
 from fitting.waves.unwrapping import unwrapped
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content, Numbers
 
 #: Units of displacements and their factors to metres.
 UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "rad": 1.0}
@@ -88,7 +89,7 @@ def with_noise(field: WaveField, noise: float | None) -> WaveField:
     return field
 
 
-def _motion(name: str, found: dict[str, Any]) -> tuple[np.ndarray, list[str]]:
+def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     """Complex displacements (F, nx, ny, nz, 3) in the file's unit, and notes."""
     if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, evenly apart
         u = _instants(name, "phases", found["phases"])
@@ -134,7 +135,7 @@ def _instants(name: str, field: str, values: Any) -> np.ndarray:
     return u if u.ndim == 6 else u[None]
 
 
-def _array_of_numbers(name: str, field: str, values: Any) -> np.ndarray:
+def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
     a = np.asarray(values)
     if a.dtype.kind not in "fciu":
         raise InputError(f"{name}: {field} holds {a.dtype}, not numbers: store complex numbers")

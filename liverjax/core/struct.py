@@ -16,6 +16,8 @@ Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
 Array = np.ndarray | jax.Array
 #: Numbers of nodes, elements or triangles.
 Indices = Array
+#: What a TOML file has under a heading, or what goes into a JSON file: values are checked where they are read.
+Content = dict[str, Any]
 
 
 def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 from liverjax.jobs import resumable_parts
 from liverjax.scenes.scene import Scene
@@ -117,7 +118,7 @@ def _content(result: Result, state: Any) -> dict[str, np.ndarray]:
 def _read(file: Path, like: Any) -> tuple[Result, Any]:
     leaves, structure = jax.tree.flatten(like)
     with h5py.File(file) as part:
-        rows: dict[str, Any] = {name: part[name][()] if name in part else None for name in _ROWS}
+        rows: Content = {name: part[name][()] if name in part else None for name in _ROWS}
         took = StepStatistics(*(part[f"statistics_{name}"][()] for name in StepStatistics._fields))
         state = [part[f"state_{k}"][()] for k in range(len(leaves))]
     return Result(**rows, statistics=took), jax.tree.unflatten(structure, state)

@@ -14,7 +14,7 @@ import numpy as np
 
 from liverjax.core import history
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Indices, Number, Numbers, param, struct
+from liverjax.core.struct import Content, Indices, Number, Numbers, param, struct
 from liverjax.mesh import selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
@@ -39,10 +39,10 @@ class ElasticSupport(Physics):
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "normal", "tangential", "stiffness", "history")
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "ElasticSupport":
+    def read(cls, mesh: TetMesh, table: Content, name: str) -> "ElasticSupport":
         """From [[support]]: a place, and stiffnesses."""
         nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
-        given: dict[str, Any] = {k: table[k] for k in ("normal", "tangential", "stiffness") if k in table}
+        given: Content = {k: table[k] for k in ("normal", "tangential", "stiffness") if k in table}
         if ("stiffness" in given) == bool({"normal", "tangential"} & set(given)):
             raise InputError(
                 f"{name} needs either normal and tangential in Pa/m, for springs on the surface, or stiffness in N/m, "

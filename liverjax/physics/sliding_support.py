@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Indices, Numbers, param, replace, static, struct
+from liverjax.core.struct import Content, Indices, Numbers, param, replace, static, struct
 from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
@@ -28,7 +28,7 @@ class SlidingSupport(Physics):
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "sliding")
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "SlidingSupport":
+    def read(cls, mesh: TetMesh, table: Content, name: str) -> "SlidingSupport":
         """From [[support]] with `sliding = true`: the nodes define the plane."""
         if table["sliding"] is not True:
             raise InputError(

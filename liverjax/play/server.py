@@ -10,6 +10,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 from liverjax.play.pulling import Playing, pulled
 
 
@@ -74,7 +75,7 @@ class Answer(BaseHTTPRequestHandler):
         """Thirty lines a second would say nothing."""
 
 
-def stepped(playing: Playing, asked: dict[str, Any]) -> Playing:
+def stepped(playing: Playing, asked: Content) -> Playing:
     """The body after a step that a page requested."""
     return pulled(playing, asked.get("node"), asked.get("to"), asked.get("stiffness", playing.stiffness))
 

@@ -4,7 +4,6 @@ Other numbers become one number an element. A law of another kind is computed fo
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ from liverjax import laws
 from liverjax.core import names
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Indices, Numbers, param, replace, struct
+from liverjax.core.struct import Content, Indices, Numbers, param, replace, struct
 from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.tetrahedra import TetMesh
@@ -33,7 +32,7 @@ class Region:
     """Elements with other numbers than the scene, or with another law. Where two regions meet, the later one counts."""
 
     elements: Indices = param("1", "element numbers (n,)")
-    law: dict[str, Any] | Law | None = param(
+    law: Content | Law | None = param(
         "1", "names as after `law.` (`mu`, `mu.0`, `1.mu` of several laws) -> values; or a law of its own", default=None
     )
     viscosity: Mapping[str, Numbers] | None = param("1", "`ratios` or `relaxation_times` or both -> (N,)", default=None)

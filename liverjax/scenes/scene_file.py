@@ -14,6 +14,7 @@ from liverjax import laws
 from liverjax.core import history
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.files import read_mesh
@@ -83,7 +84,7 @@ def load_scene(path: str | Path) -> Scene:
         raise InputError(f"{path}: {error}") from None
 
 
-def scene_from(content: dict[str, Any], folder: Path = Path()) -> Scene:
+def scene_from(content: Content, folder: Path = Path()) -> Scene:
     """A scene from the content of a scene file as nested dictionaries."""
     _known("scene", content, _SECTIONS)
     content = _with_paths(content, folder)
@@ -290,7 +291,7 @@ def _prony(table: dict) -> Prony:
 
 
 def _porosity(mesh: TetMesh, table: dict) -> Porosity:
-    values: dict[str, Any] = {}
+    values: Content = {}
     for key in ("bulk", "limit_bulk", "fluid_fraction", "permeability"):
         if key not in table:
             raise InputError(f"[porosity] needs {key}: give a number")

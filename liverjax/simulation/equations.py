@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
@@ -132,7 +133,7 @@ def force_sizes(scene: Scene) -> Sizes:
     return Sizes(*jax.lax.stop_gradient(jax.lax.map(size, jnp.stack([along, rounded]))))
 
 
-def equations(scene: Scene, state: State, k: Any, sizes: Sizes | None = None) -> Equations:
+def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None) -> Equations:
     """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all."""
     sizes = force_sizes(scene) if sizes is None else sizes
     physics, free = physics_of(scene), free_directions(scene)
@@ -207,7 +208,7 @@ def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
-def residual(e: Equations, q: jax.Array, s: Any) -> tuple[jax.Array, jax.Array, Any]:
+def residual(e: Equations, q: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Out-of-balance forces (3 V,) [N] at part s of the step, the size of all forces, and the pressures."""
     f = forces(e, q, s)
     at_work = e.noise + jnp.linalg.norm(f.internal)

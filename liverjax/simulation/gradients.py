@@ -7,7 +7,7 @@ and the memory known beforehand.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -40,7 +40,7 @@ class Gradient:
 def value_and_gradient(
     loss: Callable[[Result], jax.Array],
     scene: Scene,
-    at: dict[str, Any],
+    at: Mapping[str, object],
     store: str | int = "all",
     mode: str = "reverse",
 ) -> Gradient:

@@ -10,7 +10,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
@@ -151,7 +151,7 @@ def simulate(
 def simulate_part(
     scene: Scene,
     state: State,
-    first: Any,
+    first: Number,
     count: int,
     report: Callable[[int], None] | None = None,
 ) -> tuple[Result, State]:

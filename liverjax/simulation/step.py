@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from liverjax import laws
 from liverjax.core import status
-from liverjax.core.struct import replace
+from liverjax.core.struct import Number, replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.physics.base import End, NodalForce
 from liverjax.physics.elasticity import Elastic
@@ -44,7 +44,9 @@ def problem_of(e: Equations) -> Problem:
     )
 
 
-def _tangent(e: Equations, kind: str, q: jax.Array, s: Any, pressure: Any, near: Any) -> tangent.Tangent:
+def _tangent(
+    e: Equations, kind: str, q: jax.Array, s: Number, pressure: jax.Array | None, near: Any
+) -> tangent.Tangent:
     return tangent.tangent(e, pressure, positions(e, q, s), s, near, kind)
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.elements import mjed, projection
 from liverjax.elements.gradients import volume_gradients
 from liverjax.laws.terms import invariant_terms
@@ -68,13 +69,15 @@ def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> di
     return {(a + 1, b + 1): scale_matrix(mesh.weights, block) for (a, b), block in zip(_OWN, K, strict=True)}
 
 
-def element_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> dict[tuple[int, int], Matrix]:
+def element_blocks(
+    e: Equations, pressure: jax.Array | None, F: Matrix, kind: str = "true"
+) -> dict[tuple[int, int], Matrix]:
     """K_ab [N/m] of `PAIRS` of every linear element, at given nodal pressures (V,) [Pa] or None."""
     full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
-def stiffness(e: Equations, pressure: Any, x: jax.Array, kind: str = "true") -> BlockMatrix:
+def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: str = "true") -> BlockMatrix:
     """Derivative of all forces at positions x (V, 3) [m] and given pressures (V,) [Pa], or None."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
@@ -90,7 +93,7 @@ def node_blocks(e: Equations) -> Block | None:
     return total
 
 
-def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached, ...]:
+def _attached(e: Equations, x: jax.Array, s: Number, kind: str) -> tuple[Attached, ...]:
     """Stiffness of the elements that physics put between nodes."""
     found = (a.attached(e.mesh, x, s) for a in e.nodal)
     return tuple(own if kind == "true" else attached.definite(own) for own in found if own is not None)
@@ -132,9 +135,9 @@ class Tangent(NamedTuple):
 
 def tangent(
     e: Equations,
-    pressure: Any,
+    pressure: jax.Array | None,
     x: jax.Array,
-    s: Any,
+    s: Number,
     near: tuple[Any, Tangent] | None = None,
     kind: str = "true",
 ) -> Tangent:
@@ -162,7 +165,7 @@ _Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix, 
 
 
 @partial(jax.jit, static_argnames="kind")
-def _assembled(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> _Assembled:
+def _assembled(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: str) -> _Assembled:
     """The tangent without its coarse space."""
     mesh, volume = e.mesh, _coupled(e)
     if mesh.order > 1:
@@ -193,7 +196,7 @@ def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
     return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 
 
-def _of_points(e: Equations, pressure: Any, x: jax.Array, s: Any, kind: str) -> _Assembled:
+def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: str) -> _Assembled:
     """The tangent of quadratic elements: moduli at their points, and two levels of a preconditioner."""
     mesh, volume = e.mesh, _coupled(e)
     F = deformation_gradient(mesh, x)
@@ -313,7 +316,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 
 
 def solve(
-    e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int
+    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solve K dq = b; return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
     if e.scene.solve.linear_solver == "direct":
@@ -343,7 +346,9 @@ def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
     return x[:n] if unit is None else jnp.concatenate([x[:n], x[n:] / unit])
 
 
-def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iterations: int) -> tuple[jax.Array, jax.Array]:
+def adjoint(
+    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
+) -> tuple[jax.Array, jax.Array]:
     """Solve K x = b with the pressures, for derivatives. Return x and its residual over |b|."""
     if e.scene.solve.linear_solver == "direct":
         x = _factorised(e, K, b)
@@ -356,7 +361,7 @@ def adjoint(e: Equations, K: Tangent, b: jax.Array, tolerance: Any, max_iteratio
         x, s = conjugate_gradients(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
         return x, s.residual
 
-    def nearly(r: jax.Array, tolerance: Any) -> jax.Array:
+    def nearly(r: jax.Array, tolerance: Number) -> jax.Array:
         return solve(e, K, r, tolerance, max_iterations)[0]
 
     return with_true_residual(nearly, tolerance, product(e, K, exactly=True), b)

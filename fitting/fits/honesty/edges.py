@@ -1,7 +1,5 @@
 """The influence of the ends of the band: the fit is repeated without the first and without the last half decade."""
 
-from typing import Any
-
 import numpy as np
 
 from fitting.fits import viscoelastic
@@ -10,6 +8,7 @@ from fitting.methods import generalised_maxwell, kramers_kronig, relaxation_spec
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts, levenberg_marquardt
 from fitting.readers.rheometer import Sweep, some
+from liverjax.core.struct import Content
 
 HALF_DECADE = float(np.sqrt(10))
 #: Names of the two parts that are left out, and of the moduli in words.
@@ -121,7 +120,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     return {name: new[name] - value for name, value in old.items()}
 
 
-def _moved_most(fit: Fit, changes: dict[str, Any]) -> list[str]:
+def _moved_most(fit: Fit, changes: Content) -> list[str]:
     """A sentence for each end, with the three numbers that it moves most."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):

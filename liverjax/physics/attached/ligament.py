@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Array, Indices, Number, Numbers, param, struct
+from liverjax.core.struct import Array, Content, Indices, Number, Numbers, param, struct
 from liverjax.mesh import locate, selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
@@ -34,7 +34,7 @@ class Ligament(Physics):
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "to", "points", "stiffness", "pre_tension", "rest_length")
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Ligament":
+    def read(cls, mesh: TetMesh, table: Content, name: str) -> "Ligament":
         """From [[ligament]]: a place and a point of the wall, or two points of the body."""
         if ("points" in table) == ("to" in table):
             raise InputError(f"{name} needs either to = [x, y, z], with a place, or points = [[x, y, z], [x, y, z]]")

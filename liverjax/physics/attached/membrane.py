@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Indices, Number, param, struct
+from liverjax.core.struct import Content, Indices, Number, param, struct
 from liverjax.laws import layers
 from liverjax.laws.base import Law
 from liverjax.mesh import selection, surface
@@ -36,7 +36,7 @@ class Membrane(Physics):
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "thickness", "law")
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> "Membrane":
+    def read(cls, mesh: TetMesh, table: Content, name: str) -> "Membrane":
         """From [[membrane]]: a place (the whole surface where there is none), a thickness and a law."""
         for key, example in (("thickness", "thickness = 5e-5, in m"), ("law", "[membrane.law] with name and numbers")):
             if key not in table:

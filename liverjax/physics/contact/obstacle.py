@@ -20,7 +20,7 @@ from jax.typing import DTypeLike
 from liverjax.core import history
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Content, Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
 from liverjax.mesh import selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
@@ -65,7 +65,7 @@ class Obstacle(Physics):
     )
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, Any], name: str) -> Self:
+    def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
         """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
         shape = table.get("shape")
         if shape not in SHAPES:
@@ -76,7 +76,7 @@ class Obstacle(Physics):
         whole = "where" not in table and "set" not in table
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         triangles = selection.boundary_triangles(mesh, nodes)
-        given: dict[str, Any] = {key: table[key] for key in ("radius", "half_angle", "stiffness") if key in table}
+        given: Content = {key: table[key] for key in ("radius", "half_angle", "stiffness") if key in table}
         given |= {k: three_numbers(table[k], f"{name} {k}") for k in ("position", "axis", "by") if k in table}
         if "axis" in given:
             given["axis"] = given["axis"] / max(float(jnp.linalg.norm(given["axis"])), 1e-300)
