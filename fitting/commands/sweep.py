@@ -3,7 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
@@ -12,6 +12,7 @@ from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
 from liverjax.core.plotting import import_meanwhile
+from liverjax.core.struct import Content
 
 if TYPE_CHECKING:
     from fitting.fits.posterior import Posterior
@@ -146,7 +147,7 @@ def run(options: argparse.Namespace) -> int:
 
         return together.run(options)
     options.method = options.method or "torsion"
-    shift: dict[str, Any] = {}
+    shift: Content = {}
     if options.master is None:
         sweep = shared_options.usable_sweep(options, options.sweep[0])
     else:

@@ -6,7 +6,7 @@ creep are computed as for Prony modes. Its own few numbers are what is fitted an
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.methods.springpots import FRACTIONAL, Fractional
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
+from liverjax.core.struct import Content
 
 #: Starts of each model, how far the random ones lie from the one that follows the Prony modes, and iterations.
 STARTS, AROUND, MOST_STEPS = 4, 0.7, 80
@@ -179,10 +180,10 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     return best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds)
 
 
-def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[dict[str, Any]]:
+def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[Content]:
     """What the choice rests on, best first."""
     best = min(map(criterion, tried))
-    rows: list[dict[str, Any]] = [
+    rows: list[Content] = [
         {
             "model": f.kind.name,
             "modes": f.modes,

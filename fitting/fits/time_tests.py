@@ -37,7 +37,7 @@ class TimeFit(NamedTuple):
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
-    details: dict[str, Any]
+    details: Content
     parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
 
     @property

@@ -1,6 +1,6 @@
 """The master curve of sweeps at several temperatures: its points, and the laws of its shift factors."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from fitting.master.temperature_laws import TemperatureLaw
 from fitting.master.temperature_sweeps import AtTemperatures, joined
 from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 #: Distance of a sweep from the common curve that is worth a sentence, and the error [decades] of a loose factor.
 FAR_OFF, LOOSE = 0.05, 0.3
@@ -57,7 +58,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
 def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
     a, b = 10.0**log_a, 10.0**log_b
-    moduli: dict[str, Any] = {q: getattr(sweep, q) for q in ("storage", "loss", "storage_sd", "loss_sd")}
+    moduli: Content = {q: getattr(sweep, q) for q in ("storage", "loss", "storage_sd", "loss_sd")}
     moduli = {q: None if values is None else b * values for q, values in moduli.items()}
     return sweep._replace(angular_frequency=a * sweep.angular_frequency, **moduli)
 
@@ -84,7 +85,7 @@ def _sentences(found: Shifts) -> list[str]:
     return out
 
 
-def shift_numbers(found: MasterCurve) -> dict[str, Any]:
+def shift_numbers(found: MasterCurve) -> Content:
     """The part `shift` of the details in fit.json."""
     s = found.shifts
     return {

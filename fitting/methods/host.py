@@ -1,4 +1,4 @@
-"""Formulas of a few numbers run in NumPy as they do in JAX: nothing to compile, and exact derivatives all the same."""
+"""Formulas of a few numbers that run in NumPy as in JAX: without compilation, with exact derivatives."""
 
 from collections.abc import Callable
 from typing import Any

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.readers.rheometer import Sweep
+from liverjax.core.struct import Content
 
 
 def parameter_vector(u: Array, maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural) -> Array:
@@ -59,7 +60,7 @@ def equilibrium_error(u: Estimate) -> float:
     return float(np.linalg.norm(slope @ u.root)) if rest > 1e-10 else np.inf
 
 
-def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> dict[str, Any]:
+def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:
     """95 % intervals by profile likelihood, closed form: all other parameters refitted along each one.
 
     Returns:

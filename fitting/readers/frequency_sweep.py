@@ -1,7 +1,7 @@
 """A measured frequency sweep, and the parts of it that can be used."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 

@@ -10,7 +10,7 @@ from liverjax.core.errors import InputError
 
 
 def text_of(path: Path, what: str = "a frequency sweep") -> str:
-    """Content of a text file of any encoding, or of a workbook; `InputError` asking for the CSV file of `what`."""
+    """Content of a text file of any encoding, or of a workbook. `InputError` if it is neither; it names `what`."""
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder: give the CSV file of {what}")

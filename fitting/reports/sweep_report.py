@@ -97,15 +97,15 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
     }
 
 
-def band_sensitivity(fit: Fit) -> dict[str, Any]:
+def band_sensitivity(fit: Fit) -> Content:
     """Changes by the names of `standard_errors`; null where too few points were left."""
     changes = fit.details.get("band_sensitivity", {})
     return {part: None if found is None else by_stem(found) for part, found in changes.items()}
 
 
-def by_stem(flat: dict[str, float]) -> dict[str, Any]:
+def by_stem(flat: dict[str, float]) -> Content:
     """Numbers by the names of `standard_errors`: one list for ratios[0], ratios[1], …"""
-    out: dict[str, Any] = {}
+    out: Content = {}
     for name, value in flat.items():
         stem = name.split("[")[0]
         if stem == name:
@@ -115,7 +115,7 @@ def by_stem(flat: dict[str, float]) -> dict[str, Any]:
     return out
 
 
-def own_numbers(p: Estimate | None, kind: Kind) -> dict[str, Any]:
+def own_numbers(p: Estimate | None, kind: Kind) -> Content:
     """Parameters of a model that is not made of modes, for fit.json."""
     if p is None:
         return {}
@@ -123,7 +123,7 @@ def own_numbers(p: Estimate | None, kind: Kind) -> dict[str, Any]:
     return {"parameters": {n: {"value": v, "standard_error": e, "unit": unit} for n, v, e, unit in rows}}
 
 
-def own_rows(p: Estimate, kind: Kind, details: dict[str, Any], marked: Iterable[str] = ()) -> list[str]:
+def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
     """The same for a terminal, and how near the Prony modes come; those in `marked` have a star."""
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):

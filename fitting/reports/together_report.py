@@ -89,7 +89,7 @@ def _by_name(values: np.ndarray, n: int) -> Content:
     }
 
 
-def _share_of_test(share: Share, found: Together) -> dict[str, Any]:
+def _share_of_test(share: Share, found: Together) -> Content:
     own, without = found.parameters, share.errors_without
     named = _by_name(without, found.modes) if own is None else dict(zip(own.names, without.tolist(), strict=True))
     return {

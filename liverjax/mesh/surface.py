@@ -34,7 +34,7 @@ def areas(points: jax.Array, triangles: Indices) -> jax.Array:
 
 
 def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:
-    """Nodes (m,) of flat triangles that take part of something uniform on them, and the part of each.
+    """Nodes (m,) of flat triangles that share a uniform load, and the share of each.
 
     A third at each vertex of a linear element. The functions of the vertices of a quadratic one have no integral: a
     third at the middle of each edge. Triangles (m, 4) of a mesh of order 3 name their face in the last column.

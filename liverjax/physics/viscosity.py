@@ -157,7 +157,7 @@ def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax
 
 
 def initial_history(prony: Prony, points: int | tuple[int, ...], dtype: DTypeLike = float) -> History:
-    """Memory of a body at rest, zero: of E points, or of the shape (Q, E)."""
+    """Zero memory of a body at rest, for E points or the shape (Q, E)."""
     shape = (points,) if isinstance(points, int) else points
     gamma = jnp.zeros((jnp.asarray(prony.ratios).shape[0], 6, *shape), dtype)
     return History(gamma, None if prony.scheme == "backward_euler" else jnp.zeros((6, *shape), dtype))

@@ -1,4 +1,4 @@
-"""One load or time step of a scene: what solves its equations, and the state it hands to the next."""
+"""One load or time step of a scene: it solves the equations and returns the next state."""
 
 from functools import partial
 from typing import Any
