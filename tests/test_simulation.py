@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.sparse.linalg
 
 import liverjax as lj
 from liverjax.core import status
@@ -360,62 +359,6 @@ def test_a_scene_carries_only_what_it_has():
 
 def _primitives(scene: lj.Scene) -> set[str]:
     return set(re.findall(r"= (\w+)", str(jax.make_jaxpr(lj.simulate)(scene))))
-
-
-def hanging(**solve) -> lj.Scene:
-    """A block under gravity."""
-    mesh = box()
-    weight = lj.Body(density=1060.0, gravity=jnp.array([0.0, 0.0, -2.0]))
-    return lj.Scene(mesh=mesh, law=LAW, body=weight, fixed=(bottom(mesh),), solve=lj.Solve(**solve))
-
-
-def test_one_step_of_newton_is_the_chapters_scheme():
-    scene = hanging(kind="dynamic", dt=0.01, steps=5, newton="one_step")
-    one, full = lj.simulate(scene), lj.simulate(replace(scene, solve=replace(scene.solve, newton="converged"))).check()
-    assert np.all(np.asarray(one.statistics.iterations) == 1)
-    moved = np.abs(np.asarray(full.positions[-1] - scene.mesh.points)).max()
-    assert 0 < np.abs(np.asarray(one.positions - full.positions)).max() < 0.05 * moved
-    # The old spelling, one iteration, is the same scheme.
-    counted = lj.simulate(replace(scene, solve=replace(scene.solve, newton="converged", newton_iterations=1)))
-    assert np.array_equal(counted.positions, one.positions)
-
-
-def test_one_step_of_newton_says_when_its_residual_is_above_the_tolerance():
-    scene = hanging(steps=1, newton="one_step")
-    large = lj.simulate(scene)
-    assert float(large.statistics.residual[0]) > 1e-3 and int(large.status[0]) == status.ONE_STEP
-    with pytest.raises(RuntimeError, match="one_step"):
-        large.check()
-    loose = lj.simulate(replace(scene, solve=replace(scene.solve, tolerance=0.5)))
-    assert int(loose.status[0]) == status.CONVERGED
-
-
-def test_one_step_of_newton_solves_to_the_tolerance_asked_for():
-    """Under a weight of a millionth the body is linear: what is left is the linear solve's error alone."""
-    scene = hanging(steps=1, newton="one_step", tolerance=1e-9)
-    light = replace(scene, body=replace(scene.body, gravity=1e-9 * scene.body.gravity))
-    # Residual of a linear solve to 0.3 of the tolerance, and what is quadratic in the motion (1e-9 of 1e-1).
-    assert float(lj.simulate(light).statistics.residual[0]) < 1e-9
-
-
-@pytest.mark.slow
-def test_one_step_of_newton_takes_the_regularised_stiffness():
-    """The chapter's own scheme (4.1.2 iii), against a sparse solve with the assembled matrix, from a pressed start."""
-    scene = hanging(steps=1, newton="one_step", robust="regularised", tolerance=1e-9)
-    mesh, law = scene.mesh, scene.law
-    x = np.array(mesh.points) * np.array([1.0, 1.0, 0.7])
-    mass = scene.body.density * np.asarray(lj.boundary.nodal_volumes(mesh))
-    load = mass[:, None] * np.asarray(scene.body.gravity) - np.asarray(lj.mjed.internal_force(mesh, law, jnp.array(x)))
-    K = lj.mjed.stiffness_matrix(mesh, law, jnp.array(x), regularised=True).tocsr()
-    free = np.setdiff1d(np.arange(len(x)), np.asarray(scene.fixed[0].nodes))
-    degrees = (3 * free[:, None] + np.arange(3)).ravel()
-    expected = x.copy()
-    expected[free] += scipy.sparse.linalg.spsolve(K[degrees][:, degrees].tocsc(), load[free].ravel()).reshape(-1, 3)
-    found = lj.simulate(scene, start=jnp.array(x)).positions[0]
-    # Held nodes are held where the reference has them, as the bottom is in both.
-    assert np.abs(np.asarray(found) - expected).max() < 1e-7 * np.abs(expected - x).max()
-    plain = lj.simulate(replace(scene, solve=replace(scene.solve, robust="off")), start=jnp.array(x)).positions[0]
-    assert np.abs(np.asarray(plain) - expected).max() > 1e-3 * np.abs(expected - x).max()
 
 
 @pytest.mark.slow

@@ -1,0 +1,107 @@
+"""The estimate of a mesh's error: near the true error, refused where it says nothing, and a correction of fits."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.simulation.cautions import mesh_sentence
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def _pull(order: int, cells: int, by: float = 1e-6) -> lj.Scene:
+    mesh = lj.shapes.box((0.01, 0.01, 0.01), (cells, cells, cells))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=800.0, bulk=16000.0),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_max"], by=jnp.array([0.0, 0.0, by])),),
+        solve=lj.Solve(linear_solver="cg"),
+    )
+
+
+def _force(mesh: lj.TetMesh):
+    top = mesh.node_sets["z_max"]
+    return lambda x, R: jnp.sum(R[-1, top, 2])
+
+
+def _pulled(scene: lj.Scene) -> float:
+    result = lj.simulate(scene)
+    return float(_force(scene.mesh)(result.positions, result.reactions))
+
+
+def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
+    """A linear problem: one linear solve is all, but for its tolerance of 1e-2."""
+    scene = _pull(1, 2)
+    result = lj.simulate(scene, mesh_error=True)
+    value, change = result.mesh_error.change(_force(scene.mesh), result)
+    richer = replace(_pull(2, 2), solve=lj.Solve(volumetric="mixed"))
+    other = _pulled(richer)
+    assert bool(result.mesh_error.found.all()) and change < -0.05 * value
+    assert abs(value + change - other) < 0.02 * abs(change)
+    assert re.search("nodes are up to .* m off.*take order = 2 in", mesh_sentence(scene, result))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("order", "cells"), [(1, 2), (1, 3), (2, 2)])
+@pytest.mark.parametrize("by", [1e-6, 5e-4])
+def test_effectivity_against_a_finer_mesh(order, cells, by, verified):
+    """Truth: quadratic elements, 4 and 6 cells, extrapolated by the order that edges of clamped faces leave (1.5)."""
+    scene = _pull(order, cells, by)
+    result = lj.simulate(scene, mesh_error=True)
+    value, change = result.mesh_error.change(_force(scene.mesh), result)
+    coarse, fine = (_pulled(_pull(2, n, by)) for n in (4, 6))
+    truth = fine + (fine - coarse) / (1.5**1.5 - 1)
+    effectivity = float(change) / (truth - float(value))
+    assert 0.5 < effectivity < 2
+    verified(f"mesh error, order {order}, {cells} cells", "finer meshes", abs(effectivity - 1), 1.0)
+
+
+def test_mesh_error_refuses_what_it_cannot_say():
+    scene = _pull(1, 1)
+    with pytest.raises(lj.InputError, match="leave start out"):
+        lj.simulate(scene, start=scene.mesh.points, mesh_error=True)
+    with pytest.raises(lj.InputError, match="leaves an error of its own"):
+        lj.simulate(replace(scene, solve=lj.Solve(newton_iterations=1)), mesh_error=True)
+
+
+@pytest.mark.slow
+def test_the_mesh_bias_of_a_fitted_number_corrects_it():
+    """Data of quadratic elements on a finer mesh, fitted with coarse linear ones: the bias says what they cause."""
+    from fitting.fits import scene_numbers
+    from fitting.readers.displacements import Displacements
+
+    def block(order: int, cells: int, mu: float) -> lj.Scene:
+        mesh = lj.shapes.box((0.02, 0.01, 0.01), (2 * cells, cells, cells))
+        mesh = lj.quadratic(mesh) if order == 2 else mesh
+        return lj.Scene(
+            mesh=mesh,
+            law=lj.laws.NeoHookean(mu=mu, bulk=2400.0),
+            fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+            body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -0.5])),
+            solve=lj.Solve(linear_solver="cg"),
+        )
+
+    truth, coarse = block(2, 4, 800.0), block(1, 4, 700.0)
+    corner = int(np.argmax(np.asarray(coarse.mesh.points) @ np.ones(3)))
+    same = int(
+        np.argmin(np.linalg.norm(np.asarray(truth.mesh.points) - np.asarray(coarse.mesh.points)[corner], axis=1))
+    )
+    moved = np.asarray(lj.simulate(truth).check().positions[-1] - truth.mesh.points)[same]
+    data = Displacements(
+        step=np.array([0]),
+        nodes=np.full((1, 4), corner),
+        weights=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        measured=moved[None],
+        sd=np.full((1, 3), 1e-6),
+    )
+    problem = scene_numbers.Problem((coarse,), (data,))
+    with pytest.warns(UserWarning, match="the mesh moves law.mu by"):
+        found = scene_numbers.fit_numbers(problem, ["law.mu"], mesh_error=True)
+    off, left = found.values[0] - 800.0, found.values[0] - found.mesh_bias[0] - 800.0
+    assert off < -20 and abs(left) < 0.3 * abs(off)
