@@ -57,9 +57,9 @@ class Harmonic:
 def harmonic(
     scene: Scene,
     frequencies_Hz: Any = None,
-    factors: Number | None = None,
+    factors: Any = None,
     about: jax.Array | None = None,
-    motion: Number | None = None,
+    motion: Any = None,
     mass: str = "consistent",
 ) -> Harmonic:
     """Small motion of the scene at these frequencies, driven by its tractions, prescribed motions and inlets.

@@ -1,5 +1,7 @@
 """Error of harmonic motion by its mesh: the same problem is solved in the next richer space of functions."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -13,11 +15,7 @@ from liverjax.waves.harmonic import Harmonic, harmonic
 
 
 def harmonic_mesh_error(
-    scene: Scene,
-    found: Harmonic,
-    factors: Number | None = None,
-    about: jax.Array | None = None,
-    motion: Number | None = None,
+    scene: Scene, found: Harmonic, factors: Any = None, about: jax.Array | None = None, motion: Any = None
 ) -> jax.Array:
     """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
 

@@ -13,13 +13,12 @@ supports, membranes and springs. Pressures that are unknowns beside the motion: 
 from functools import cache
 from itertools import product
 from math import factorial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.laws.base import Law, volumetric_part
 from liverjax.laws.terms import invariant_terms

@@ -84,7 +84,7 @@ class _Sparse(NamedTuple):
     size: int
 
 
-def _host(*given: object) -> np.ndarray:
+def _host(*given: Any) -> np.ndarray:
     A, factors, omegas, b = jax.tree.map(np.asarray, given)
     system, plan, matrix, x = _system(A, b.shape[1]), None, _digest(A), np.zeros_like(b)
     for f, omega in enumerate(omegas):
@@ -164,7 +164,7 @@ def _system(A: Any, size: int) -> _Sparse:
     at = A.nodes[:, None] + V * np.arange(3)[None, :, None]  # (n, 3, E)
     places = [_places_of_blocks(at)]
     rest = 0.0 if A.rest is None else A.rest
-    mass: Number = 0.0
+    mass: Any = 0.0
     if A.mass is not None and A.mass.ndim == 3:
         mass = A.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
     parts: list = [lambda m, w: (m * A.relaxing + rest - w**2 * mass).reshape(-1)]
