@@ -12,7 +12,7 @@ from fitting.fits import models, viscoelastic
 from fitting.fits.honesty import edges, total_error
 from fitting.methods import generalised_maxwell, kramers_kronig
 from fitting.methods.kramers_kronig import runs_probability
-from fitting.readers.rheometer import Sweep, read_sweep, some, within
+from fitting.readers.rheometer import Sweep, read_sweep, some, within, without_inertia
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -211,3 +211,25 @@ def test_points_outside_the_limits_are_left_out_and_said():
     ):
         with pytest.raises(InputError, match=sentence):
             within(s, low, high)
+
+
+@pytest.mark.slow
+def test_total_errors_hold_what_a_shorter_band_says():
+    """Ten raw samples: cut from 100 to 20 rad/s, the shortest time and G0 move by less than one total error."""
+    folder = SHARED / "data" / "lions_mane"
+    if not folder.is_dir():
+        pytest.skip("the raw sweeps of the samples are not here")
+    for file in sorted(folder.glob("*.csv")):
+        s = kramers_kronig.without_instrument(without_inertia(read_sweep(file), 0.004, 0.0092))
+        whole, cut = (_honest_fit(some(s, s.angular_frequency < end)) for end in (101.0, 20.1))
+        errors, last = total_error.total_errors(whole), f"relaxation_times[{whole.modes - 1}]"
+        apart = cut.uncertainty.values - whole.uncertainty.values
+        # Of the stiffest sample the cut is the half decade that the error is made of: equal to rounding.
+        assert abs(apart[0]) < errors["shear_modulus"] * (1 + 1e-9), file.name
+        assert abs(apart[-1]) < errors[last] * (1 + 1e-9), file.name
+        assert abs(apart[0]) > whole.uncertainty.standard_errors[0], file.name  # the error by noise does not hold it
+
+
+def _honest_fit(s: Sweep) -> viscoelastic.Fit:
+    dense = generalised_maxwell.spectrum(s)
+    return edges.honest(viscoelastic.choose_modes(s, dense)[0], s, dense)

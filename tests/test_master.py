@@ -7,6 +7,7 @@ import pytest
 from conftest import SHARED
 
 from fitting.__main__ import main
+from fitting.fits import models
 from fitting.master import master_curve, shifts, temperature_laws, temperature_sweeps
 from fitting.readers.frequency_sweep import Sweep
 
@@ -165,3 +166,6 @@ def test_twenty_measured_tables_make_one_curve():
     other = master_curve.master_curve(data, 293.15).laws[0]
     apart = found.shifts.temperatures[found.shifts.reference] - 293.15
     assert other.numbers["C2_K"][0] == pytest.approx(wlf.numbers["C2_K"][0] - apart, rel=0.03)
+    # A smooth spectrum of 2 times a decade follows 14 decades; half a decade at the cold end is noise.
+    fit = models.spectrum_fit(found.sweep)
+    assert np.mean(fit.relative_errors(found.sweep)) < 0.015 and fit.details["spectrum"]["decades_carried"] > 12

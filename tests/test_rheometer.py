@@ -415,3 +415,12 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
     with pytest.raises(InputError, match="pip install python-calamine"):
         read_sweep(old)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"])
+def test_any_encoding_is_read(tmp_path, encoding):
+    text = "Frequency [Hz];G' [kPa];G'' [kPa];T [°C]\n0,5;1,25;0,5;20\n1;1,5;0,6;20\n2;1,75;0,7;20\n"
+    (tmp_path / "a.csv").write_bytes(text.encode(encoding))
+    s = read_sweep(tmp_path / "a.csv")
+    assert s.storage.tolist() == [1250, 1500, 1750] and s.loss.tolist() == [500, 600, 700]
+    assert s.raw is not None and np.allclose(s.raw["temperature"], 293.15)

@@ -35,6 +35,10 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
 def _decoded(path: Path, data: bytes) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
+    start = data[:200]  # UTF-16 without its mark: every second byte of plain text is 0
+    for name, zeros in (("utf-16-le", start[1::2]), ("utf-16-be", start[::2])):
+        if len(start) > 20 and not any(zeros):
+            return data.decode(name, errors="replace")
     if b"\0" in data:
         raise InputError(f"{path} is not a text file: export the sweep as CSV or text")
     try:
