@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import replace
+from liverjax.core.struct import Indices, replace
 from liverjax.mesh.adjacency import PAIRS
 from liverjax.mesh.basis import FACES
 from liverjax.mesh.tetrahedra import TetMesh
@@ -55,6 +55,14 @@ def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
     code, wanted = (_code(np.sort(t.astype(np.int64), axis=1), V) for t in (of_elements, triangles))
     order = np.argsort(code, kind="stable")
     return np.asarray(mesh.faces).ravel()[order[np.searchsorted(code, wanted, sorter=order)]]
+
+
+def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
+    """Triangles (m, 3) as a mesh of order 3 wants them: vertices in order, then the number of the face; host side."""
+    if mesh.order < 3:
+        return triangles
+    vertices = np.sort(np.asarray(triangles), axis=1)
+    return jnp.asarray(np.column_stack([vertices, face_numbers(mesh, vertices)]), jnp.int32)
 
 
 def _code(triples: np.ndarray, V: int) -> np.ndarray:

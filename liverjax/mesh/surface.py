@@ -13,11 +13,18 @@ _EDGES = ((0, 1), (1, 2), (2, 0))
 
 
 def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
-    """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, of quadratic meshes, middles of edges."""
+    """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, of quadratic meshes, middles of edges.
+
+    Triangles (m, 4) of a mesh of order 3 have the functions of order 3 of their edges and of their face beside.
+    """
     vertices = [triangles[:, a] for a in range(3)]
     if mesh.order == 1:
         return vertices
-    return vertices + [_middle(mesh, triangles[:, a], triangles[:, b]) for a, b in _EDGES]
+    middles = [_middle(mesh, triangles[:, a], triangles[:, b]) for a, b in _EDGES]
+    if triangles.shape[1] == 3:
+        return vertices + middles
+    edges = mesh.pattern.edges.shape[1]
+    return [*vertices, *middles, *(n + edges for n in middles), mesh.number_of_vertices + 2 * edges + triangles[:, 3]]
 
 
 def _middle(mesh: TetMesh, a: Indices, b: Indices) -> jax.Array:
@@ -42,11 +49,8 @@ def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float
     nodes = triangle_nodes(mesh, triangles)
     if mesh.order == 1:
         return [(n, 1 / 3) for n in nodes]
-    found = [(n, 1 / 3) for n in nodes[3:]]
-    if triangles.shape[1] == 4:
-        bubbles = mesh.number_of_vertices + 2 * mesh.pattern.edges.shape[1]
-        found.append((bubbles + triangles[:, 3], 9 / 20))
-    return found
+    found = [(n, 1 / 3) for n in nodes[3:6]]
+    return [*found, (nodes[-1], 9 / 20)] if triangles.shape[1] == 4 else found
 
 
 def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = None) -> jax.Array:
@@ -56,7 +60,7 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
-        nodes = jnp.stack(triangle_nodes(mesh, triangles))
+        nodes = jnp.stack(triangle_nodes(mesh, triangles)[:6])
         weights, l = triangle_rule()
         N, along = _quadratic(l)
         first, second = (jnp.tensordot(jnp.asarray(slope.T, x.dtype), x[nodes], axes=1) for slope in along)
@@ -69,12 +73,17 @@ def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     if mesh.order == 1:
         return np.ones(1), np.array([[[-1.0, 1.0, 0.0]], [[-1.0, 0.0, 1.0]]])
     weights, l = triangle_rule()
-    return weights, np.swapaxes(np.stack(_quadratic(l)[1]), 1, 2)
+    along = (_quadratic if mesh.order == 2 else _ten_functions)(l)[1]
+    return weights, np.swapaxes(np.stack(along), 1, 2)
 
 
 def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
-    """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q)."""
-    return l if mesh.order == 1 else _quadratic(l)[0]
+    """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
+
+    Of a mesh of order 3, whose functions on edges point to the higher vertex, triangles name their vertices in order
+    (`liverjax.mesh.promotion.with_faces`).
+    """
+    return l if mesh.order == 1 else (_quadratic if mesh.order == 2 else _ten_functions)(l)[0]
 
 
 def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -85,3 +94,20 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     by += [[4 * l[b] if m == a else 4 * l[a] if m == b else zero for m in range(3)] for a, b in _EDGES]
     slopes = np.array(by)
     return np.stack(N), [slopes[:, m] - slopes[:, 0] for m in (1, 2)]
+
+
+def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The same, and those of order 3 of the edges and of the face, ten (10, Q)."""
+    N, slopes = _quadratic(l)
+    zero = np.zeros_like(l[0])
+    more, by = [], []
+    for a, b in ((0, 1), (1, 2), (0, 2)):
+        more.append(l[a] * l[b] * (l[a] - l[b]))
+        own = {a: (2 * l[a] - l[b]) * l[b], b: (l[a] - 2 * l[b]) * l[a]}
+        by.append([own.get(m, zero) for m in range(3)])
+    more.append(27 * l[0] * l[1] * l[2])
+    by.append([27 * l[1] * l[2], 27 * l[0] * l[2], 27 * l[0] * l[1]])
+    along = np.array(by)
+    return np.concatenate([N, more]), [
+        np.concatenate([slope, along[:, m] - along[:, 0]]) for slope, m in zip(slopes, (1, 2), strict=True)
+    ]

@@ -26,7 +26,8 @@ import numpy as np
 from liverjax.core.struct import Indices, Number
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.solvers.attached import Attached
+from liverjax.solvers.attached import Attached, GivesWay
+from liverjax.solvers.attached import definite as without_negative
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector
 
@@ -173,12 +174,28 @@ class NodalForce:
         """Energy [J] at the end of the step."""
         raise TypeError(f"{type(self).__name__} lacks energy(mesh, x)")
 
+    def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
+        """An energy [J] at x whose gradient at `start` (V, 3) is the force there, for a search that begins there.
+
+        The energy itself where there is one. Else what keeps the force from having one is held as it is at `start`.
+        """
+        return self.energy(mesh, x)
+
     def stiffness(self) -> Block | None:
         """Diagonal blocks 3 x 3 of (V,) [N/m], an entry None where it is 0; None: the force is constant."""
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached | None:
         """Stiffness at x of further elements between nodes, added to `stiffness`; None: there are none."""
+        return None
+
+    def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached | None:
+        """The same without negative eigenvalues."""
+        own = self.attached(mesh, x, s)
+        return None if own is None else without_negative(own)
+
+    def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
+        """What a number that adapts to motion takes from that stiffness, or from its definite form; None: nothing."""
         return None
 
     def predicted(self) -> jax.Array | None:
@@ -217,6 +234,13 @@ class Physics:
             InputError: one sentence that begins with `name`.
         """
 
+    def check_place(self, mesh: TetMesh, name: str) -> None:
+        """Refuse a mesh that it cannot begin with; host side. A loaded mesh may be any: no run begins there.
+
+        Raises:
+            InputError: one sentence that begins with `name`.
+        """
+
     def in_body(self, mesh: TetMesh, law: Any) -> "Physics":
         """The same physics with the numbers that follow from this law."""
         return self
@@ -249,8 +273,8 @@ class Physics:
         """Node numbers (n,) and directions (n, 3) along which the body is held against rigid motion."""
         return np.zeros(0, int), np.zeros((0, 3))
 
-    def enriched(self, more: Callable[[Indices], Indices]) -> "Physics":
-        """The same physics on richer elements: `more` adds the nodes between the given node numbers (n,)."""
+    def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Physics":
+        """The same physics on a mesh of richer elements: `more` adds the nodes between given node numbers (n,)."""
         return self
 
     def bulk_modulus(self) -> Any:

@@ -135,6 +135,12 @@ class Loading(NodalForce):
         """Minus the work of the dead loads."""
         return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
 
+    def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
+        """Pressures that follow are held as they are at `start`."""
+        if self.conservative:
+            return self.energy(mesh, x)
+        return jnp.vdot(self.force(mesh, start, jnp.ones((), x.dtype)), x - start)
+
     def product(self, mesh: TetMesh, x: jax.Array, s: Any, dx: jax.Array) -> jax.Array:
         """Change of the pressures alone: dead loads do not change."""
         if self.before is not None:

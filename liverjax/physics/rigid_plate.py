@@ -72,8 +72,8 @@ class RigidPlate(Physics):
             return None
         return Torque(plate=self.tied(step))
 
-    def enriched(self, more: Callable[[Any], Any]) -> "RigidPlate":
-        """The same with the nodes in between."""
+    def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
+        """With the nodes in between."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -57,8 +57,8 @@ class SlidingSupport(Physics):
         loose = jnp.max(free.mask[self.nodes] * (jnp.abs(normal) > 1e-12), axis=1, keepdims=True)
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
-    def enriched(self, more: Callable[[Any], Any]) -> "SlidingSupport":
-        """The same with the nodes in between."""
+    def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "SlidingSupport":
+        """With the nodes in between."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,7 @@ def _quadratic_mesh(scene: Scene) -> Scene:
         body=body,
         fixed=tuple(replace(f, nodes=more(f.nodes)) for f in scene.fixed),
         displaced=tuple(_between(mesh, d, more(d.nodes)) for d in scene.displaced),
-        physics=tuple(p.enriched(more) for p in scene.physics),
+        physics=tuple(p.enriched(mesh, more) for p in scene.physics),
     )
 
 
@@ -66,7 +66,7 @@ def _cubic(scene: Scene) -> Scene:
         body=body,
         fixed=(*(replace(f, nodes=more(f.nodes)) for f in scene.fixed), *still),
         traction=tuple(_with_faces(mesh, load) for load in scene.traction),
-        physics=tuple(p.enriched(more) for p in scene.physics),
+        physics=tuple(p.enriched(mesh, more) for p in scene.physics),
     )
 
 

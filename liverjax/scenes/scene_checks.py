@@ -41,12 +41,6 @@ def check_choices(scene: Scene) -> None:
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies is not None):
         raise InputError("[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) go together: give both, or neither")
     _loaded(scene)
-    rubs = [name for name, physics in _named_physics(scene) if not physics.conservative]
-    if rubs and (scene.solve.linear_solver == "direct" or scene.solve.robust != "off"):
-        raise InputError(
-            f"{rubs[0]} has friction or a force, for which linear_solver = 'direct' and robust have no matrix: leave "
-            "them out"
-        )
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
@@ -57,8 +51,6 @@ def check_choices(scene: Scene) -> None:
         _own_volumes(scene)
     if scene.solve.volumetric == "mixed":
         _mixed(scene)
-    if scene.solve.robust != "off" and any(load.pressure is not None for load in scene.traction):
-        raise InputError("[solve] robust needs forces with an energy: leave it out where a pressure follows the body")
     for k, load in enumerate(scene.traction):
         history.check(load.times, load.history, f"traction.{k}")
         if np.ndim(load.history) == 2:
@@ -114,8 +106,6 @@ def _own_volumes(scene: Scene) -> None:
     for law in several:
         if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
             raise InputError(f"{name} needs a law with bulk apart from its shear, {type(law).__name__} is none")
-    if scene.solve.volumetric == "nodal" and len(several) > 1:
-        raise InputError(f"{name} averages volumes across regions of several laws: use 'element' or 'mixed'")
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
         raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
 
@@ -161,6 +151,8 @@ def check_scene(scene: Scene) -> None:
     regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
     for name, physics in _named_physics(scene):
         physics.check(scene.mesh, name)
+        if scene.points_are != "loaded":
+            physics.check_place(scene.mesh, name)
     _no_two_normals(scene)
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))

@@ -220,14 +220,17 @@ def residual(e: Equations, q: jax.Array, s: Number) -> tuple[jax.Array, jax.Arra
     return r, at_work, f.pressure
 
 
-def energy(e: Equations, q: jax.Array) -> jax.Array:
-    """The energy [J] that a step minimises: the sum of incremental potentials. Its gradient is the residual."""
-    x = positions(e, q, 1.0)
+def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
+    """The energy [J] that a step minimises: the sum of incremental potentials.
+
+    Its gradient at `start` is the residual; everywhere, where all forces have an energy.
+    """
+    x, begin = positions(e, q, 1.0), positions(e, start, 1.0)
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
         total = total + e.volume.energy(e.mesh, determinant(F))
-    return sum((a.energy(e.mesh, x) for a in e.nodal), total)
+    return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
 def advanced(e: Equations, end: End) -> State:

@@ -21,7 +21,7 @@ from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
 from liverjax.solvers import attached, block_matrix, direct, point_matrix
-from liverjax.solvers.attached import Attached
+from liverjax.solvers.attached import Attached, GivesWay
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.krylov import (
     conjugate_gradients,
@@ -93,15 +93,19 @@ def node_blocks(e: Equations) -> Block | None:
     return total
 
 
-def _attached(e: Equations, x: jax.Array, s: Number, kind: str) -> tuple[Attached, ...]:
-    """Stiffness of the elements that physics put between nodes."""
-    found = (a.attached(e.mesh, x, s) for a in e.nodal)
-    return tuple(own if kind == "true" else attached.definite(own) for own in found if own is not None)
+def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached | GivesWay, ...]:
+    """Stiffness of elements between nodes that the physics bring, and what takes from it."""
+    found: list[Attached | GivesWay | None] = []
+    for a in e.nodal:
+        found.append(a.attached(e.mesh, x, s) if kind == "true" else a.definite(e.mesh, x, s))
+        found.append(a.gives_way(e.mesh, x, s, kind != "true"))
+    return tuple(own for own in found if own is not None)
 
 
-def _symmetric(e: Equations, more: tuple[Attached, ...]) -> tuple[Attached, ...]:
-    """Elements between nodes for the preconditioner, made symmetric: the stiffness of friction is not."""
-    return more if e.conservative else tuple(attached.symmetric_part(own) for own in more)
+def _symmetric(e: Equations, more: tuple[Attached | GivesWay, ...]) -> tuple[Attached, ...]:
+    """What a preconditioner takes of elements between nodes: friction has a stiffness without symmetry."""
+    elements = tuple(own for own in more if isinstance(own, Attached))
+    return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
 
 def _with_diagonals(e: Equations, diagonal: Block, more: tuple[Attached, ...]) -> Block:
@@ -130,7 +134,8 @@ class Tangent(NamedTuple):
     slow: Coarse
     x: jax.Array | None  # (V, 3) where it was made, for loads that follow
     s: Any  # part of the step there
-    attached: tuple[Attached, ...] = ()  # elements between nodes, not in the matrix
+    follows: jax.Array | None  # 1 where these loads count, 0 in a tangent without negative eigenvalues
+    attached: tuple[Attached | GivesWay, ...] = ()  # elements between nodes, not in the matrix
 
 
 def tangent(
@@ -154,12 +159,12 @@ def tangent(
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     # Loads that follow the body need to know where.
-    where, part = (None, None) if e.conservative else (x, s)
-    return Tangent(matrix, inverse, below, slow, where, part, more)
+    where, part, follows = (None, None, None) if e.conservative else (x, s, jnp.asarray(kind == "true", x.dtype))
+    return Tangent(matrix, inverse, below, slow, where, part, follows, more)
 
 
 #: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
-_Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix, tuple[Attached, ...]]
+_Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix, tuple[Attached | GivesWay, ...]]
 
 # A program has the two functions below several times: within jit they are traced once.
 
@@ -305,10 +310,10 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
             force = mixed_system.eliminated_points(e.mesh, volume.flow, A, motion, exactly)
         for own in K.attached:
             force = block_matrix.sums(force, attached.product(own, motion))
-        if following and K.x is not None:
+        if following and K.x is not None and K.follows is not None:
             dx = jnp.stack(motion, axis=-1)
             for a in following:
-                change = a.product(e.mesh, K.x, K.s, dx)
+                change = K.follows * a.product(e.mesh, K.x, K.s, dx)
                 force = block_matrix.sums(force, change.T)
         return _flat(e, force) if balance is None else jnp.concatenate([_flat(e, force), balance])
 
@@ -323,7 +328,7 @@ def solve(
         dq = _factorised(e, K, b)
         return dq, jnp.zeros((), jnp.int32), jnp.vdot(dq, b) >= 0
     # A block-triangular preconditioner is not symmetric either.
-    method = conjugate_gradients if K.x is None and e.mixed is None else stabilised_biconjugate_gradients
+    method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
     return dq, s.iterations, s.positive
 

@@ -17,8 +17,18 @@ class Attached(NamedTuple):
     blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric but for friction
 
 
-def product(A: Attached, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+class GivesWay(NamedTuple):
+    """What one number that adapts to the motion takes from a stiffness: -h h^T / size."""
+
+    h: jax.Array  # (V, 3) [N/m] force of the nodes for a unit of the number
+    size: jax.Array  # () [N/m] stiffness of the number by itself
+
+
+def product(A: Attached | GivesWay, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
     """Forces, columns (V,), of a motion given by its columns (V,)."""
+    if isinstance(A, GivesWay):
+        share = -sum(jnp.vdot(h, c) for h, c in zip(A.h.T, columns, strict=True)) / A.size
+        return tuple(share * A.h.T)
     moved = jnp.stack([c[A.nodes] for c in columns], axis=1)
     force = jnp.sum(A.blocks * moved[None, None], axis=(2, 3))
     total = jnp.zeros((len(columns[0]), 3), force.dtype).at[A.nodes].add(jnp.swapaxes(force, 1, 2))

@@ -13,7 +13,7 @@ import numpy as np
 from liverjax.core.struct import Number
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.solvers.attached import Attached
+from liverjax.solvers.attached import Attached, GivesWay
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
 
@@ -22,7 +22,11 @@ if TYPE_CHECKING:
 
 
 def solve(
-    A: BlockMatrix, free: jax.Array, b: jax.Array, normals: jax.Array | None = None, attached: tuple[Attached, ...] = ()
+    A: BlockMatrix,
+    free: jax.Array,
+    b: jax.Array,
+    normals: jax.Array | None = None,
+    attached: tuple[Attached | GivesWay, ...] = (),
 ) -> jax.Array:
     """Solution (m, V) of A x = b (m, V) for m x m blocks, 0 where `free` (m, V) is 0; NaN where A is singular.
 
@@ -40,7 +44,7 @@ def solve_points(
     free: tuple[jax.Array, jax.Array],
     b: tuple[jax.Array, jax.Array],
     normals: Number | None = None,
-    attached: tuple[Attached, ...] = (),
+    attached: tuple[Attached | GivesWay, ...] = (),
 ) -> jax.Array:
     """The same of quadratic elements, flat: positions (3 V,), and pressures of the vertices where A has them.
 
@@ -77,10 +81,10 @@ def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     return scipy.sparse.coo_array((values, (lines, columns)), shape=(size, size)).tocsr()
 
 
-def _entries(attached: tuple[Attached, ...], n: int) -> list[tuple]:
+def _entries(attached: tuple[Attached | GivesWay, ...], n: int) -> list[tuple]:
     """Values, lines and columns of elements between nodes, of unknowns in which all x of n nodes come first."""
     found = []
-    for nodes, blocks in attached:
+    for nodes, blocks in (own for own in attached if isinstance(own, Attached)):
         at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(-1, nodes.shape[1])
         found.append((blocks.reshape(len(at), len(at), -1), at[:, None], at[None]))
     return found
@@ -102,7 +106,17 @@ def _solve(*given: object) -> np.ndarray:
         more = [a.ravel() for a in np.broadcast_arrays(*entry)]
         values, lines, columns = [*values, more[0]], [*lines, more[1]], [*columns, more[2]]
     A = scipy.sparse.coo_array((np.concatenate(values), (np.concatenate(lines), np.concatenate(columns))))
-    return _one_solution(A.tocsr(), free.ravel(), b.ravel(), normals, abs(diagonal[0, 0]).mean()).reshape(m, n)
+    ways = _given_ways(attached, m * n)
+    return _one_solution(A.tocsr(), free.ravel(), b.ravel(), (normals, abs(diagonal[0, 0]).mean()), ways).reshape(m, n)
+
+
+def _given_ways(attached: tuple[Attached | GivesWay, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of all numbers that adapt, h (size, n) in the order of the unknowns and their own stiffness (n,)."""
+    found = [own for own in attached if isinstance(own, GivesWay)]
+    H = np.zeros((size, len(found)))
+    for column, own in zip(H.T, found, strict=True):
+        column[: own.h.size] = own.h.T.ravel()
+    return H, np.array([own.size for own in found])
 
 
 def _solve_points(order: int, *given: object) -> np.ndarray:
@@ -136,17 +150,23 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
     parts = [[a.ravel() for a in np.broadcast_arrays(*entry)] for entry in entries]
     values, lines, columns = (np.concatenate(a) for a in zip(*parts, strict=True))
     A = scipy.sparse.coo_array((values, (lines, columns)), shape=(len(known), len(known))).tocsr()
-    return _one_solution(A, known, load, normals, abs(element[0, 0]).mean()).astype(b[0].dtype)
+    ways = _given_ways(attached, len(known))
+    x = _one_solution(A, known, load, (normals, abs(element[0, 0]).mean()), ways)
+    return x.astype(b[0].dtype)
 
 
-def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, normals: Number, mean: float) -> np.ndarray:
-    """Solution (n,) of A x = b where `free` (n,) is not 0; `mean` stands for A along the normals."""
+def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
+    """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0, for `ways` H and S.
+
+    `along`: normals that x is 0 along, or None, and what stands for A along them.
+    """
     import scipy.sparse.linalg
 
+    (normals, mean), (H, size) = along, ways
     if normals is not None:
         N = across(np.asarray(normals), len(b))
         inside = scipy.sparse.eye_array(len(b)) - N
-        A = inside @ A @ inside + mean * N
+        A, H = inside @ A @ inside + mean * N, inside @ H
     keep = np.flatnonzero(free)
     A = A[keep][:, keep].tocsc()
     x = np.zeros_like(b)
@@ -154,6 +174,9 @@ def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, normals: Number, mean
         # The pattern is symmetric and so, nearly, is the best order of the unknowns.
         factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         x[keep] = factor.solve(b[keep])
-    except (RuntimeError, ValueError):  # singular, or not finite
+        if len(size):  # Sherman, Morrison and Woodbury
+            Z, H = factor.solve(H[keep]), H[keep]
+            x[keep] += Z @ np.linalg.solve(np.diag(size) - H.T @ Z, H.T @ x[keep])
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):  # singular, or not finite
         x[keep] = np.nan
     return x

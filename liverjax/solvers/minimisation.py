@@ -5,6 +5,9 @@ eigenvalues (`liverjax.elements.projection`); every step is shortened until the 
 falls from point to point, and near the minimum convergence is quadratic. A start with inverted elements is first
 untangled as a stable neo-Hookean body of the same moduli, whose energy is finite everywhere: so any law may start
 there.
+
+Forces without an energy, as those of friction, are held in each iteration as they are where it begins: so they have one
+for that iteration, and its gradient there is the residual.
 """
 
 from typing import NamedTuple
@@ -23,6 +26,9 @@ _ROUNDOFF = 5e3
 _PATIENCE = 8
 #: Most iterations on the energy, and most shortenings of one of them.
 _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
+#: Farther away than this, over the forces at work, a true tangent without symmetry is not tried: BiCGSTAB does not tell
+#: that it is not positive, and takes all its iterations.
+_NEAR = 0.1
 #: Residual at which a surrogate body is untangled enough.
 _UNTANGLED = 1e-4
 
@@ -97,12 +103,14 @@ def _evaluated(
 ) -> _Descent:
     r, force, by = problem.residual(q, jnp.ones((), q.dtype))
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
-    energy = _potential(problem).energy(q)
+    energy = _potential(problem).energy(q, q)
     return _Descent(q, energy, r, relative, by, definite, patience, indefinite, jnp.array(False), *counts)
 
 
 def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     one, definite = jnp.ones((), c.q.dtype), c.definite > 0
+    if not problem.symmetric:
+        definite = definite | (c.relative > _NEAR)
     K = jax.lax.cond(
         definite,
         lambda: _potential(problem).definite(c.q, one, c.by, None),
@@ -134,7 +142,7 @@ def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usab
 
     def good(t):
         q = c.q + t * dq
-        energy = _potential(problem).energy(q)
+        energy = _potential(problem).energy(q, c.q)
         falls = energy <= c.energy + _FALL * t * slope
         level = abs(energy - c.energy) <= _ROUNDOFF * jnp.finfo(c.q.dtype).eps * abs(c.energy)
         better = jnp.linalg.norm(problem.residual(q, one)[0]) < size

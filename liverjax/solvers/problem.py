@@ -69,8 +69,8 @@ class Problem(NamedTuple):
 class Potential(NamedTuple):
     """The energy of a step, for steps that cannot be followed."""
 
-    #: q -> energy of which r(q, 1) is the gradient.
-    energy: Callable[[jax.Array], jax.Array]
+    #: (q, start) -> energy whose gradient at start is r(start, 1). Forces without an energy are held as at start.
+    energy: Callable[[jax.Array, jax.Array], jax.Array]
     #: As `Problem.tangent`, of a matrix without negative eigenvalues.
     definite: Callable[[jax.Array, jax.Array, Any, Any], Any]
     #: (q, s) -> the least J of an element: not above 0 where elements are inverted.

@@ -12,6 +12,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
+from liverjax.physics.contact.friction import RoughObstacle
+from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import prescribed
@@ -204,7 +206,7 @@ def _small(scene: Scene, mass: str) -> Scene:
         raise InputError(
             '[mesh] is = "loaded" has no harmonic motion: take the scene of lj.unloaded(scene), and its run as about'
         )
-    if not all(physics.conservative for physics in scene.physics):
+    if any(isinstance(physics, RoughObstacle | PressedObstacle) for physics in scene.physics):
         raise InputError(
             "friction and pressed obstacles have no harmonic motion here: leave them out, or run the scene in time"
         )

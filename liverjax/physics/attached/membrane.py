@@ -8,6 +8,7 @@ Source: Holzapfel, Eberlein, Wriggers and Weizsaecker 1996, "A new axisymmetrica
 finite strain analysis of arteries", and Bonet and Wood 2008, section 6.6 (plane stress).
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -15,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content, Indices, Number, param, struct
+from liverjax.core.struct import Content, Indices, Number, param, replace, struct
 from liverjax.laws import layers
 from liverjax.laws.base import Law
-from liverjax.mesh import selection, surface
+from liverjax.mesh import promotion, selection, surface
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
@@ -60,6 +61,10 @@ class Membrane(Physics):
             raise InputError(f"{name}.thickness has shape {shape}: give one number, or one a triangle {len(numbers)}")
         layers.check(self.law, name)
 
+    def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Membrane":
+        """On the same triangles."""
+        return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
+
     def freeze(self, memory: Any, step: Step) -> "Stretched":
         """The incompressible part of the law, where it has one."""
         isochoric = self.law.isochoric_part()
@@ -97,7 +102,7 @@ class Stretched(Elements):
 
     def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Triangular root (m,) [m] of the metric of the reference triangles' edges."""
-        corners = jnp.moveaxis(mesh.points[self.triangles], 0, -1)
+        corners = jnp.moveaxis(mesh.points[self.triangles[:, :3]], 0, -1)
         first, second = corners[1] - corners[0], corners[2] - corners[0]
         r11 = jnp.sqrt(jnp.sum(first * first, axis=0))
         r12 = jnp.sum(first * second, axis=0) / r11

@@ -63,7 +63,9 @@ class RoughObstacle(Obstacle):
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
         """Keep the slip at the beginning of the step, and the places of the points relative to the obstacle."""
         moved = super().freeze(memory, step).moved
-        past = contact_points(self, step.mesh, step.x) - moved[0][:, None, None]
+        # At rest the positions that a run begins with are but a guess: the surface comes from the reference.
+        x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
+        past = contact_points(self, step.mesh, x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
         return Rubbing(
             obstacle=self,
@@ -98,17 +100,28 @@ class Rubbing(Touching):
 
     def slip_at(self, at: jax.Array, s: Number) -> jax.Array:
         """Elastic slip (3, Q, m) [m] of points (3, Q, m) at part s of the step."""
-        moved = self.now(s)
-        d = distances(self.obstacle, at, moved)
-        trial = self.slip + at - moved[:, None, None] - self.past
-        n = jnp.stack(d.normal)
-        trial = trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
-        most = self.friction * jnp.maximum(-d.value, 0.0)
-        size = jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
+        n, most = self._law(at, s)
+        trial = self._trial(at, s, n)
+        size = _of_slip(trial)
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
-    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Forces of the pressures and of the friction."""
+    def _law(self, at: jax.Array, s: Number) -> tuple[jax.Array, jax.Array]:
+        """Normals (3, Q, m), and the most slip (Q, m) [m] that the pressure bears."""
+        d = distances(self.obstacle, at, self.now(s))
+        return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
+
+    def _trial(self, at: jax.Array, s: Number, n: jax.Array) -> jax.Array:
+        """Slip (3, Q, m) [m] of points that all stick, along planes with normals n (3, Q, m)."""
+        trial = self.slip + at - self.now(s)[:, None, None] - self.past
+        return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
+
+    def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
+        """Where a surface just touches (1, 1, Q, m): the first guess is that it will be pressed, and stick."""
+        d = distances(self.obstacle, at, self.now(s))
+        return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
+        """Pressures, and the shear that holds back."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
@@ -117,14 +130,42 @@ class Rubbing(Touching):
         at, plain = self.points(x), super().attached(mesh, x, s)
         units = [jnp.zeros_like(at).at[j].set(1.0) for j in range(3)]
         H = jnp.stack([jax.jvp(lambda at: self.slip_at(at, s), (at,), (unit,))[1] for unit in units], axis=1)
-        d = distances(self.obstacle, at, self.now(s))
-        n = jnp.stack(d.normal)
-        sticks = jnp.eye(3)[:, :, None, None].astype(x.dtype) - n[:, None] * n[None]
-        # As with the pressure: where a surface just touches, the first guess is that it will be pressed, and stick.
-        guessed = just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0)
-        H = weighted_stiffness(self.obstacle, mesh)[None, None] * jnp.where(guessed[None, None], sticks, H)
-        return Attached(plain.nodes, plain.blocks + between_nodes(mesh, H))
+        return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
+
+    def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
+        """Half of stiffness times slip squared, up to the most slip that the pressure at `start` bears; then linear."""
+        one = jnp.ones((), x.dtype)
+        n, most = self._law(self.points(start), one)
+        size = _of_slip(self._trial(self.points(x), one, n))
+        stored = jnp.where(size > most, most * (size - 0.5 * most), 0.5 * size * size)
+        return self.energy(mesh, x) + jnp.sum(weighted_stiffness(self.obstacle, mesh) * stored)
+
+    def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
+        """Second derivative of that energy: a point that slides is held across its way alone."""
+        at, plain = self.points(x), super().definite(mesh, x, s)
+        n, most = self._law(at, s)
+        trial = self._trial(at, s, n)
+        size = _of_slip(trial)
+        slides, way = (size > most)[None, None], trial / size[None]
+        H = _planes(n) - jnp.where(slides, way[:, None] * way[None], 0.0)
+        H = jnp.where(slides, (most / size)[None, None], 1.0) * H
+        return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(n), H))
+
+    def _with_shear(self, mesh: TetMesh, plain: Attached, H: jax.Array) -> Attached:
+        """The stiffness of the pressures with that of the shear, H (3, 3, Q, m) over the contact's."""
+        shear = weighted_stiffness(self.obstacle, mesh)[None, None] * H
+        return Attached(plain.nodes, plain.blocks + between_nodes(mesh, shear))
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
         """Nothing is left: `attached` has the whole derivative."""
         return jnp.zeros_like(dx)
+
+
+def _of_slip(trial: jax.Array) -> jax.Array:
+    """Of slips (3, Q, m), never 0."""
+    return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
+
+
+def _planes(n: jax.Array) -> jax.Array:
+    """Projections (3, 3, Q, m) onto planes with normals n (3, Q, m)."""
+    return jnp.eye(3, dtype=n.dtype)[:, :, None, None] - n[:, None] * n[None]

@@ -10,6 +10,7 @@ triangle's size at a pressure of that stiffness. `lj.obstacle_forces` tells forc
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
 import jax
@@ -20,9 +21,10 @@ from jax.typing import DTypeLike
 from liverjax.core import history
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content, Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
-from liverjax.mesh import selection, surface
+from liverjax.mesh import promotion, selection, surface
+from liverjax.mesh.basis import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance
@@ -32,8 +34,8 @@ from liverjax.solvers.attached import Attached
 HARDNESS = 100.0
 #: Distance that counts as touching, over the size of a triangle.
 _TOUCHING = 1e-9
-#: Points of a triangle: barycentric coordinates (3, Q), equal weights; exact to degree 2.
-_POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
+#: Points of a triangle: weights and barycentric coordinates (3, Q), exact to degree 2.
+_POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
 
 @struct
@@ -85,7 +87,7 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse an unknown shape, wrong numbers or triangles, and a body that is not outside at the beginning."""
+        """A known shape, numbers that make one, and triangles of the mesh."""
         if self.shape not in SHAPES:
             raise InputError(f"{name} shape = {self.shape!r} is not known: use {', '.join(SHAPES)}")
         numbers = np.asarray(self.triangles)
@@ -100,6 +102,9 @@ class Obstacle(Physics):
         history.check(self.times, self.history, name)
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
             raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
+
+    def check_place(self, mesh: TetMesh, name: str) -> None:
+        """A body that is outside at the beginning; a loaded one may lie in it as deep as the contact leaves it."""
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         first = self.displacement(0, 1, 0.0)
         deepest = -float(np.min(np.asarray(_distances(self, mesh, mesh.points, first).value)))
@@ -131,8 +136,12 @@ class Obstacle(Physics):
         """The obstacle at time 0 of its history; without one it has not moved yet."""
         return replace(self, by=None) if self.history is None else self
 
+    def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Obstacle":
+        """On the same triangles."""
+        return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
+
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """Displacement (3,) [m] at the end of step k; step 0 is the beginning of the run."""
+        """(3,) [m] at the end of step k; step 0 is the beginning of the run."""
         zero = jnp.zeros(3)
         if self.history is not None:
             return zero + history.value_at(self.by, k * dt, self.times, self.history)
@@ -187,6 +196,13 @@ class Touching(NodalForce):
         )
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
+    def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
+        """Along the normal alone: what bends it is never positive."""
+        d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
+        k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
+        H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])
+        return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
+
 
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Gradient of the energy (V, 3) [N] at positions x (V, 3): the force of the nodes on the obstacle, `moved` (3,)."""
@@ -219,8 +235,13 @@ def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
 
 
 def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
-    """Functions of a triangle's nodes at its points (n, Q)."""
-    return jnp.asarray(surface.triangle_functions(mesh, _POINTS), dtype)
+    """Of a triangle's nodes at its points (n, Q)."""
+    return jnp.asarray(surface.triangle_functions(mesh, _rule(mesh)[1]), dtype)
+
+
+def _rule(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Between three points a surface of order 3 would pass into the obstacle."""
+    return triangle_rule() if mesh.order == 3 else _POINTS
 
 
 def contact_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
@@ -255,7 +276,7 @@ def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
 def weighted_stiffness(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Stiffness times reference area of every point (Q, m) [N/m]."""
     whole = _triangle_areas(obstacle, mesh) * obstacle.stiffness
-    return jnp.broadcast_to(whole / _POINTS.shape[1], (_POINTS.shape[1], *whole.shape))
+    return jnp.asarray(_rule(mesh)[0], whole.dtype)[:, None] * whole[None]
 
 
 def three_numbers(value: object, name: str) -> jax.Array:

@@ -5,7 +5,8 @@ The obstacle moves along its force alone. Its travel t follows from the balance 
     dE/dt(x, t) = F,
 
 E the energy of the contact at positions x. Eliminated, t(x) adds -h h^T / E_tt to the stiffness of the contact, with
-h = dE/dx dt. That is one dense matrix of rank one, so the product applies it and no matrix holds it.
+h = d2E/dx dt. That is one dense matrix of rank one, so no matrix holds it: products apply it, and a factorisation is
+corrected for it.
 """
 
 from collections.abc import Mapping
@@ -26,10 +27,12 @@ from liverjax.physics.contact.obstacle import (
     contact_points,
     distances,
     point_functions,
+    shared_out,
     three_numbers,
     touching_nodes,
     weighted_stiffness,
 )
+from liverjax.solvers.attached import GivesWay
 
 #: Most steps of the search for the place of the obstacle.
 _MOST_STEPS = 200
@@ -43,8 +46,6 @@ class PressedObstacle(Obstacle):
 
     keys: ClassVar[tuple[str, ...]] = (*(key for key in Obstacle.keys if key != "by"), "force")
     driven: ClassVar[str] = "force"
-    #: There is an energy, but the matrix of the solver does not have all of its second derivative.
-    conservative: ClassVar[bool] = False
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Mapping[str, object], name: str) -> Self:
@@ -53,7 +54,7 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse also no force, a given motion, a history of vectors, and an obstacle that never meets the body."""
+        """Besides: a force, no given motion, and factors as history."""
         super().check(mesh, name)
         history.check(self.times, self.history, name, (1,))
         if self.by is not None:
@@ -61,8 +62,13 @@ class PressedObstacle(Obstacle):
         force = np.asarray(self.force, float)
         if force.shape != (3,) or not np.all(np.isfinite(force)) or not np.any(force):
             raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
+
+    def check_place(self, mesh: TetMesh, name: str) -> None:
+        """Besides: a body in the way."""
+        super().check_place(mesh, name)
         if not self._meets(mesh):
-            raise InputError(f"{name} force = {force.tolist()} presses it past the body: turn it or move position")
+            force = np.asarray(self.force, float).tolist()
+            raise InputError(f"{name} force = {force} presses it past the body: turn it or move position")
 
     def _meets(self, mesh: TetMesh) -> bool:
         """Whether the obstacle comes to the surface on its way."""
@@ -136,8 +142,6 @@ class Pressing(Touching):
     functions: jax.Array | None = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
 
-    conservative: ClassVar[bool] = False  # type: ignore[misc]
-
     def points(self, x: jax.Array) -> jax.Array:
         """Points of contact (3, Q, m) at positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
@@ -195,9 +199,16 @@ class Pressing(Touching):
         depth = jnp.minimum(distances(self.obstacle, at, travel * self.direction).value, 0.0)
         return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
 
-    def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """-h (h . dx) / E_tt: the obstacle gives way."""
-        travel = self.travel(self.points(x), s)
-        h = jax.jvp(lambda t: self.force_at(mesh, x, t * self.direction), (travel,), (jnp.ones_like(travel),))[1]
-        slope = self._resistance(self.points(x), travel)[1]
-        return -h * (jnp.vdot(h, dx) / jnp.where(slope > 0, slope, 1.0))
+    def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
+        """By its travel; `definite`: what bends the normals is left out, as in the stiffness of the contact then."""
+        at = self.points(x)
+        d = distances(self.obstacle, at, self.travel(at, s) * self.direction)
+        along = self.hardness * (d.value < 0) * sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
+        pushes = jnp.stack([along * n for n in d.normal])
+        if not definite:
+            depth = self.hardness * jnp.minimum(d.value, 0.0)
+            pushes = pushes + depth[None] * jnp.einsum(
+                "ijqm,j->iqm", jnp.stack([jnp.stack(r) for r in d.bent]), self.direction
+            )
+        size = jnp.einsum("i,iqm->", self.direction, pushes)
+        return GivesWay(-shared_out(self.obstacle, mesh, x, pushes), jnp.where(size > 0, size, 1.0))
