@@ -14,6 +14,7 @@ from liverjax.elements import mjed, projection, reference
 from liverjax.scenes import regions
 from liverjax.scenes.scene import with_parameters
 from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation.run import prepared
 from liverjax.tensors.matrices import deformation_gradient, unpack
 from liverjax.tensors.subsets import in_subset, put_together, subsets
 
@@ -258,10 +259,6 @@ def test_scene_files_name_a_law_for_a_region():
             "region.1 changes the law of elements to which region.0",
         ),
         (
-            {"region": [{"where": {"z_min": 0.01}, "law": OGDEN}], "solve": {"volumetric": "nodal"}},
-            "averages volumes across regions",
-        ),
-        (
             {
                 "region": [
                     {"where": {"z_min": 0.01}, "law": {"name": "saint_venant_kirchhoff", "mu": 1.0, "lame_lambda": 1.0}}
@@ -276,6 +273,48 @@ def test_scene_files_name_a_law_for_a_region():
 def test_unusable_laws_of_regions_get_one_sentence(more, sentence):
     with pytest.raises(lj.InputError, match=sentence):
         scene_from(CONTENT | more)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_averaged_volumes_know_laws_of_several_kinds(order):
+    """Where all volume ratios are the same, averaging changes nothing: each element has the energy of its own law."""
+    from liverjax.physics.volumes import averaged
+
+    scene = prepared(pulled("static", lambda e: lj.Region(elements=e, law=replace(TUMOUR, volumetric="log"))))
+    mesh = scene.mesh if order == 1 else lj.quadratic(scene.mesh)
+    subsets, J = scene.law.subsets, 0.9
+    share = [float(jnp.sum(mesh.volumes[e[0]])) for e in subsets.elements]
+    own = averaged.nodal_energy(mesh, mesh.at_points(scene.law))
+    found = averaged.energy(mesh, own, jnp.full(mesh.weights.shape, J))
+    first, second = (law.bulk for law in scene.law.laws)
+    exact = share[0] * 0.5 * first * (J - 1) ** 2 + share[1] * 0.5 * second * np.log(J) ** 2
+    assert np.isclose(found, exact, rtol=1e-12)
+    p = averaged.averaged_pressure(mesh, own, jnp.full(mesh.weights.shape, J))
+    # Inside either part the pressure is its own law's.
+    assert np.isclose(p.min(), first * (J - 1), rtol=1e-12) or np.isclose(p.min(), second * np.log(J) / J, rtol=1e-12)
+    assert np.isclose(
+        jnp.sum(p * averaged._mean(mesh, jnp.ones(mesh.weights.shape))[1]),
+        sum(s * slope for s, slope in zip(share, (first * (J - 1), second * np.log(J) / J), strict=True)),
+        rtol=1e-12,
+    )
+
+
+@pytest.mark.slow
+def test_averaged_volumes_of_a_region_with_the_same_law_written_otherwise():
+    """Mooney-Rivlin without its second constant is neo-Hookean; and another number of one law is a law of its own."""
+    same = lj.laws.MooneyRivlin(c10=LIVER.mu / 2, c01=0.0, bulk=LIVER.bulk)
+    nodal = lj.Solve(volumetric="nodal", tolerance=1e-10)
+
+    def ends(region):
+        return lj.simulate(replace(pulled("static", region), solve=nodal)).check().positions[-1]
+
+    plain = lj.simulate(replace(pulled("static", lambda e: lj.Region(elements=e, law=same)), region=(), solve=nodal))
+    np.testing.assert_allclose(ends(lambda e: lj.Region(elements=e, law=same)), plain.positions[-1], atol=1e-12)
+    soft = ends(lambda e: lj.Region(elements=e, law={"bulk": 0.5 * LIVER.bulk}))
+    np.testing.assert_allclose(
+        ends(lambda e: lj.Region(elements=e, law=replace(same, bulk=0.5 * LIVER.bulk))), soft, atol=1e-12
+    )
+    assert np.abs(soft - plain.positions[-1]).max() > 1e-6
 
 
 def test_elements_named_twice_and_reduced_models_are_refused():

@@ -4,6 +4,8 @@ The volumetric energy is sum_a V_a U(J_a) over nodes, J_a the mean J of the elem
 volumes, V_a a quarter of these. There are about five times fewer nodes than elements, so five times fewer constraints
 where the bulk modulus is large. Pressure is p_a = U'(J_a), an element's the mean over its nodes; the stiffness is that
 at given pressures and G^T D^-1 G with D = V_a/U'': the system of a porous step in which nothing flows.
+
+Where elements have different volumetric energies, that of a node is their mean, weighted by volume.
 """
 
 from typing import Any
@@ -12,7 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import param, struct
-from liverjax.laws.base import Law, Sum, volumetric_part
+from liverjax.laws.base import Law, Sum, Volumetric, volumetric_part
+from liverjax.laws.by_region import ByRegion
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.tetrahedra import TetMesh
@@ -28,6 +31,24 @@ def _mean(mesh: TetMesh, J: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _invariants(law: Law, J: jax.Array) -> Any:
     return tuple(Invariants(J=J) for _ in law.laws) if isinstance(law, Sum) else Invariants(J=J)
+
+
+def nodal_energy(mesh: TetMesh, law: Law) -> Law:
+    """The volumetric energy of the nodes, with one bulk modulus a node (V,) where elements have different ones."""
+    U = volumetric_part(law)
+    if len(U.pieces()) == 1 and all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(U)):
+        return U
+    E = mesh.number_of_elements
+    found: dict[tuple, jax.Array] = {}
+    for k, own in enumerate(U.pieces()):
+        for part in own.summands():
+            bulk = jnp.broadcast_to(jnp.reshape(part.bulk, -1), (E,))
+            if isinstance(U, ByRegion):
+                bulk = jnp.zeros_like(bulk).at[U.subsets.elements[k][0]].set(bulk[U.subsets.elements[k][0]])
+            kind = (part.volumetric, part.below)
+            found[kind] = found.get(kind, 0.0) + _mean(mesh, bulk)[0]
+    parts = [Volumetric(bulk=bulk, volumetric=kind, below=below) for (kind, below), bulk in found.items()]
+    return parts[0] if len(parts) == 1 else Sum(laws=tuple(parts))
 
 
 def energy(mesh: TetMesh, law: Law, J: jax.Array) -> jax.Array:
@@ -60,15 +81,15 @@ class AveragedVolume(Physics):
     law: Law = param("1", "of which the volumetric part counts")
 
     def freeze(self, memory: Any, step: Step) -> "Averaged":
-        """The law itself."""
-        return Averaged(law=self.law)
+        """The energy of the nodes."""
+        return Averaged(law=nodal_energy(step.mesh, self.law))
 
 
 @struct
 class Averaged(VolumeStress):
     """Averaged volumes during a step."""
 
-    law: Law = param("1", "of which the volumetric part counts")
+    law: Law = param("1", "volumetric energy of the nodes")
 
     def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
         """See `pressure` of this module."""
