@@ -93,7 +93,7 @@ def node_blocks(e: Equations) -> Block | None:
     return total
 
 
-def _attached(e: Equations, x: jax.Array, s: Any, kind: str) -> tuple[Attached | GivesWay, ...]:
+def _attached(e: Equations, x: jax.Array, s: Number, kind: str) -> tuple[Attached | GivesWay, ...]:
     """Stiffness of elements between nodes that the physics bring, and what takes from it."""
     found: list[Attached | GivesWay | None] = []
     for a in e.nodal:
