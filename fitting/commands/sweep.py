@@ -188,7 +188,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _master(options: argparse.Namespace) -> tuple["Sweep", dict]:
-    """The master curve of the files, written and printed, and its part of fit.json."""
+    """Write and print the master curve of the files; return it with its part of fit.json."""
     from fitting.master import master_curve, master_report, temperature_sweeps
     from fitting.readers import rheometer
 

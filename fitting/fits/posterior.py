@@ -1,7 +1,7 @@
 """Samples of the posterior of a fit, from the data and a stated prior.
 
 The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. Without
-deviations its prior is 1 / s. With deviations it is 1 / s above 1: they are believed, and only ever enlarged.
+deviations its prior is 1 / s. With deviations it is 1 / s above 1: the deviations may be enlarged, never reduced.
 """
 
 import time

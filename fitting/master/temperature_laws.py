@@ -26,7 +26,7 @@ class TemperatureLaw(NamedTuple):
 
 
 def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
-    """The laws that enough temperatures determine, the nearest first; none of fewer than three temperatures."""
+    """The laws that the temperatures determine, best fit first. Fewer than three temperatures determine none."""
     T = shifts.temperatures
     T0 = T[shifts.reference]
     if len(T) < 3:

@@ -91,7 +91,7 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 
 
 def natural_fluid(u: Array) -> Maxwell:
-    """Model without an equilibrium modulus from u (2N,): like `natural`, with the last mode as its rest."""
+    """Model without an equilibrium modulus from u (2N,): like `natural`, but the last mode takes its place."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 

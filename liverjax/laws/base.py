@@ -223,11 +223,11 @@ class Sum(Law):
         return first, second
 
     def shear_modulus(self):
-        """Sum of the summands'."""
+        """The sum over all laws."""
         return sum(law.shear_modulus() for law in self.laws)
 
     def bulk_modulus(self):
-        """Sum of the summands'."""
+        """The sum over all laws."""
         return sum(law.bulk_modulus() for law in self.laws)
 
 

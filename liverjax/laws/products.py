@@ -1,4 +1,4 @@
-"""Laws as the chapter decomposes them (section 4.1.2 i): sums of products g(I1, I2) h(J), functions of such sums."""
+"""Laws as the chapter writes them (section 4.1.2 i): sums of products g(I1, I2) h(J), and functions of such sums."""
 
 from collections.abc import Callable
 from math import comb

@@ -70,7 +70,7 @@ def _finite(e: Equations) -> Equations:
 def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
     """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step.
 
-    `kept` is the tangent of the last step, `near` one whose coarse space will do for derivatives.
+    `kept` is the tangent of the last step; derivatives may take the coarse space of `near`.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(

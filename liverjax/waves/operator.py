@@ -42,7 +42,7 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 
 
 class Operator(NamedTuple):
-    """Matrices of every element with n nodes, and what acts at nodes."""
+    """Matrices of every element with n nodes, and the matrices of nodes."""
 
     points: jax.Array  # (V, 3) [m] where the nodes are
     nodes: jax.Array  # (n, E)

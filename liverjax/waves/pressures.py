@@ -142,7 +142,7 @@ def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def _pull(mesh: TetMesh, g: list) -> jax.Array:
-    """(n, 3, 4, E): forces on the nodes of pressures of the corners, from forces g (3,) of 1 Pa on the corners."""
+    """Forces (n, 3, 4, E) on the nodes by pressures at the corners, from the forces g (3,) of 1 Pa at each corner."""
     own = mesh.weights[None, None] * jnp.stack([jnp.stack(vector) for vector in g])  # (4, 3, E), or (4, 3, Q, E)
     if mesh.order == 1:
         return jnp.broadcast_to(own[:, :, None] / 4, (4, 3, 4, mesh.number_of_elements))
