@@ -9,7 +9,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
 from liverjax.physics.contact.friction import RoughObstacle
@@ -59,9 +59,9 @@ class Harmonic:
 def harmonic(
     scene: Scene,
     frequencies_Hz: Any = None,
-    factors: Any = None,
+    factors: Number | None = None,
     about: jax.Array | None = None,
-    motion: Any = None,
+    motion: Number | None = None,
     mass: str = "consistent",
 ) -> Harmonic:
     """Small motion of the scene at these frequencies, driven by its tractions, prescribed motions and inlets.

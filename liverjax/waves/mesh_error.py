@@ -1,12 +1,10 @@
 """Error of harmonic motion by its mesh: the same problem is solved in the next richer space of functions."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import Number, replace
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.enriched import enriched
@@ -15,7 +13,11 @@ from liverjax.waves.harmonic import Harmonic, harmonic
 
 
 def harmonic_mesh_error(
-    scene: Scene, found: Harmonic, factors: Any = None, about: jax.Array | None = None, motion: Any = None
+    scene: Scene,
+    found: Harmonic,
+    factors: Number | None = None,
+    about: jax.Array | None = None,
+    motion: Number | None = None,
 ) -> jax.Array:
     """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
 

@@ -13,12 +13,13 @@ supports, membranes and springs. Pressures that are unknowns beside the motion: 
 from functools import cache
 from itertools import product
 from math import factorial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.laws.base import Law, volumetric_part
 from liverjax.laws.terms import invariant_terms
@@ -173,7 +174,7 @@ def _exponents(vertex: list[tuple], *which: int) -> tuple:
 Motion = tuple[jax.Array, jax.Array | None]
 
 
-def forces_of_motion(A: Operator, factor: Any, omega: Any, motion: Motion) -> Motion:
+def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
     """Forces (V, 3) complex [N] of a motion, and the balance (P,) [m^3] where there are pressures.
 
     Args:
@@ -201,13 +202,13 @@ def forces_of_motion(A: Operator, factor: Any, omega: Any, motion: Motion) -> Mo
     return total + _of_nodes_alone(A, omega, u), balance
 
 
-def _stored(own: Pressures, omega: Any, near: jax.Array) -> jax.Array:
+def _stored(own: Pressures, omega: Number, near: jax.Array) -> jax.Array:
     """(store + flow / (i omega)) p of every element's vertices, (4, E) [m^3]."""
     stored = jnp.einsum("vwe,we->ve", own.store, near)
     return stored if own.flow is None else stored + jnp.einsum("vwe,we->ve", own.flow, near) / (1j * omega)
 
 
-def _of_nodes_alone(A: Operator, omega: Any, u: jax.Array) -> jax.Array:
+def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
     """Forces (V, 3) [N] of lumped masses, springs and elements between nodes."""
     total = jnp.zeros_like(u)
     if A.mass is not None and A.mass.ndim == 1:

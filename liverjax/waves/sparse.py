@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.struct import Number
 from liverjax.solvers import multifrontal
 from liverjax.solvers.direct import across
 from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_part
@@ -84,7 +85,7 @@ class _Sparse(NamedTuple):
     size: int
 
 
-def _host(*given: Any) -> np.ndarray:
+def _host(*given: object) -> np.ndarray:
     A, factors, omegas, b = jax.tree.map(np.asarray, given)
     system, plan, matrix, x = _system(A, b.shape[1]), None, _digest(A), np.zeros_like(b)
     for f, omega in enumerate(omegas):
@@ -200,10 +201,10 @@ def _of_pressures(own: Any, at: np.ndarray, V: int) -> tuple[list, list]:
     line, column = (a.ravel() for a in np.broadcast_arrays(at[:, :, None], p[None, None]))
     among = [a.ravel() for a in np.broadcast_arrays(p[:, None], p[None])]
 
-    def pulled(m: Any, w: float) -> np.ndarray:
+    def pulled(m: Number, w: float) -> np.ndarray:
         return own.pull.ravel() + 0j
 
-    def stored(m: Any, w: float) -> np.ndarray:
+    def stored(m: Number, w: float) -> np.ndarray:
         flow = 0.0 if own.flow is None else own.flow / (1j * w)
         return -(own.store + flow).ravel() + 0j
 
