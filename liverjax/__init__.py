@@ -25,7 +25,7 @@ from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.files import read_mesh, write_mesh
 from liverjax.mesh.promotion import quadratic
-from liverjax.mesh.refinement import refined
+from liverjax.mesh.refinement import refined, rim
 from liverjax.mesh.tetrahedra import TetMesh, check_mesh, tet_mesh
 from liverjax.physics import boundary, viscosity
 from liverjax.physics.boundary import Displaced, Fixed, Traction
@@ -91,6 +91,7 @@ __all__ = [
     "reduced_positions",
     "reference",
     "refined",
+    "rim",
     "save_reduced",
     "separate",
     "separated_displacement",

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.simulation.automatic import qualities
 from liverjax.tensors.matrices import deformation_gradient, pack
 
 SHAPES = {
@@ -55,6 +57,36 @@ def test_refined_meshes_fill_the_same_body():
     twice = lj.refined(quadratic)
     assert twice.order == 2
     np.testing.assert_array_equal(twice.points, lj.quadratic(fine).points)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+def test_meshes_refined_near_nodes_are_whole(shape):
+    """Twice at the edge of a held face: faces fit, the body is the same, elements stay round, held faces stay held."""
+    mesh = SHAPES[shape]()
+    mesh = replace(mesh, node_sets={"bottom": np.flatnonzero(np.isclose(np.asarray(mesh.points)[:, 2], 0.0))})
+    surface = _area(mesh)
+    for _ in range(2):
+        near = lj.rim(mesh, mesh.node_sets["bottom"])
+        fine = lj.refined(mesh, near=near)
+        lj.check_mesh(fine)
+        # A node that hangs on a neighbour's face would leave faces of one element inside the body.
+        assert np.isclose(_area(fine), surface, rtol=1e-12)
+        assert np.isclose(fine.volumes.sum(), mesh.volumes.sum(), rtol=1e-13) and fine.volumes.min() > 0
+        assert mesh.number_of_elements < fine.number_of_elements < 8 * mesh.number_of_elements
+        before, after = (set(map(tuple, np.asarray(m.pattern.edges).T)) for m in (mesh, fine))
+        assert not any(set(edge) & set(near.tolist()) for edge in before & after)
+        bottom = np.flatnonzero(np.isclose(np.asarray(fine.points)[:, 2], 0.0))
+        assert sorted(np.asarray(fine.node_sets["bottom"])) == sorted(bottom)
+        # Bisection at the longest edge makes few shapes: the worst element loses less than a half of its quality.
+        quality = [qualities(np.asarray(m.points), np.asarray(m.tetrahedra), m.volumes).min() for m in (mesh, fine)]
+        assert quality[1] > 0.5 * quality[0]
+        mesh = fine
+    assert lj.refined(lj.quadratic(SHAPES[shape]()), near=[0]).order == 2
+
+
+def _area(mesh: lj.TetMesh) -> float:
+    corners = np.asarray(mesh.points)[lj.boundary.boundary_triangles(mesh)]
+    return float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum())
 
 
 def test_affine_field_has_its_gradient():

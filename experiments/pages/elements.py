@@ -54,7 +54,9 @@ def table() -> str:
     for r in livers:
         adds = f"{1e3 * r['change']:+.2g} mm" + ("" if r["found"] else ", with corners inside out")
         rows.append(f"| {r['form']} | {r['elements']:,} | {1e3 * r['value']:.2f} mm | {adds} | {r['run_s']:.2g} s |")
-    return "\n".join([*rows, *_phantom(), *_cheapest(data["rows"]), *_iterations(data), *_sponge(data)])
+    return "\n".join(
+        [*rows, *_phantom(), *_cheapest(data["rows"]), *_iterations(data), *_sponge(data), *_thin_cells(data)]
+    )
 
 
 def _phantom() -> list[str]:
@@ -69,7 +71,32 @@ def _phantom() -> list[str]:
         form = "linear" if r["order"] == 1 else "quadratic"
         values = f"{r['largest_mm']:.2f} mm | {r['mean_mm']:.2f} mm" if r["code"] == "converged" else "|"
         rows.append(f"| {form} | {r['elements']:,} | {r['steps']} | {values} | {r['smallest_J']:.2g} | {r['code']} |")
+    if len(data.get("clamps", [])) < 3:
+        return rows
+    rows += [
+        "",
+        "Under a quarter of that load, 0.5 m/s2, quadratic elements, refined at the edges of the clamps alone:",
+        "",
+    ]
+    rows += [
+        "| refined | number | largest | mean of 1,369 nodes | off the limit | smallest J | run (CPU) |",
+        "|---" * 7 + "|",
+    ]
+    limit = _limit([r["largest_mm"] for r in data["clamps"]])
+    for r in data["clamps"]:
+        off = f"{100 * (r['largest_mm'] / limit - 1):+.2g} %"
+        rows.append(
+            f"| {r['rims']} times | {r['elements']:,} | {r['largest_mm']:.3f} mm | {r['mean_mm']:.3f} mm | {off} "
+            f"| {r['smallest_J']:.2g} | {r['cpu_s']:.2g} s |"
+        )
+    rows += ["", f"Their limit, by what the last two refinements added, is {limit:.2f} mm."]
     return rows
+
+
+def _limit(values: list[float]) -> float:
+    """Of values whose differences fall by one factor: of the last two differences."""
+    a, b = values[-2] - values[-3], values[-1] - values[-2]
+    return values[-1] + b * (b / a) / (1 - b / a)
 
 
 def _cheapest(rows: list[dict]) -> list[str]:
@@ -112,6 +139,23 @@ def _sponge(data: dict) -> list[str]:
         rows.append(
             f"| {r['form']} | {r['elements']:,} | {r['permeability']:g} | {r['newton']} | {r['linear']} "
             f"| {r['run_s']:.2g} s |"
+        )
+    return rows
+
+
+def _thin_cells(data: dict) -> list[str]:
+    """Of plates of flat cells."""
+    if "flat cells" not in data:
+        return []
+    rows = [
+        "",
+        "Mixed elements in plates of 6 x 6 x 6 flat cells, glued below, the top moved aside and down, one step:",
+        "",
+    ]
+    rows += ["| elements | K/mu | cells as wide as thick, times | Newton | linear | run |", "|---" * 6 + "|"]
+    for r in data["flat cells"]:
+        rows.append(
+            f"| {r['form']} | {r['ratio']:g} | {r['aspect']:g} | {r['newton']} | {r['linear']} | {r['run_s']:.2g} s |"
         )
     return rows
 

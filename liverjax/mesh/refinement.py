@@ -1,33 +1,105 @@
-"""A finer mesh: every tetrahedron cut into eight of half its size."""
+"""A finer mesh: every tetrahedron cut into eight of half its size, or those near some nodes cut in two."""
 
 import numpy as np
 
+from liverjax.core.struct import Indices
 from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.basis import FACES
 from liverjax.mesh.promotion import of_faces, quadratic
+from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 
-def refined(mesh: TetMesh) -> TetMesh:
+def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     """The mesh with every tetrahedron cut into eight (Bey 1995), of the same order; host side.
 
     The old vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`: the vertices
     are the nodes of `quadratic(mesh)`. A node set takes in the new nodes on all faces that it holds. Curved surfaces
     stay as they were drawn: refinement does not bring them nearer to the organ.
+
+    Args:
+        near: node numbers (n,). With them only the edges that meet these nodes are halved, and as many others as keep
+            the mesh whole: an element is cut at its longest edge first (Rivara 1984), so elements stay as round as
+            they were. `rim` gives the nodes around a clamp, where most of a mesh's error is.
     """
     V = mesh.number_of_vertices
-    points, tets = np.asarray(mesh.points)[:V], np.asarray(mesh.tetrahedra)
-    a, b, c, d = tets.T
-    middle = dict(zip(PAIRS, V + np.asarray(mesh.pattern.element_edges), strict=True))
-    ab, ac, ad, bc, bd, cd = (middle[pair] for pair in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)))
+    points, (low, high) = np.asarray(mesh.points)[:V], np.asarray(mesh.pattern.edges)
+    halved = np.ones(len(low), bool) if near is None else _halved(mesh, np.asarray(near))
+    middle = np.where(halved, V - 1 + np.cumsum(halved), -1)
+    tets = _eighths(mesh, middle) if near is None else _bisected(mesh, middle)
+    sets = {}
+    for name, nodes in mesh.node_sets.items():
+        own = np.asarray(nodes)[np.asarray(nodes) < V]
+        new = middle[of_faces(mesh, own)[len(own) :] - V]
+        sets[name] = np.concatenate([own, new[new >= 0]])
+    made = tet_mesh(np.vstack([points, 0.5 * (points[low] + points[high])[halved]]), tets, sets)
+    return quadratic(made) if mesh.order > 1 else made
+
+
+def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
+    """Those of some surface nodes (n,) at the edge of the surface that they hold, (m,): where strain is largest."""
+    held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
+    triangles = boundary_triangles(mesh, held)
+    sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
+    sides, count = np.unique(sides, axis=0, return_counts=True)
+    return np.union1d(sides[count == 1], np.setdiff1d(held, triangles)).astype(int)
+
+
+def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
+    """Elements (8 E, 4) of the numbers (N,) of the edges' middles."""
+    a, b, c, d = np.asarray(mesh.tetrahedra).T
+    ab, ac, ad, bc, bd, cd = middle[np.asarray(mesh.pattern.element_edges)]
     children = [
         *([a, ab, ac, ad], [ab, b, bc, bd], [ac, bc, c, cd], [ad, bd, cd, d]),
         *([ab, ac, ad, bd], [ab, bc, ac, bd], [ac, ad, bd, cd], [ac, bc, cd, bd]),
     ]
+    return np.stack(children).transpose(2, 0, 1).reshape(-1, 4)
+
+
+def _by_length(mesh: TetMesh) -> np.ndarray:
+    """Places (N,) of the edges by length: no two are equal, so two elements cut the face between them alike."""
     low, high = np.asarray(mesh.pattern.edges)
-    vertices = {name: np.asarray(nodes)[np.asarray(nodes) < V] for name, nodes in mesh.node_sets.items()}
-    made = tet_mesh(
-        np.vstack([points, 0.5 * (points[low] + points[high])]),
-        np.stack(children).transpose(2, 0, 1).reshape(-1, 4),
-        {name: of_faces(mesh, nodes) for name, nodes in vertices.items()},
-    )
-    return quadratic(made) if mesh.order > 1 else made
+    points = np.asarray(mesh.points)
+    # Rounded, so that edges of one length are told by their number on every machine.
+    lengths = np.linalg.norm(points[low] - points[high], axis=1).astype(np.float32)
+    place = np.empty(len(low), int)
+    place[np.argsort(lengths, kind="stable")] = np.arange(len(low))
+    return place
+
+
+def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
+    """Which edges (N,) are halved: at the nodes, and the longest of every element and face that has a halved one."""
+    edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
+    groups = [edges, *(edges[[k for k, pair in enumerate(PAIRS) if set(pair) <= set(face)]] for face in FACES)]
+    longest = [np.take_along_axis(g, place[g].argmax(axis=0)[None], axis=0)[0] for g in groups]
+    halved = np.logical_or(*np.isin(np.asarray(mesh.pattern.edges), near))
+    while True:
+        before = halved.sum()
+        for group, first in zip(groups, longest, strict=True):
+            halved[first[halved[group].any(axis=0)]] = True
+        if halved.sum() == before:
+            return halved
+
+
+def _bisected(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
+    """Elements (m, 4), cut in two at their longest halved edge until no edge is left to cut."""
+    V, place = mesh.number_of_vertices, _by_length(mesh)
+    low, high = np.asarray(mesh.pattern.edges).astype(np.int64)
+    code = low * V + high  # in ascending order
+    tets, done = np.asarray(mesh.tetrahedra).astype(np.int64), []
+    while len(tets):
+        ends = np.stack([np.sort(tets[:, pair], axis=1) for pair in map(list, PAIRS)])
+        wanted = np.where((ends < V).all(axis=2), ends[..., 0] * V + ends[..., 1], -1)
+        edge = np.minimum(np.searchsorted(code, wanted), len(code) - 1)
+        rank = np.where((code[edge] == wanted) & (middle[edge] >= 0), place[edge], -1)
+        slot, every = rank.argmax(axis=0), np.arange(len(tets))
+        whole = rank[slot, every] < 0
+        done.append(tets[whole])
+        tets, edge, slot = tets[~whole], edge[slot, every][~whole], slot[~whole]
+        halves = []
+        for end in np.array(PAIRS)[slot].T:
+            half = tets.copy()
+            half[np.arange(len(half)), end] = middle[edge]
+            halves.append(half)
+        tets = np.concatenate(halves)
+    return np.concatenate(done)
