@@ -10,7 +10,8 @@ def tests() -> str:
     for r in found["rows"]:
         order = "" if r["order"] is None else f"{r['order']:.2f}"
         file, name = r["test"].split("::")
-        cells = (r["benchmark"], r["source"], f"{r['difference']:.1e}", f"{r['allowed']:.0e}", order)
+        off = f"{r['difference']:.1e}" + (f" (the mesh's bar {r['bar']:.1e})" if "bar" in r else "")
+        cells = (r["benchmark"], r["source"], off, f"{r['allowed']:.0e}", order)
         rows.append("| " + " | ".join(cells) + f" | `{file.removeprefix('tests/')}` `{name.split('[')[0]}` |")
     return "\n".join(rows)
 
