@@ -6,7 +6,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.solvers import newton, step_cutting
-from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve
+from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve, started, symmetric_solve
 from liverjax.solvers.problem import Problem, StepOptions
 
 RNG = np.random.default_rng(0)
@@ -86,6 +86,78 @@ def test_newton_halves_a_step_that_overshoots():
     # From 3 the full Newton step for atan leaves every bound.
     x, s = newton.newton_root(jnp.arctan, jnp.array([3.0]), _none, 1.0, newton.NewtonOptions(tolerance=1e-12))
     assert s.status == status.CONVERGED and abs(x[0]) < 1e-12
+
+
+def test_a_solve_begun_near_its_solution_is_as_exact_and_takes_less():
+    exact = jnp.linalg.solve(A, b)
+    taken = []
+
+    def solver(b, tolerance):
+        x, s = conjugate_gradients(lambda v: A @ v, b, _none, tolerance, 100)
+        taken.append(int(s.iterations))
+        return x, s.residual
+
+    for near in (jnp.zeros(20), exact + 1e-5 * b, 1e3 * b):  # the last is farther away than 0: left out
+        x, residual = started(solver, lambda v: A @ v, b, near, 1e-10)
+        left = float(jnp.linalg.norm(b - A @ x) / jnp.linalg.norm(b))
+        assert left < 1e-10 and np.isclose(float(residual), left, rtol=1e-3)
+    assert taken[1] < taken[0] == taken[2]
+
+
+def test_derivatives_handed_from_step_to_step():
+    """x_k = A^-1 (x_(k-1)^2 + p): the next solve begins where the last ended, in both modes, and changes no number."""
+    near = []
+
+    def solver(b, guess):
+        jax.debug.callback(lambda a: near.append(np.asarray(a)), guess)
+        return jnp.linalg.solve(A, b), jnp.zeros(())
+
+    def end(p, handed):
+        x, last = jnp.zeros(20), (jnp.zeros(20), jnp.zeros(20))
+        for _ in range(3):
+            both = (x**2 + p, last)
+            x, last = symmetric_solve(lambda u: (A @ u[0], u[1]), both, solver, 1e-10)
+            last = last if handed else (jnp.zeros(20), jnp.zeros(20))
+        return jnp.sum(x**3)
+
+    plain, handed = (jax.grad(lambda p, h=h: end(p, h))(b) for h in (False, True))
+    jax.effects_barrier()
+    assert np.allclose(plain, handed, rtol=1e-12, atol=0)
+    # Reverse mode: the first solve of the way back begins at 0, the next at twice the first solution, then on the line.
+    assert not near[-3].any() and near[-2].any() and near[-1].any()
+    forward = jax.jvp(lambda p: end(p, True), (b,), (jnp.ones(20),))[1]
+    assert np.isclose(forward, plain.sum(), rtol=1e-12)
+
+
+def test_a_guess_takes_up_what_the_last_steps_foretold():
+    """Roots 1 + k/10 + k^2/20, guessed straight on: always short by 1/10, which the third guess makes up for."""
+
+    def root(k):
+        return 1 + 0.1 * k + 0.05 * k**2
+
+    def run(forgetful):
+        q, before, kept, taken = jnp.ones(1), jnp.ones(1), None, []
+        for k in range(1, 7):
+            new, s, kept = step(jnp.asarray(float(k)), q, 2 * q - before, kept)
+            q, before = new, q
+            kept = kept._replace(trust=0 * kept.trust) if forgetful else kept
+            taken.append(int(s.iterations))
+        return float(q[0]), taken
+
+    @jax.jit
+    def step(k, start, guess, kept):
+        method = Problem(
+            residual=lambda q, s: (q**3 - root(k) ** 3, jnp.ones(()), None),
+            tangent=lambda q, s, by, near: 3 * q**2,
+            solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32), jnp.array(True)),
+            preconditioner=lambda K: lambda r: r / K,
+            moved=False,
+        )
+        return step_cutting.solve(method, start, StepOptions(), guess, kept)
+
+    (end, taken), (same, more) = run(False), run(True)
+    assert np.isclose(end, root(6), rtol=1e-8) and np.isclose(same, root(6), rtol=1e-8)
+    assert taken[:2] == more[:2] and all(a < b for a, b in zip(taken[3:], more[3:], strict=True))
 
 
 def test_lanes_do_not_disturb_each_other():

@@ -124,6 +124,25 @@ def test_darcys_laplacian_and_its_polynomial():
         assert eigenvalues.min() > least and eigenvalues.max() < 1.1
 
 
+def test_pressures_from_a_guess():
+    """Near or far, a guess changes neither pressures nor derivatives; a near one lets a looser solve be as exact."""
+    sponge = replace(SPONGE, drained=MESH.node_sets["z_max"])
+    J, b = jnp.ones(MESH.number_of_elements), jnp.asarray(1e-6 * rng.standard_normal(MESH.number_of_nodes))
+
+    def pressures(rate, guess):
+        F = deformation_gradient(MESH, X)
+        flow = darcy.flow(replace(sponge, permeability=rate), MESH, J, F, 0.05, 1e-10)
+        return jnp.sum(darcy.solved(MESH, flow, b, guess) ** 3)
+
+    value = jax.jit(jax.value_and_grad(pressures))
+    plain, slope = value(2e-5, None)
+    at = jax.jit(lambda: darcy.flow(sponge, MESH, J, deformation_gradient(MESH, X), 0.05, 1e-12))()
+    exact = jax.jit(lambda: darcy.solved(MESH, at, b))()
+    for guess in (darcy.Guess(exact, 1e5), darcy.Guess(1e3 * exact[::-1], 1.0)):
+        again, same = value(2e-5, guess)
+        assert np.isclose(again, plain, rtol=1e-8) and np.isclose(same, slope, rtol=1e-8)
+
+
 def test_chebyshev_meets_its_bound():
     d = jnp.asarray(rng.uniform(1, 2, 30))
     Q = np.linalg.qr(rng.standard_normal((30, 30)))[0]

@@ -26,6 +26,7 @@ import numpy as np
 from liverjax.core.struct import Indices, Number
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.darcy import Guess
 from liverjax.solvers.attached import Attached, GivesWay
 from liverjax.solvers.attached import definite as without_negative
 from liverjax.solvers.block_matrix import Block, BlockMatrix
@@ -134,8 +135,8 @@ class VolumeStress:
     #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`), not solved for on the way.
     unknown: ClassVar[bool] = False
 
-    def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,)."""
+    def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
+        """Pressures (V,) [Pa] of a step that ends with volume ratios J (E,); `guess` to begin a solve with."""
         raise TypeError(f"{type(self).__name__} lacks pressure(mesh, J)")
 
     def stress(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Matrix:

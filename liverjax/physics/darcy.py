@@ -80,21 +80,31 @@ def right_side(flow: Flow, b: jax.Array) -> jax.Array:
     """The part of b (V,) for the free pressures: inflow added, the effect of given pressures subtracted."""
     if flow.enters is not None:
         b = b + flow.enters
-    return flow.mask * (b if flow.given is None else b - _product(flow, flow.given))
+    return flow.mask * (b if flow.given is None else b - flow_product(flow, flow.given))
 
 
-def with_given(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
+class Guess(NamedTuple):
+    """Pressures to begin a solve with, and how exact it need be."""
+
+    pressure: jax.Array  # (V,) [Pa], without derivative
+    looser: Number  # tolerance over that of the flow
+
+
+def with_given(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
     """All pressures (V,) [Pa], with the given ones."""
-    P = solved(mesh, flow, right_side(flow, b))
+    P = solved(mesh, flow, right_side(flow, b), guess)
     return P if flow.given is None else P + flow.given
 
 
-def solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
-    """A^-1 b for b (V,), A the matrix of the pressure, to the tolerance of the flow; has derivatives."""
+def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) -> jax.Array:
+    """A^-1 b for b (V,), A the matrix of the pressure, to the tolerance of the flow; has derivatives.
+
+    A `guess` saves iterations; derivatives are as exact as without it.
+    """
 
     def apply(p):
         # A unit row where drained: adjoint loads need not vanish there.
-        return flow.mask * _product(flow, flow.mask * p) + (1 - flow.mask) * p
+        return flow.mask * flow_product(flow, flow.mask * p) + (1 - flow.mask) * p
 
     diagonal = flow.mask * flow.matrix.diagonal[0][0] + (1 - flow.mask)
     slow = preconditioner.correction(mesh, flow.slow, flow.mask[:, None])
@@ -102,18 +112,29 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     def precondition(r):
         return r / diagonal + slow((r,))[0]
 
-    D = jax.lax.stop_gradient(diagonal)
-    return differentiable_solve(apply, b, precondition, flow.tolerance, 2000, Known(diagonal=D))
+    known = Known(diagonal=jax.lax.stop_gradient(diagonal))
+
+    def exact(A, b):
+        return differentiable_solve(A, b, precondition, flow.tolerance, 2000, known)
+
+    if guess is None:
+        return exact(apply, b)
+
+    def found(lack, begin):
+        r = -lack(begin)
+        size = jnp.linalg.norm(r)
+        tolerance = guess.looser * flow.tolerance * jnp.linalg.norm(b) / jnp.where(size > 0, size, 1.0)
+        return begin + differentiable_solve(apply, r, precondition, tolerance, 2000, known)
+
+    begin = jax.lax.stop_gradient(flow.mask * guess.pressure)
+    return jax.lax.custom_root(lambda p: apply(p) - b, begin, found, exact)
 
 
-def _product(flow: Flow, p: jax.Array) -> jax.Array:
+def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
     """A p, by differences of neighbours: where p is uniform nothing flows, however large dt and however few digits."""
     rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
-
-    def add(slot, total):
-        return total + rows[slot] * (p[nodes[slot]] - p)
-
-    return jax.lax.fori_loop(0, nodes.shape[0], add, flow.store * p)
+    # One kernel for all neighbours: a third of the time of a loop over them, on small and on large meshes.
+    return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
 
 
 #: Error of the polynomial that stands for the inverse of the pressure's matrix in Newton's direction.
@@ -130,7 +151,7 @@ def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     exact = preconditioner.correction(mesh, flow.slow, flow.mask[:, None])
 
     def apply(p):
-        return flow.mask * _product(flow, p)
+        return flow.mask * flow_product(flow, p)
 
     def slow(r):
         return exact((r,))[0]

@@ -197,12 +197,14 @@ def inflow(porosity: Porosity, mesh: TetMesh, time: Number, dt: Number) -> tuple
     return given, enters
 
 
-def pressure(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array) -> jax.Array:
+def pressure(
+    porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array, guess: darcy.Guess | None = None
+) -> jax.Array:
     """P (V,) [Pa] at the end of a step that ends with volumes J_end (E,)."""
     before: Any = fluid.J_before
     increment = fluid.J - before if porosity.scheme == "lagged" else J_end - fluid.J
     b = flow.store * fluid.pressure - integrals(mesh, increment)
-    return darcy.with_given(mesh, flow, b)
+    return darcy.with_given(mesh, flow, b, guess)
 
 
 def fluid_energy(porosity: Porosity, mesh: TetMesh, fluid: Fluid, flow: Flow, J_end: jax.Array) -> jax.Array:
@@ -245,9 +247,9 @@ class CoupledSponge(Sponge):
     fluid: Fluid = param("1", "at the beginning of the step")
     flow: Flow = param("1", "the equation of the pressure")
 
-    def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+    def pressure(self, mesh: TetMesh, J: jax.Array, guess: darcy.Guess | None = None) -> jax.Array:
         """Pressures from the volume change of this step."""
-        return pressure(self.porosity, mesh, self.fluid, self.flow, J)
+        return pressure(self.porosity, mesh, self.fluid, self.flow, J, guess)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
         """Matrix of storage and flow; it is positive."""
@@ -268,7 +270,7 @@ class LaggedSponge(Sponge):
     fluid: Fluid = param("1", "at the beginning of the step")
     given: jax.Array = param("Pa", "the pressure (V,)")
 
-    def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+    def pressure(self, mesh: TetMesh, J: jax.Array, guess: darcy.Guess | None = None) -> jax.Array:
         """Wherever the step ends."""
         return self.given
 

@@ -11,6 +11,7 @@ from liverjax.elements import mjed
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Free, NodalForce, Physics, Solid, Start, Step, VolumeStress
+from liverjax.physics.darcy import Guess
 from liverjax.physics.prescribed import free_degrees, prescribed
 from liverjax.physics.registry import law_at_rest, physics_of
 from liverjax.scenes.scene import Scene
@@ -189,8 +190,8 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
 
 
 @jax.jit  # a program has it several times: it is traced once
-def forces(e: Equations, q: jax.Array, s: Any) -> Forces:
-    """Forces of all physics at unknowns q (3 V,), at part s of the step."""
+def forces(e: Equations, q: jax.Array, s: Number, guess: Guess | None = None) -> Forces:
+    """Forces of all physics at unknowns q (3 V,), at part s of the step; `guess` of pressures that flow, or None."""
     x = positions(e, q, s)
     F = deformation_gradient(e.mesh, x)
     first, *rest = [solid.stress(F) for solid in e.solids]
@@ -198,7 +199,7 @@ def forces(e: Equations, q: jax.Array, s: Any) -> Forces:
     for other in rest:
         P = add_matrices(P, other)
     if e.volume is not None:
-        pressure = e.volume.pressure(e.mesh, determinant(F)) if e.mixed is None else _unknown_pressure(e, q)
+        pressure = e.volume.pressure(e.mesh, determinant(F), guess) if e.mixed is None else _unknown_pressure(e, q)
         P = add_matrices(P, e.volume.stress(e.mesh, pressure, F))
     return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F)
 
@@ -208,9 +209,17 @@ def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
-def residual(e: Equations, q: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax.Array:
+    """Pressures (V,) [Pa] that flow, at unknowns q (3 V,), from a guess of them."""
+    assert e.volume is not None
+    return e.volume.pressure(e.mesh, determinant(deformation_gradient(e.mesh, positions(e, q, s))), guess)
+
+
+def residual(
+    e: Equations, q: jax.Array, s: Number, guess: Guess | None = None
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Out-of-balance forces (3 V,) [N] at part s of the step, the size of all forces, and the pressures."""
-    f = forces(e, q, s)
+    f = forces(e, q, s, guess)
     at_work = e.noise + jnp.linalg.norm(f.internal)
     for force in f.nodal:
         at_work = at_work + jnp.linalg.norm(force)

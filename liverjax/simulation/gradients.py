@@ -104,6 +104,8 @@ def memory(scene: Scene, store: str | int = "all") -> int:
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
     root = _bytes(scene.mesh.points)
+    if scene.porosity is not None and scene.porosity.scheme == "implicit":
+        root += scene.mesh.number_of_vertices * scene.mesh.points.dtype.itemsize
     # Tangents of a step, and of the run's beginning.
     work = 2 * tangent + _WORK * scene.mesh.weights.size * scene.mesh.points.dtype.itemsize
     if kept >= steps:

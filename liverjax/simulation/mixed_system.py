@@ -4,6 +4,7 @@ A physics that acts on the volume of elements has pressures at the nodes and a m
 the fluid flows, so the matrix couples them. Where volume changes are averaged at the nodes, the matrix is diagonal.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -47,37 +48,36 @@ def coupled(
     return block_matrix.BlockMatrix(rows, diagonal, mesh.pattern.row_nodes)
 
 
-def eliminated(
-    mesh: TetMesh, flow: Flow | None, A: block_matrix.BlockMatrix, both: tuple[jax.Array, ...], exactly: bool = False
-) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of a motion that changes pressures too, from `both` = A (dx, 0) of the `coupled` matrix A.
+def balances(
+    mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
+) -> tuple[tuple[jax.Array, ...], jax.Array]:
+    """Forces, columns (V,), of a motion (V,) at given pressures, and the balance of volumes (V,) that it leaves."""
+    if isinstance(A, PointMatrix):
+        return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
+    *forces, balance = block_matrix.product(A, motion)
+    return tuple(forces), balance
+
+
+def pressure_change(
+    mesh: TetMesh,
+    flow: Flow | None,
+    A: block_matrix.BlockMatrix | PointMatrix,
+    balance: jax.Array,
+    exactly: bool = False,
+) -> jax.Array:
+    """Change of pressures (V,) that answers a balance of volumes (V,).
 
     Without `flow` the matrix of the pressures is diagonal. With `flow` their equation is solved approximately, or, if
     `exactly` is set, to its tolerance.
     """
-    *forces, balance = both
-    dP = _pressures(mesh, flow, -A.diagonal[3][3], balance, exactly)
-    return tuple(f + p for f, p in zip(forces, pulled(mesh, A, -dP), strict=True))
-
-
-def _pressures(mesh: TetMesh, flow: Flow | None, compliance: jax.Array, balance: jax.Array, exactly: bool) -> jax.Array:
-    """Change of pressures (V,) with a balance of volumes (V,)."""
     if flow is None:
-        return balance / compliance
+        if isinstance(A, PointMatrix):
+            assert A.pressures is not None
+            return balance / A.pressures.diagonal[0][0]
+        return balance / -A.diagonal[3][3]
     if exactly:
         return flow.mask * darcy.solved(mesh, flow, flow.mask * balance)
     return darcy.nearly_solved(mesh, flow, balance)
-
-
-def eliminated_points(
-    mesh: TetMesh, flow: Flow | None, A: PointMatrix, motion: Any, exactly: bool = False
-) -> tuple[jax.Array, ...]:
-    """The same for quadratic elements: forces, columns (V,), of a motion (V,) that changes pressures too."""
-    assert A.pressures is not None
-    balance = -point_matrix.volume_changes(mesh, A, motion)
-    dP = _pressures(mesh, flow, A.pressures.diagonal[0][0], balance, exactly)
-    forces = point_matrix.product(mesh, A, motion)
-    return tuple(f - p for f, p in zip(forces, point_matrix.pull(mesh, A, dP), strict=True))
 
 
 def with_pressures(

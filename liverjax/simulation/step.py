@@ -11,11 +11,22 @@ from liverjax.core import status
 from liverjax.core.struct import Number, replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.physics.base import End, NodalForce
+from liverjax.physics.darcy import Guess
 from liverjax.physics.elasticity import Elastic
 from liverjax.simulation import tangent
-from liverjax.simulation.equations import Equations, State, advanced, energy, forces, positions, residual, unknowns
+from liverjax.simulation.equations import (
+    Equations,
+    State,
+    advanced,
+    energy,
+    flowing_pressure,
+    forces,
+    positions,
+    residual,
+    unknowns,
+)
 from liverjax.solvers import step_cutting
-from liverjax.solvers.problem import Kept, Potential, Problem, StepOptions, StepStatistics
+from liverjax.solvers.problem import Beside, Kept, Potential, Problem, StepOptions, StepStatistics
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 
@@ -40,8 +51,17 @@ def problem_of(e: Equations) -> Problem:
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
+        beside=_flowing(e),
         potential=potential,
     )
+
+
+def _flowing(e: Equations) -> Beside | None:
+    """Pressures that flow, where they depend on motion."""
+    volume: Any = e.volume
+    if volume is None or volume.flow is None:
+        return None
+    return Beside(volume.fluid.pressure, partial(flowing_pressure, e), Guess)
 
 
 def _tangent(
@@ -82,7 +102,7 @@ def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[Stat
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     q, statistics, kept = step_cutting.solve(problem_of(e), unknowns(e, x), options, guess, kept, near)
-    f = forces(e, q, jnp.ones((), x.dtype))
+    f = forces(e, q, jnp.ones((), x.dtype), None if kept.beside is None else Guess(kept.beside, 1.0))
     projected = e.free.normals is not None or e.free.tied
     reactions = f.total - e.free.vectors(f.total, f.x) if projected else (1 - e.free.mask) * f.total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)

@@ -5,7 +5,7 @@ eliminated. BiCGSTAB solves systems with loads that follow the body. The precond
 diagonal blocks and, where slow motions would slow them down, a coarse space.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from liverjax.elements import mjed, projection
 from liverjax.elements.gradients import volume_gradients
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh.adjacency import PAIRS
+from liverjax.physics import darcy
 from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
@@ -26,8 +27,8 @@ from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.krylov import (
     conjugate_gradients,
     stabilised_biconjugate_gradients,
+    started,
     true_residual,
-    with_true_residual,
 )
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.solvers.preconditioner import Coarse, coarse, corrected, worthwhile
@@ -294,30 +295,38 @@ def _flat(e: Equations, columns: Any) -> jax.Array:
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
     """K as a function of flat vectors (3 V,). Pressures that follow motion are solved roughly, or `exactly`."""
     A, volume, n = K.matrix, _coupled(e), 3 * e.mesh.number_of_nodes
-    following = [a for a in e.nodal if not a.conservative]
 
     def apply(v: jax.Array) -> jax.Array:
         motion, balance = e.free.columns(block_matrix.columns(v[:n])), None
         if e.mixed is not None:
             force, balance = mixed_system.with_pressures(e.mesh, e.mixed, A, (motion, v[n:]))
+        elif volume is not None:
+            force, left = mixed_system.balances(e.mesh, A, motion)
+            dP = mixed_system.pressure_change(e.mesh, volume.flow, A, left, exactly)
+            force = block_matrix.sums(force, mixed_system.pulled(e.mesh, A, -dP))
         elif isinstance(A, BlockMatrix):
             force = block_matrix.product(A, motion)
-            if volume is not None:
-                force = mixed_system.eliminated(e.mesh, volume.flow, A, force, exactly)
-        elif volume is None:
-            force = point_matrix.product(e.mesh, A, motion)
         else:
-            force = mixed_system.eliminated_points(e.mesh, volume.flow, A, motion, exactly)
-        for own in K.attached:
-            force = block_matrix.sums(force, attached.product(own, motion))
-        if following and K.x is not None and K.follows is not None:
-            dx = jnp.stack(motion, axis=-1)
-            for a in following:
-                change = K.follows * a.product(e.mesh, K.x, K.s, dx)
-                force = block_matrix.sums(force, change.T)
+            force = point_matrix.product(e.mesh, A, motion)
+        force = _with_nodal(e, K, motion, force)
         return _flat(e, force) if balance is None else jnp.concatenate([_flat(e, force), balance])
 
     return apply
+
+
+def _with_nodal(
+    e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
+) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), with those of elements between nodes and of loads that follow a motion."""
+    for own in K.attached:
+        force = block_matrix.sums(force, attached.product(own, motion))
+    following = [a for a in e.nodal if not a.conservative]
+    if following and K.x is not None and K.follows is not None:
+        dx = jnp.stack(motion, axis=-1)
+        for a in following:
+            change = K.follows * a.product(e.mesh, K.x, K.s, dx)
+            force = block_matrix.sums(force, change.T)
+    return tuple(force)
 
 
 def solve(
@@ -352,21 +361,64 @@ def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
 
 
 def adjoint(
-    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
+    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int, near: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
-    """Solve K x = b with the pressures, for derivatives. Return x and its residual over |b|."""
+    """Solve K x = b with the pressures, for derivatives. Return x and its residual over |b|.
+
+    Iterations begin at `near` where that helps. No load follows the body here.
+    """
+    apply = product(e, K, exactly=True)
     if e.scene.solve.linear_solver == "direct":
         x = _factorised(e, K, b)
-        return x, true_residual(product(e, K, exactly=True), b, x)
+        return x, true_residual(apply, b, x)
     volume = _coupled(e)
-    if e.mixed is not None:
-        x, s = stabilised_biconjugate_gradients(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
-        return x, s.residual
-    if volume is None or volume.flow is None:
-        x, s = conjugate_gradients(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
+    flows = e.mixed is None and volume is not None and volume.flow is not None
+    method = conjugate_gradients if e.mixed is None else stabilised_biconjugate_gradients
+
+    def iterated(b: jax.Array, tolerance: Number) -> tuple[jax.Array, jax.Array]:
+        if flows:
+            return _refined(e, K, b, tolerance, max_iterations)
+        x, s = method(apply, b, preconditioner(e, K), tolerance, max_iterations)
         return x, s.residual
 
-    def nearly(r: jax.Array, tolerance: Number) -> jax.Array:
-        return solve(e, K, r, tolerance, max_iterations)[0]
+    return iterated(b, tolerance) if near is None else started(iterated, apply, b, near, tolerance)
 
-    return with_true_residual(nearly, tolerance, product(e, K, exactly=True), b)
+
+#: Of `_refined`: tolerance of its solves for motions and for pressures, and how often at most.
+_INNER, _INNER_PRESSURE, _REFINEMENTS = 5e-2, 1e-2, 60
+
+
+def _refined(
+    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
+) -> tuple[jax.Array, jax.Array]:
+    """Solution of K x = b where pressures flow, and its residual over |b|: iterative refinement of the mixed system.
+
+    Motions and pressures are refined together, so no solve for pressures is more accurate than one refinement can use.
+    """
+    volume: Any = _coupled(e)
+    A, flow, goal = K.matrix, volume.flow, tolerance * jnp.linalg.norm(b)
+    loose = flow._replace(tolerance=_INNER_PRESSURE)
+
+    def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """What forces lack with pressures that answer the balance of volumes, and the change of pressures for it."""
+        motion = e.free.columns(block_matrix.columns(x))
+        force, balance = mixed_system.balances(e.mesh, A, motion)
+        dP = mixed_system.pressure_change(e.mesh, loose, A, balance - darcy.flow_product(flow, P), exactly=True)
+        force = block_matrix.sums(force, mixed_system.pulled(e.mesh, A, -P - dP))
+        return b - _flat(e, _with_nodal(e, K, motion, force)), dP
+
+    def go_on(c):
+        _, _, r, _, last, k = c
+        size = jnp.linalg.norm(r)
+        return (size > goal) & (size < last) & (k < _REFINEMENTS)
+
+    def step(c):
+        x, P, r, dP, _, k = c
+        x, P = x + solve(e, K, r, _INNER, max_iterations)[0], P + dP
+        return x, P, *left(x, P), jnp.linalg.norm(r), k + 1
+
+    P = jnp.zeros_like(flow.store)
+    start = (jnp.zeros_like(b), P, b, P, jnp.asarray(jnp.inf, b.dtype), jnp.zeros((), jnp.int32))
+    x, _, r, *_ = jax.lax.while_loop(go_on, step, start)
+    scale = jnp.linalg.norm(b)
+    return x, jnp.linalg.norm(r) / jnp.where(scale > 0, scale, 1.0)

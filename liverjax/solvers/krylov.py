@@ -121,6 +121,70 @@ def stabilised_biconjugate_gradients(
     return x, LinearStatistics(k, true_residual(matvec, b, x), jnp.array(True))
 
 
+#: A vector, and the solutions of the last two solves, the latest first.
+WithLast = tuple[jax.Array, tuple[jax.Array, ...]]
+
+
+def symmetric_solve(
+    matvec: Callable[[WithLast], WithLast],
+    both: WithLast,
+    solver: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
+    tolerance: Number,
+) -> WithLast:
+    """x of A x = b, A symmetric, as a linear map of b, and the last two solutions of such solves.
+
+    Its derivatives are solves as well, in both modes. NaN as of `differentiable_solve`.
+
+    Args:
+        matvec: (x, last two) -> (A x, the same two).
+        both: b, and the last two solutions: the solve begins on the line through them.
+        solver: (b, near) -> solution, and the true residual over |b|.
+        tolerance: of the solver.
+    """
+
+    # One vector of all three: a derivative by one part alone has no cotangents of the others, which JAX does not take.
+    def joined(parts):
+        return jnp.concatenate([parts[0], *parts[1]])
+
+    def parted(vector):
+        x, latest, earlier = jnp.split(vector, 3)
+        return x, (latest, earlier)
+
+    def solve(_, vector):
+        b, (latest, earlier) = parted(vector)
+        x, residual = solver(b, 2 * latest - earlier)
+        return joined((jnp.where(_good(residual, tolerance, b), x, jnp.nan), (x, latest)))
+
+    def product(vector):
+        return joined(matvec(parted(vector)))
+
+    return parted(jax.lax.custom_linear_solve(product, joined(both), solve=solve, transpose_solve=solve))
+
+
+def _good(residual: jax.Array, tolerance: Number, b: jax.Array) -> jax.Array:
+    return residual <= jnp.maximum(min(1e-3, float(jnp.finfo(b.dtype).eps) ** (1 / 3)), 10 * tolerance)
+
+
+def started(
+    solver: Callable[[jax.Array, Number], tuple[jax.Array, jax.Array]],
+    matvec: Callable[[jax.Array], jax.Array],
+    b: jax.Array,
+    near: jax.Array,
+    tolerance: Number,
+) -> tuple[jax.Array, jax.Array]:
+    """Solution of A x = b, begun at `near` if that is nearer than 0: then less is left for the solver.
+
+    `solver` is (b, tolerance) -> solution and its residual over |b|, `tolerance` that of |b - A x| over |b|. Returns
+    the solution and its residual over |b|.
+    """
+    left, size = b - matvec(near), jnp.linalg.norm(b)
+    helps = jnp.linalg.norm(left) < size
+    begin, left = jnp.where(helps, near, 0.0), jnp.where(helps, left, b)
+    rest = jnp.linalg.norm(left) / jnp.where(size > 0, size, 1.0)
+    more, residual = solver(left, tolerance / jnp.where(rest > 0, rest, 1.0))
+    return begin + more, rest * residual
+
+
 def true_residual(matvec: Callable[[jax.Array], jax.Array], b: jax.Array, x: jax.Array) -> jax.Array:
     """|b - A x| / |b|."""
     scale = jnp.linalg.norm(b)
@@ -160,45 +224,9 @@ def differentiable_solve(
             residual, found = s.residual, s.positive & (s.iterations < max_iterations)
         else:
             x, residual = solver(b)
-        good = residual <= jnp.maximum(min(1e-3, eps ** (1 / 3)), 10 * tolerance)
+        good = _good(residual, tolerance, b)
         if diagonal is not None:
             good = good | (found & (residual * jnp.linalg.norm(b) <= 4 * eps * jnp.linalg.norm(diagonal * x)))
         return jnp.where(good, x, jnp.nan)
 
     return jax.lax.custom_linear_solve(matvec, b, solve=solve, transpose_solve=solve, symmetric=symmetric)
-
-
-#: Refinement: tolerance of one inner solve, how often at most.
-_INNER, _REFINEMENTS = 5e-2, 60
-
-
-def with_true_residual(
-    nearly: Callable[[jax.Array, Number], jax.Array],
-    tolerance: Number,
-    matvec: Callable[[jax.Array], jax.Array],
-    b: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Solve A x = b by repeated solves with an approximation of A (iterative refinement): few products with A itself.
-
-    Returns the solution and its residual relative to |b|.
-
-    Args:
-        nearly: (r, tolerance) -> near A^-1 r, to that tolerance.
-        tolerance: of |b - A x| relative to |b|.
-    """
-    goal = tolerance * jnp.linalg.norm(b)
-
-    def go_on(c):
-        _, r, last, k = c
-        size = jnp.linalg.norm(r)
-        return (size > goal) & (size < last) & (k < _REFINEMENTS)
-
-    def step(c):
-        x, r, _, k = c
-        x = x + nearly(r, _INNER)
-        return x, b - matvec(x), jnp.linalg.norm(r), k + 1
-
-    start = (jnp.zeros_like(b), b, jnp.asarray(jnp.inf, b.dtype), jnp.zeros((), jnp.int32))
-    x, r, *_ = jax.lax.while_loop(go_on, step, start)
-    scale = jnp.linalg.norm(b)
-    return x, jnp.linalg.norm(r) / jnp.where(scale > 0, scale, 1.0)

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from liverjax.core.struct import Number
+
 #: Most iterations of one linear solve.
 MOST_LINEAR_ITERATIONS = 3000
 #: Tolerance of the linear solve for a direction, the loosest.
@@ -38,14 +40,32 @@ class Kept(NamedTuple):
     made: jax.Array  # False: there is none yet
     pace: jax.Array  # linear iterations a digit, with its preconditioner when that was new
     worn: jax.Array  # the preconditioner takes much longer by now
+    #: Root of the last step less what was predicted, and the part of it that the step before foretold: as much of it
+    #: is added to the next guess.
+    surprise: jax.Array
+    trust: jax.Array
+    beside: jax.Array | None = None  # what is solved for beside the root, there (`Problem.beside`)
+    #: Of derivatives: solutions of their last two linear solves, for the next to begin near. A run carries zeros.
+    adjoints: tuple[jax.Array, ...] = ()
+
+
+class Beside(NamedTuple):
+    """What the residual solves for at every q, by iterations that a guess shortens."""
+
+    before: jax.Array  # a guess at the beginning of the step
+    #: (q, s, guess) -> its solution at q.
+    solved: Callable[..., jax.Array]
+    #: (solution nearby, tolerance over the usual one) -> guess for `residual` and `solved`.
+    guess: Callable[[jax.Array, Number], tuple]
 
 
 class Problem(NamedTuple):
     """Equations of a step, and how their linear systems are solved."""
 
     #: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that it is small against, and what
-    #: `tangent` needs beside. May close over traced parameters; derivatives are exact at the root.
-    residual: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array, Any]]
+    #: `tangent` needs beside. May close over traced parameters; derivatives are exact at the root. Where there is a
+    #: `beside`, by is its solution and a third argument a guess of it.
+    residual: Callable[..., tuple[jax.Array, jax.Array, Any]]
     #: (q, s, by, near) -> any pytree that stands for dr/dq, used again while iterations converge fast with it; near
     #: is None, or whether an earlier one is near enough to take parts from, and that one.
     tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
@@ -53,15 +73,16 @@ class Problem(NamedTuple):
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
-    #: (tangent, b, tolerance, max_iterations) -> as `solve`, with dr/dq itself, and the residual over |b|: for
-    #: derivatives, where dr/dq is symmetric. None: they are solved for with products of dr/dq.
-    adjoint: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array]] | None = None
+    #: (tangent, b, tolerance, max_iterations, near) -> as `solve`, with dr/dq itself, and the residual over |b|: for
+    #: derivatives, where dr/dq is symmetric; near is a guess. None: they are solved for with products of dr/dq.
+    adjoint: Callable[[Any, jax.Array, Number, int, jax.Array], tuple[jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is.
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
     #: |r| that the digits of q leave.
     roundoff: Any = 0.0
+    beside: Beside | None = None
     #: What a step that cannot be followed is minimised with; None: it is not.
     potential: "Potential | None" = None
 

@@ -16,7 +16,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from liverjax.core import status
 from liverjax.core.struct import Number
-from liverjax.solvers.krylov import Known, differentiable_solve
+from liverjax.solvers.krylov import Known, differentiable_solve, symmetric_solve
 from liverjax.solvers.minimisation import minimise, untangled
 from liverjax.solvers.problem import (
     LINEAR_TOLERANCE,
@@ -53,6 +53,8 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| there
     aim: jax.Array  # |r| that the last direction was to remove
     kept: Kept
+    beside: jax.Array | None  # what the residual solved for there; None: nothing
+    looser: jax.Array  # tolerance of the next such solve over the usual one
     indefinite: jax.Array  # the last tangent solved with was not positive
     stale: jax.Array  # dq is of a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
@@ -79,8 +81,12 @@ def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
     """The empty `Kept` of the first step."""
     zero = jnp.zeros((), start.dtype)
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
-    no = jnp.array(False)
-    return Kept(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), made), no, zero, no)
+    no, beside = jnp.array(False), None if problem.beside is None else problem.beside.before
+    # Derivatives that begin near the last: where the matrix is symmetric, so that transposed it is the same.
+    adjoints = () if problem.adjoint is None else (jnp.zeros_like(start), jnp.zeros_like(start))
+    empty = (jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), a) for a in (made, beside))
+    tangent, beside = jax.lax.stop_gradient(tuple(empty))
+    return Kept(tangent, no, zero, no, jax.lax.stop_gradient(jnp.zeros_like(start)), zero, beside, adjoints)
 
 
 def solve(
@@ -97,9 +103,12 @@ def solve(
     one for derivatives.
     """
     start = jax.lax.stop_gradient(start)
-    guess = None if guess is None else jax.lax.stop_gradient(guess)
-    kept = nothing_kept(problem, start) if kept is None else jax.lax.stop_gradient(kept)
+    guess = predicted = None if guess is None else jax.lax.stop_gradient(guess)
+    kept = nothing_kept(problem, start) if kept is None else kept
+    last, kept = kept.adjoints, jax.lax.stop_gradient(kept._replace(adjoints=()))
     one = jnp.ones((), start.dtype)
+    if guess is not None:
+        guess = guess + kept.trust * kept.surprise
 
     def at_end(q):
         return problem.residual(q, one)[0]
@@ -108,6 +117,11 @@ def solve(
 
     def follow(_, start):
         root, (statistics, kept) = found(start)
+        if predicted is not None:
+            off = jnp.where(statistics.status == status.CONVERGED, root - predicted, 0.0)
+            kept = kept._replace(surprise=off, trust=_foretold(off, kept.surprise))
+        if problem.beside is not None:
+            kept = kept._replace(beside=problem.beside.solved(root, one, problem.beside.guess(kept.beside, 1.0)))
         # Counts and node numbers leave as floating-point numbers: implicit differentiation gives every output a
         # tangent, and jax 0.10 refuses those of integers.
         return root, (statistics, jax.tree.map(lambda a: a.astype(start.dtype), kept))
@@ -124,18 +138,53 @@ def solve(
     q, aux = jax.lax.custom_root(at_end, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     statistics, kept = jax.lax.stop_gradient(aux)
     kept = jax.tree.map(lambda a, dtype: a.astype(dtype), kept, kind)
-    q, statistics = checkpoint_name((jax.lax.stop_gradient(q), statistics), ROOT)
+    q, beside, statistics = checkpoint_name((jax.lax.stop_gradient(q), kept.beside, statistics), ROOT)
+    root, adjoints = _with_derivative(problem, q, beside, last, options.tolerance, near)
+    code, iterations, linear, cuts = (n.astype(jnp.int32) for n in statistics[:4])
+    kept = kept._replace(beside=beside, adjoints=adjoints)
+    return root, StepStatistics(code, iterations, linear, cuts, statistics.residual), kept
+
+
+def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
+    """The part of a vector, from 0 to 1, that the vector before it foretold."""
+    square = jnp.vdot(before, before)
+    return jnp.clip(jnp.vdot(vector, before) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
+
+
+def _with_derivative(
+    problem: Problem, q: jax.Array, beside: jax.Array | None, last: tuple[jax.Array, ...], tolerance: Number, near: Any
+) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    """The root q with the derivative of the residual's root, and the solutions for the next derivative to begin near.
+
+    To be carried from step to step, these solutions pass for unknowns of their own, equal to `last`. Forward mode
+    hands them on, and reverse mode hands them back, from the later step to the earlier.
+    """
+    one = jnp.ones((), q.dtype)
+
+    def lack(unknowns):
+        q, hints = unknowns
+        r, _, by = _evaluated_near(problem, q, one, beside, 1.0)
+        return (r, tuple(a - b for a, b in zip(hints, last, strict=True))), by
 
     def tangent_solve(linear, y):
         some = None if near is None else (jnp.array(True), near)
-        K = problem.tangent(q, one, jax.lax.stop_gradient(problem.residual(q, one)[2]), some)
-        limits = (jnp.maximum(_ADJOINT * options.tolerance, 1e-13), MOST_LINEAR_ITERATIONS)
-        solver = None if problem.adjoint is None else lambda b: problem.adjoint(K, b, *limits)
-        return differentiable_solve(linear, y, problem.preconditioner(K), *limits, Known(problem.symmetric, solver))
+        by = lack((q, last))[1] if beside is None else beside
+        K = problem.tangent(q, one, jax.lax.stop_gradient(by), some)
+        limits = (jnp.maximum(_ADJOINT * tolerance, 1e-13), MOST_LINEAR_ITERATIONS)
+        if problem.adjoint is None:
+            known = Known(problem.symmetric)
+            matvec, b = (lambda v: linear((v, ()))[0]), y[0]
+            return differentiable_solve(matvec, b, problem.preconditioner(K), *limits, known), ()
+        return symmetric_solve(linear, y, lambda b, near: problem.adjoint(K, b, *limits, near), limits[0])
 
-    root = jax.lax.custom_root(at_end, q, lambda _, q: q, tangent_solve)
-    code, iterations, linear, cuts = (n.astype(jnp.int32) for n in statistics[:4])
-    return root, StepStatistics(code, iterations, linear, cuts, statistics.residual), kept
+    return jax.lax.custom_root(lambda u: lack(u)[0], (q, last), lambda _, u: u, tangent_solve)
+
+
+def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
+    """The residual at q, with what it solves for from a solution nearby."""
+    if problem.beside is None or beside is None:
+        return problem.residual(q, s)
+    return problem.residual(q, s, problem.beside.guess(beside, looser))
 
 
 def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptions) -> tuple[jax.Array, Any]:
@@ -161,14 +210,14 @@ def _one_step(problem: Problem, start: jax.Array, kept: Kept, options: StepOptio
 def _follow(
     problem: Problem, start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: Kept, options: StepOptions
 ) -> tuple[jax.Array, Any]:
-    begin = _first_point(start, guess, guessing, kept)
+    begin = _first_point(start, guess, guessing, kept, None if problem.beside is None else problem.beside.before)
     end = jax.lax.while_loop(lambda c: ~c.done, partial(_iterate, problem, options, start), begin)
     stopped = jnp.where(end.cuts > options.max_cuts, status.STEP_CUT, status.STALLED)
     failure = jnp.where(end.indefinite, status.INDEFINITE, stopped)
     failure = jnp.where(jnp.isfinite(end.relative), failure, status.NOT_FINITE)
     code = jnp.where((end.s >= 1) & (end.relative <= options.tolerance), status.CONVERGED, failure)
     a, b, c, d = (n.astype(start.dtype) for n in (code, end.total, end.linear, end.cuts))
-    return end.q, (StepStatistics(a, b, c, d, end.relative), end.kept)
+    return end.q, (StepStatistics(a, b, c, d, end.relative), end.kept._replace(beside=end.beside))
 
 
 def _robust(
@@ -207,7 +256,9 @@ def _robust(
     return jax.lax.cond(taken.status == status.CONVERGED, lambda: (q, (taken, kept)), again)
 
 
-def _first_point(start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: Kept) -> _Point:
+def _first_point(
+    start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: Kept, beside: jax.Array | None
+) -> _Point:
     zero, none, one, no = jnp.zeros((), start.dtype), jnp.zeros((), jnp.int32), jnp.ones((), start.dtype), False
     first = jnp.where(guessing, guess, start)
     return _Point(
@@ -215,6 +266,8 @@ def _first_point(start: jax.Array, guess: jax.Array, guessing: jax.Array, kept: 
         size=one * jnp.inf,
         aim=zero,
         kept=kept,
+        beside=beside,
+        looser=one,
         indefinite=jnp.array(no),
         stale=jnp.array(no),
         remake=jnp.array(no),
@@ -296,7 +349,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     """Evaluate the residual once, and solve for a direction if it is needed."""
     trial = jnp.where(c.launch, c.q_begin, jnp.where(c.remake, c.q, c.q + c.t * c.dq))
     s = jnp.where(c.launch, c.s_begin, c.s)
-    r, force, by = problem.residual(trial, s)
+    r, force, by = _evaluated_near(problem, trial, s, c.beside, c.looser)
     unbalanced = jnp.where(c.launch & ~c.guessing & (c.s_begin == 0), r, c.unbalanced)
     r = r - (1 - s) * unbalanced
     size = jnp.linalg.norm(r)
@@ -323,6 +376,8 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         size=jnp.where(v.accepted, size, c.size),
         aim=jnp.where(v.go_on, jnp.linalg.norm(load), c.aim),
         kept=kept,
+        beside=None if c.beside is None else jnp.where(v.accepted, by, c.beside),
+        looser=_looser(options, v, forcing * relative, c.looser),
         indefinite=jnp.where(v.go_on, ~positive, c.indefinite),
         stale=jnp.where(v.go_on, ~renew, c.stale),
         remake=v.remake,
@@ -344,6 +399,19 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         relative=jnp.where(v.accepted | ~jnp.isfinite(relative), relative, c.relative),
         done=v.done,
     )
+
+
+#: What is solved for beside the root: error over the residual that a direction is to leave.
+_BESIDE = 0.1
+
+
+def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.Array) -> jax.Array:
+    """Tolerance of the next solve beside the root over the usual one: no finer than the residual to come can use.
+
+    Where a part begins nothing is known of it, so the tolerance is the usual one.
+    """
+    wanted = jnp.maximum(1.0, _BESIDE * expected / options.tolerance)
+    return jnp.where(v.failed | v.lost, 1.0, jnp.where(v.go_on, wanted, before)).astype(before.dtype)
 
 
 def _along(problem: Problem, q: jax.Array, s: jax.Array) -> jax.Array:
@@ -369,4 +437,4 @@ def _direction(
     pace = (linear / -jnp.log10(forcing)).astype(load.dtype)
     first = jnp.where(renew & ~near[0], pace, kept.pace)
     worn = jnp.where(wanted, pace > _WEAR * first, kept.worn)
-    return dq, linear, Kept(K, kept.made | renew, first, worn), positive
+    return dq, linear, kept._replace(tangent=K, made=kept.made | renew, pace=first, worn=worn), positive

@@ -20,6 +20,7 @@ from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Physics, Step, VolumeStress
+from liverjax.physics.darcy import Guess
 from liverjax.solvers.block_matrix import BlockMatrix
 from liverjax.tensors.matrices import Invariants, Matrix, cofactor, scale_matrix
 
@@ -91,7 +92,7 @@ class Averaged(VolumeStress):
 
     law: Law = param("1", "volumetric energy of the nodes")
 
-    def pressure(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+    def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
         """See `pressure` of this module."""
         return averaged_pressure(mesh, self.law, J)
 
