@@ -35,7 +35,7 @@ from liverjax.physics.viscosity import Prony
 from liverjax.reduced.estimate import reduced_error
 from liverjax.reduced.files import load_reduced, save_reduced
 from liverjax.reduced.model import ReducedModel, reduced_identity
-from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced
+from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced, stated_error
 from liverjax.reduced.separated import SeparatedModel, separate, separated_displacement
 from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.regions import Region
@@ -99,6 +99,7 @@ __all__ = [
     "simulate",
     "simulate_batch",
     "simulate_reduced",
+    "stated_error",
     "static",
     "struct",
     "tet_mesh",

@@ -9,6 +9,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
+from liverjax.reduced.correction import Learnt, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
 from liverjax.reduced.sampling import MOST_STATES, nonnegative_weights, states_of
 
@@ -131,14 +132,70 @@ def test_weights_give_all_forces_and_are_few():
 
 def test_the_error_is_stated(trained):
     scene, model = trained
+    bare = replace(model, correction=None)
     for mu, gravity in ((850.0, (0.5, -1.0, -4.0)), (640.0, (0.0, 3.0, 2.0))):
         own = lj.with_parameters(scene, {"law.mu": mu, "body.gravity": gravity})
-        found = lj.simulate_reduced(model, own)
-        error = lj.reduced_error(model, own, found).error
         full = lj.simulate(own).check().positions
-        true = np.linalg.norm(lj.reduced_positions(model, own, found) - full, axis=-1).max(axis=1)
-        assert true.max() > 1e-6  # five modes are not the answer: there is an error to state
-        assert np.all(error < 2 * true) and np.all(true < 2 * error)
+        for m in (bare, model):
+            found = lj.simulate_reduced(m, own)
+            error = lj.reduced_error(m, own, found).error
+            true = np.linalg.norm(lj.reduced_positions(m, own, found) - full, axis=-1).max(axis=1)
+            assert true.max() > 1e-6  # five modes are not the answer: there is an error to state
+            assert np.all(true < 2 * error)
+            # The second row is far beyond the training, where a correction leads astray: its error may be overstated.
+            assert np.all(error < (2 if m is bare or mu == 850.0 else 5) * true)
+
+
+def _missing(q: np.ndarray, fields: np.ndarray) -> np.ndarray:
+    """A polynomial of degree two in coordinates and their rates, dt = 0.1."""
+    rates = np.diff(q, axis=1, prepend=0.0) / 0.1
+    parts = np.stack([0.3 * q[..., 0] - 0.1 * q[..., 2], 2.0 * q[..., 0] * q[..., 1] - 0.01 * rates[..., 1]], axis=-1)
+    return np.tensordot(parts, fields, axes=1)
+
+
+def test_a_polynomial_of_the_coordinates_is_learnt():
+    rng = np.random.default_rng(3)
+    volumes, fields = rng.uniform(0.5, 2.0, 7), rng.normal(size=(2, 7, 3))
+    q, new = (np.cumsum(rng.normal(size=(n, 6, 3)), axis=1) for n in (40, 5))
+    moved = np.abs(q).max(axis=(1, 2))
+    found = learnt_correction(Learnt(q, _missing(q, fields), moved, volumes, 0.1))
+    assert found is not None and found.products > 0
+    for own, exact in zip(new, _missing(new, fields), strict=True):
+        # The ridge of 1e-6 leaves out about as much.
+        assert np.abs(correction_at(found, jnp.asarray(own), 0.1) - exact).max() < 1e-4 * np.abs(exact).max()
+        assert float(stated_at(found, jnp.asarray(own), 0.1).max()) < 1e-3 * np.abs(exact).max()
+    noise = rng.normal(size=(40, 6, 7, 3))
+    # What no coordinate tells is not corrected, nor what few runs show.
+    assert learnt_correction(Learnt(q, noise, moved, volumes, 0.1)) is None
+    assert learnt_correction(Learnt(q[:5], _missing(q[:5], fields), moved[:5], volumes, 0.1)) is None
+
+
+def test_stated_errors_are_above_nine_in_ten_of_runs_left_out():
+    """A cubic term, which no polynomial of degree two has, leaves an error to state."""
+    rng = np.random.default_rng(4)
+    volumes, fields = np.ones(7), rng.normal(size=(1, 7, 3))
+    q, new = (rng.uniform(-1.0, 1.0, (n, 6, 2)) for n in (60, 200))
+    exact = [np.tensordot((a[..., :1] + 0.3 * a[..., :1] ** 3), fields, axes=1) for a in (q, new)]
+    found = learnt_correction(Learnt(q, exact[0], np.ones(60), volumes, None))
+    corrected = np.stack([correction_at(found, jnp.asarray(own), None) for own in new])
+    true = np.linalg.norm(corrected - exact[1], axis=-1).max(axis=(1, 2))
+    stated = np.array([float(stated_at(found, jnp.asarray(own), None).max()) for own in new])
+    above = np.mean(stated >= true)
+    # Binomial: 0.9 of 60 runs left out and of 200 new ones, three standard deviations of both.
+    assert abs(above - 0.9) < 3 * np.sqrt(0.09 / 60 + 0.09 / 200)
+
+
+@pytest.mark.slow
+def test_rows_of_the_largest_stated_errors_are_run():
+    """Rows drawn near each other, and others far away: those are taken, and what they show is known then."""
+    scene = _bar((3, 1, 1), solve=lj.Solve(steps=2))
+    rng = np.random.default_rng(5)
+    near = np.stack([np.zeros(20), np.zeros(20), rng.uniform(-1.0, -0.5, 20)], axis=1)
+    far = np.stack([np.zeros(6), rng.uniform(3.0, 4.0, 6), np.zeros(6)], axis=1)
+    rows = {"body.gravity": np.concatenate([near[:8], near[8:], far])}
+    model = lj.reduce_scene(scene, rows, most_modes=4, runs=12)
+    low, high = np.asarray(model.ranges["body.gravity"])
+    assert high[1] > 3.0 and low[2] < -0.5
 
 
 @pytest.mark.slow
@@ -163,6 +220,13 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     lj.save_reduced(model, tmp_path / "model.h5")
     again = lj.load_reduced(tmp_path / "model.h5")
     assert again.identity == model.identity and np.array_equal(again.slopes, model.slopes)
+    assert np.array_equal(again.correction.committee, model.correction.committee)
+    assert again.correction.products == model.correction.products
+    with pytest.raises(lj.InputError, match="has no correction"):
+        bare = replace(model, correction=None)
+        lj.stated_error(bare, scene, lj.simulate_reduced(bare, scene))
+    with pytest.raises(lj.InputError, match="runs = 3 must be 6 to 9, the number of rows"):
+        lj.reduce_scene(scene, {"law.mu": np.linspace(700, 900, 9)}, runs=3)
     with pytest.raises(lj.InputError, match=r"was made for scene .* run python -m liverjax reduce"):
         lj.simulate_reduced(again, _bar((1, 1, 1)))
     with pytest.raises(lj.InputError, match="no pore pressures"):

@@ -18,6 +18,12 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "--tolerance", type=float, default=1e-3, metavar="X", help="part of the motions that may be left out (1e-3)"
     )
     command.add_argument("--modes", type=int, default=40, metavar="N", help="the most modes (40)")
+    command.add_argument(
+        "--runs",
+        type=int,
+        metavar="N",
+        help="of the full model: two thirds are the first rows, then those of the largest stated error (all rows)",
+    )
     command.set_defaults(run=run)
 
 
@@ -25,7 +31,9 @@ def run(options: argparse.Namespace) -> int:
     """Make the model and write it."""
     from liverjax.jobs import reduction
 
-    model = reduction.make(options.scene, options.rows, options.out, options.tolerance, options.modes)
-    print(f"{model.number_of_modes} modes, {len(model.points)} points\nwritten: {options.out}")
+    model = reduction.make(options.scene, options.rows, options.out, options.tolerance, options.modes, options.runs)
+    print(
+        f"{model.number_of_modes} modes, {len(model.points)} points, {reduction.learnt(model)}\nwritten: {options.out}"
+    )
     print(f'to use it: [solve] reduced = "{options.out}"')
     return 0

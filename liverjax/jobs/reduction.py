@@ -22,6 +22,14 @@ from liverjax.simulation.run import Result
 from liverjax.solvers.problem import StepStatistics
 
 
+def learnt(model: ReducedModel) -> str:
+    """What the correction of a model came to, in words."""
+    if model.correction is None:
+        return "no correction: too few rows, or none made the errors smaller"
+    left = np.asarray(model.correction.left)
+    return f"corrected; runs left out are off by {np.median(left):.2g} of their motion (largest {left.max():.2g})"
+
+
 class Tried(NamedTuple):
     """A run of a scene by its reduced model."""
 
@@ -29,7 +37,9 @@ class Tried(NamedTuple):
     sentence: str  # what came out
 
 
-def make(scene_file: Path, rows_file: Path, out: Path, tolerance: float, modes: int) -> ReducedModel:
+def make(
+    scene_file: Path, rows_file: Path, out: Path, tolerance: float, modes: int, runs: int | None = None
+) -> ReducedModel:
     """Run the rows of a table with the full model and write the reduced model made from them.
 
     Raises:
@@ -42,7 +52,7 @@ def make(scene_file: Path, rows_file: Path, out: Path, tolerance: float, modes: 
     table = read_sweep(scene_file, rows_file)
     scene = replace(table.scene, solve=replace(table.scene.solve, reduced=""))
     rows = {name: table.rows[:, k] for k, name in enumerate(table.names)}
-    model = reduce_scene(scene, rows, tolerance, modes)
+    model = reduce_scene(scene, rows, tolerance, modes, runs=runs)
     save_reduced(model, out, scene_file.read_text(encoding="utf-8"))
     return model
 

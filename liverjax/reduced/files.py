@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +10,11 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.versions import versions
+from liverjax.reduced.correction import Correction
 from liverjax.reduced.model import ReducedModel
 
+#: Arrays of a correction.
+_LEARNT = ("fields", "factors", "committee", "scale", "effectivity", "left")
 _UNITS = {"modes": "1", "slopes": "1/m", "weights": "m^3", "points": "1"}
 
 
@@ -28,6 +32,10 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
         for name, unit in _UNITS.items():
             out[name] = np.asarray(getattr(model, name))
             out[name].attrs["unit"] = unit
+        if model.correction is not None:
+            for name in _LEARNT:
+                out[f"correction/{name}"] = np.asarray(getattr(model.correction, name))
+            out["correction"].attrs["products"] = model.correction.products
         for name, value in model.ranges.items():
             out[f"ranges/{name}"] = np.asarray(value)
         out.attrs["identity"], out.attrs["scene"] = model.identity, scene_text
@@ -46,6 +54,16 @@ def load_reduced(file: str | Path) -> ReducedModel:
         with h5py.File(file, "r") as stored:
             arrays = {name: jnp.asarray(stored[name][()]) for name in _UNITS}
             ranges = {name: jnp.asarray(value[()]) for name, value in stored.get("ranges", {}).items()}
-            return ReducedModel(**arrays, ranges=ranges, identity=str(stored.attrs["identity"]))
+            identity = str(stored.attrs["identity"])
+            return ReducedModel(**arrays, ranges=ranges, correction=_correction(stored), identity=identity)
     except (OSError, KeyError) as error:
         raise InputError(f"{file} is no reduced model ({error}): make one with python -m liverjax reduce") from None
+
+
+def _correction(stored: Any) -> Correction | None:
+    """The correction of an open file, where it has one."""
+    if "correction" not in stored:
+        return None
+    own = stored["correction"]
+    arrays = {name: jnp.asarray(own[name][()]) for name in _LEARNT}
+    return Correction(**arrays, products=int(own.attrs["products"]))

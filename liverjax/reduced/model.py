@@ -21,6 +21,7 @@ from liverjax.physics.base import Physics
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.loads import follows
 from liverjax.physics.viscosity import Viscoelasticity
+from liverjax.reduced.correction import Correction
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import Matrix, deformation_gradient
@@ -35,6 +36,7 @@ class ReducedModel:
     weights: jax.Array = param("m^3", "reference volume that a point stands for (S,), not negative")
     points: jax.Array = param("1", "number q E + e of point q of element e (S,)")
     ranges: dict[str, Any] = param("1", "parameters of the training: name -> lowest and highest value")
+    correction: Correction | None = param("1", "of what modes and points leave out, or none", default=None)
     identity: str = static(default="", about="digest of what modes and points are made for")
 
     @property

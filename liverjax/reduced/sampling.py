@@ -13,14 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import replace
+from liverjax.elements import mjed
 from liverjax.physics.base import End, Free, Step
+from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 
 #: The most states whose forces are taken: memory and time grow with them and their square.
-MOST_STATES = 160
+MOST_STATES = 120
 
 
 def sampled(
@@ -33,12 +35,15 @@ def sampled(
         scene: `Scene`.
         values: dotted names -> (R, …).
         q: coordinates [m].
-        tolerance: part of the forces that may be left out [1].
+        tolerance: part of the motions by these forces that may be left out [1].
     """
-    rows = []
+    compliance, rows = _compliance(whole, scene), []
     for r, times in states_of(*q.shape[:2]):
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
-        rows.append(np.asarray(_contributions(whole, own, q[r], jnp.asarray(times))).reshape(-1, whole.weights.size))
+        # As motions: forces of stiff modes are large and move little.
+        G = compliance @ np.asarray(_contributions(whole, own, q[r], jnp.asarray(times)))
+        size = np.linalg.norm(G.sum(axis=2), axis=1)
+        rows.append((G / np.maximum(size, 1e-300)[:, None, None]).reshape(-1, whole.weights.size))
     xi = nonnegative_weights(np.concatenate(rows), np.asarray(whole.weights), tolerance)
     points = np.flatnonzero(xi)
     return replace(
@@ -62,9 +67,16 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
     ]
 
 
+def _compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
+    """Inverse of the reduced stiffness of the reference shape (n, n) [m/N]."""
+    modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
+    K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
+    return np.linalg.inv(modes @ (K @ modes.T))
+
+
 @jax.jit
 def _contributions(whole: ReducedModel, scene: Scene, q: jax.Array, times: jax.Array) -> jax.Array:
-    """Contribution of each point to each reduced force along a run, at some times: (K, n, P), each state of size 1."""
+    """Contribution of each point to each reduced force along a run, at some times: (K, n, P)."""
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0 = prescribed_gradients(whole, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, False, None, Free(jnp.ones_like(points)))
@@ -79,9 +91,7 @@ def _contributions(whole: ReducedModel, scene: Scene, q: jax.Array, times: jax.A
 
     P: jax.Array
     _, P = jax.lax.scan(advance, memory, (jnp.arange(len(q)), q))
-    G = jnp.sum(whole.slopes[None] * (whole.weights[None, None] * P[times])[:, None], axis=2)
-    size = jnp.linalg.norm(jnp.sum(G, axis=2), axis=1)
-    return G / jnp.maximum(size, 1e-300)[:, None, None]
+    return jnp.sum(whole.slopes[None] * (whole.weights[None, None] * P[times])[:, None], axis=2)
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:

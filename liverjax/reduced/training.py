@@ -1,7 +1,7 @@
-"""Modes from runs of the full model: proper orthogonal decomposition of their displacements."""
+"""Modes from runs of the full model (proper orthogonal decomposition of their displacements), and which runs."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,19 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.prescribed import free_degrees
+from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
 from liverjax.reduced.model import ReducedModel, refuse_unknown_physics, with_all_points
+from liverjax.reduced.run import simulate_reduced
 from liverjax.reduced.sampling import sampled
-from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
+
+
+class _Runs(NamedTuple):
+    """Full runs that converged."""
+
+    values: dict[str, np.ndarray]  # the numbers of their rows (R, ...)
+    u: np.ndarray  # displacements (R, T, V, 3) [m]
 
 
 def reduce_scene(
@@ -24,6 +33,7 @@ def reduce_scene(
     tolerance: float = 1e-4,
     most_modes: int = 40,
     point_tolerance: float | None = None,
+    runs: int | None = None,
 ) -> ReducedModel:
     """A reduced model of a scene, from full runs with the numbers of some rows.
 
@@ -32,30 +42,100 @@ def reduce_scene(
         rows: dotted names -> one value a run, as of `simulate_batch`.
         tolerance: part of the displacements of these runs that the modes may leave out [1], root of mean squares.
         most_modes: the most modes.
-        point_tolerance: part of the reduced forces that the sampled points may leave out [1]; default: `tolerance`.
+        point_tolerance: part of the motions by the reduced forces that the sampled points may leave out [1]; default:
+            `tolerance`.
+        runs: of the full model. The first two thirds are the first rows. Of the others, those follow whose errors a
+            first reduced model states as the largest, over its own displacements. Default: all rows.
 
     Raises:
-        InputError: physics that a reduced model has not, a tolerance outside of 0 to 1, no row whose run converged.
+        InputError: physics that a reduced model has not, a tolerance outside of 0 to 1, no row whose run converged,
+            `runs` that are none of the rows.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance
     for name, value in (("tolerance", tolerance), ("point_tolerance", point_tolerance)):
         if not 0 < value < 1:
             raise InputError(f"{name} = {value} must be between 0 and 1: give e.g. 1e-4")
-    result = simulate_batch(scene, dict(rows)).result
+    values = {name: np.asarray(value, float) for name, value in rows.items()}
+    count = len(next(iter(values.values()), ()))
+    runs = count if runs is None else runs
+    if not FEWEST_RUNS <= runs <= count and runs != count:
+        raise InputError(f"runs = {runs} must be {FEWEST_RUNS} to {count}, the number of rows")
+    if runs == count:
+        return _model_of(scene, _full_runs(scene, values), tolerance, most_modes, point_tolerance)
+    first = 2 * runs // 3
+    own = _full_runs(scene, _some(values, slice(first)))
+    model = _model_of(scene, own, tolerance, most_modes, point_tolerance)
+    others = _some(values, slice(first, None))
+    far = np.argsort(_errors_of_rows(model, scene, others))[::-1][: runs - first]
+    more = _full_runs(scene, _some(others, far))
+    values = {name: np.concatenate([own.values[name], more.values[name]]) for name in values}
+    return _model_of(scene, _Runs(values, np.concatenate([own.u, more.u])), tolerance, most_modes, point_tolerance)
+
+
+def _some(values: Mapping[str, np.ndarray], which: Any) -> dict[str, np.ndarray]:
+    return {name: value[which] for name, value in values.items()}
+
+
+def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
+    result = simulate_batch(scene, dict(values)).result
     good = np.all(np.asarray(result.status) == status.CONVERGED, axis=1)
     if not good.any():
         raise InputError(f"none of the {len(good)} runs converged: give smaller loads or steps in the rows")
-    values = {name: np.asarray(value, float)[good] for name, value in rows.items()}
     mask = free_degrees(scene.mesh, scene.fixed, scene.displaced)
-    u = np.asarray(mask[None, None] * (result.positions[good] - scene.mesh.points[None, None]))
-    volumes = np.asarray(nodal_volumes(scene.mesh))
+    u = np.asarray(result.positions)[good]
+    u -= np.asarray(scene.mesh.points)
+    u *= np.asarray(mask)
+    return _Runs(_some(values, good), u)
+
+
+def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, point_tolerance: float) -> ReducedModel:
+    u, volumes = runs.u, np.asarray(nodal_volumes(scene.mesh))
     modes = proper_modes(u.reshape(-1, *u.shape[-2:]), volumes, tolerance)[:most_modes]
     whole = with_all_points(scene, jnp.asarray(modes))
     q = jnp.einsum("rtvc,nvc->rtn", u * volumes[:, None], whole.modes)
-    chosen = sampled(whole, scene, values, q, point_tolerance)
-    ranges = {name: np.stack([v.min(axis=0), v.max(axis=0)]) for name, v in values.items()}
-    return replace(chosen, ranges=jax.tree.map(jnp.asarray, ranges))
+    model = sampled(whole, scene, runs.values, q, point_tolerance)
+    ranges = {name: jnp.asarray(np.stack([v.min(axis=0), v.max(axis=0)])) for name, v in runs.values.items()}
+    model = replace(model, ranges=ranges)
+    return replace(model, correction=_learnt_from(model, scene, runs))
+
+
+def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
+    q, failed = _coordinates_of_rows(model, scene, runs.values)
+    moved = np.linalg.norm(runs.u, axis=-1).max(axis=(1, 2))
+    good = ~failed & (moved > 0)
+    missing = runs.u[good] - np.tensordot(q[good], np.asarray(model.modes), axes=1)
+    volumes = np.asarray(nodal_volumes(scene.mesh))
+    return learnt_correction(Learnt(q[good], missing, moved[good], volumes, scene.solve.dt))
+
+
+def _coordinates_of_rows(
+    model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates (R, T, n) [m] of reduced runs of all rows, and which of them failed (R,)."""
+
+    def run(model: ReducedModel, values: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        found = simulate_reduced(model, with_parameters(scene, values))
+        return found.coordinates, found.status
+
+    together = jax.jit(lambda model, values: jax.lax.map(lambda own: run(model, own), values))
+    q, code = together(model, {name: jnp.asarray(value) for name, value in values.items()})
+    return np.asarray(q), np.any(np.asarray(code) != status.CONVERGED, axis=1)
+
+
+def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Size of the correction (or of the largest coordinates where there is none), over the largest displacement."""
+    q, failed = _coordinates_of_rows(model, scene, values)
+    found = np.zeros(len(q))
+    for k, own in enumerate(q):
+        u = np.linalg.norm(np.tensordot(own, np.asarray(model.modes), axes=1), axis=-1).max()
+        if model.correction is None:
+            found[k] = u
+            continue
+        off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
+        found[k] = off.max() / max(u, 1e-300)
+    # A run that fails has nothing to say; the full one would most likely fail too.
+    return np.where(failed, -1.0, found)
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
