@@ -217,13 +217,16 @@ def test_derivatives_and_lanes(trained):
 
 def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     scene, model = trained
+    q = np.random.default_rng(6).normal(size=(12, 6, 3))
+    fields = np.ones((2, 7, 3)) * np.arange(2)[:, None, None]
+    model = replace(model, correction=learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(7), 0.1)))
     lj.save_reduced(model, tmp_path / "model.h5")
     again = lj.load_reduced(tmp_path / "model.h5")
     assert again.identity == model.identity and np.array_equal(again.slopes, model.slopes)
     assert np.array_equal(again.correction.committee, model.correction.committee)
     assert again.correction.products == model.correction.products
+    bare = replace(model, correction=None)
     with pytest.raises(lj.InputError, match="has no correction"):
-        bare = replace(model, correction=None)
         lj.stated_error(bare, scene, lj.simulate_reduced(bare, scene))
     with pytest.raises(lj.InputError, match="runs = 3 must be 6 to 9, the number of rows"):
         lj.reduce_scene(scene, {"law.mu": np.linspace(700, 900, 9)}, runs=3)

@@ -356,7 +356,7 @@ def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) 
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
     """Largest distance of a node from the full model (T,) [m], as learnt from runs left out; of use in every step.
 
-    It costs less than the run, and may be differentiated, vmapped and jitted. `reduced_error` asks the full mesh.
+    It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` asks the full mesh.
 
     Args:
         model, scene, result: as of `simulate_reduced`.
