@@ -11,13 +11,13 @@ polynomials made without a group are a committee: what they differ by tells how 
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import Number, param, static, struct
 
 #: Groups of runs that are left out in turn, and the fewest runs that are corrected.
 GROUPS, FEWEST_RUNS = 6, 6
@@ -51,10 +51,10 @@ class Learnt(NamedTuple):
     missing: np.ndarray  # full minus reduced motion (R, T, V, 3) [m]
     moved: np.ndarray  # largest displacement of each run (R,) [m]
     volumes: np.ndarray  # of the nodes (V,) [m^3]
-    dt: Any  # [s], None without time
+    dt: Number | None  # [s], None without time
 
 
-def terms(q: jax.Array, scale: Any, products: int, dt: Any) -> jax.Array:
+def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.Array:
     """The polynomial's terms at coordinates q (T, n) of a run from rest: (T, k)."""
     x = q / scale
     i, j = np.triu_indices(min(products, x.shape[-1]))
@@ -66,12 +66,12 @@ def terms(q: jax.Array, scale: Any, products: int, dt: Any) -> jax.Array:
     return jnp.concatenate(found, axis=1)
 
 
-def correction_at(own: Correction, q: jax.Array, dt: Any) -> jax.Array:
+def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
     """What is added to the motion of the nodes: (T, V, 3) [m]."""
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
-def stated_at(own: Correction, q: jax.Array, dt: Any) -> jax.Array:
+def stated_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
     """Stated largest distance of a node from the full model after the correction: (T,) [m]."""
     return own.effectivity * jackknife(terms(q, own.scale, own.products, dt), own.committee - own.factors[None])
 

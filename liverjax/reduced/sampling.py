@@ -37,7 +37,7 @@ def sampled(
         q: coordinates [m].
         tolerance: part of the motions by these forces that may be left out [1].
     """
-    compliance, rows = _compliance(whole, scene), []
+    compliance, rows = _reduced_compliance(whole, scene), []
     for r, times in states_of(*q.shape[:2]):
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
         # As motions: forces of stiff modes are large and move little.
@@ -67,7 +67,7 @@ def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
     ]
 
 
-def _compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
+def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
     """Inverse of the reduced stiffness of the reference shape (n, n) [m/N]."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)

@@ -73,7 +73,7 @@ def reduce_scene(
     return _model_of(scene, _Runs(values, np.concatenate([own.u, more.u])), tolerance, most_modes, point_tolerance)
 
 
-def _some(values: Mapping[str, np.ndarray], which: Any) -> dict[str, np.ndarray]:
+def _some(values: Mapping[str, np.ndarray], which: slice | np.ndarray) -> dict[str, np.ndarray]:
     return {name: value[which] for name, value in values.items()}
 
 
