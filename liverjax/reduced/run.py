@@ -200,11 +200,10 @@ def _newton(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse:
         own = jnp.linalg.inv(_reduced_tangent(e, at.q))
         return at._replace(inverse=own, fresh=jnp.array(True), tangents=at.tangents + 1)
 
-    # The acceleration goes on as it was: a parabola through the last coordinates.
-    if e.motion is None:
-        start = e.q
-    else:
-        start = e.q + e.dt * e.motion.velocity + (0.5 if newmark else 1.0) * e.dt**2 * e.motion.acceleration
+    start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
+    if e.motion is not None and not newmark:
+        # A parabola through the last coordinates. Accelerations of Newmark's method ring: they foretell nothing.
+        start = start + e.dt**2 * e.motion.acceleration
     start = jnp.where(_upright(_deformation(e, start)), start, e.q)
     F, none = _deformation(e, start), jnp.zeros((), jnp.int32)
     r, size = _judged(e, start, F)
