@@ -368,7 +368,13 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
 
 
 #: What a reader calls the sources of errors.
-SOURCES = {"noise": "noise", "geometry": "gap and radius", "band": "ends of the band", "mesh": "mesh"}
+SOURCES = {
+    "noise": "noise",
+    "geometry": "gap and radius",
+    "band": "ends of the band",
+    "mesh": "mesh",
+    "time_step": "time step",
+}
 
 
 def _totals(fit: Fit) -> list[str]:
