@@ -68,6 +68,7 @@ NUMBERS = (
     "traction.0.history",
     "region.0.law.bulk",
 )
+#: The bulk modulus of a sponge takes the place of the law's, so a law's own moves nothing then.
 FLUID = ("porosity.inlet.0.flux", "porosity.inlet.1.pressure", "region.1.viscosity.ratios", "region.1.porosity.bulk")
 
 
@@ -144,7 +145,7 @@ ORDERS = pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.slow
 @ORDERS
 def test_in_motion_with_viscosity_and_fluid_it_sweeps_and_has_gradients(order):
-    check_sweep_and_gradient(in_motion(order), NUMBERS + FLUID)
+    check_sweep_and_gradient(in_motion(order), NUMBERS[:-1] + FLUID)
 
 
 @pytest.mark.slow
@@ -162,7 +163,7 @@ def test_robust_steps_find_the_same_from_an_inverted_start(order):
     rest = lj.simulate(plain).check().positions
     run = jax.jit(lambda start: lj.simulate(robust, start=start))
     mesh = plain.mesh
-    noise = 0.3 * SIZE[1] * np.random.default_rng(3).standard_normal(mesh.points.shape)
+    noise = {1: 0.6, 2: 0.3}[order] * SIZE[1] * np.random.default_rng(3).standard_normal(mesh.points.shape)
     start = mesh.points + jnp.asarray(noise).at[mesh.node_sets["x_min"]].set(0.0)
     assert volume_ratios(mesh, start).min() < 0
     for begin in (mesh.points, start):
