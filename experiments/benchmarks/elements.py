@@ -345,7 +345,9 @@ def main(wanted: list[str]) -> None:
 def _figure(rows: list[dict]) -> plt.Figure:
     """Error against run time of the bodies that have a truth."""
     cases = [(b, r) for b, r in dict.fromkeys((row["body"], row["ratio"]) for row in rows if "error" in row)]
-    figure, all_axes = plt.subplots(1, max(len(cases), 1), figsize=(3.1 * max(len(cases), 1), 3.2), squeeze=False)
+    figure, all_axes = plt.subplots(
+        1, max(len(cases), 1), figsize=(3.1 * max(len(cases), 1), 3.4), squeeze=False, layout="constrained"
+    )
     for axes, (body, ratio) in zip(all_axes[0], cases, strict=False):
         for colour, form in zip(COLOURS, FORMS, strict=False):
             own = [r for r in rows if (r["body"], r["ratio"], r["form"]) == (body, ratio, form)]
@@ -357,8 +359,7 @@ def _figure(rows: list[dict]) -> plt.Figure:
         axes.set_xlabel("run time [s]")
         plain_ticks(axes.yaxis)
     all_axes[0][0].set_ylabel("error [%] (crosses: corrected)")
-    all_axes[0][0].legend(fontsize=7)
-    figure.tight_layout()
+    figure.legend(*all_axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=len(FORMS))
     return figure
 
 
