@@ -38,15 +38,21 @@ class Flow(NamedTuple):
     enters: jax.Array | None = None  # (V,) [m^3] what enters during the step; None: nothing does
 
 
-def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
-    """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
-    mask = jnp.ones(mesh.number_of_vertices, J.dtype)
+def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Array:
+    """1 at vertices (V,) whose pressure is unknown, 0 where it is drained or given."""
+    mask = jnp.ones(mesh.number_of_vertices, dtype)
     if porosity.drained is not None:
         # Pressures belong to vertices: the middles of edges among the nodes are left out.
         mask = mask.at[porosity.drained].set(0.0, mode="drop")
     for inlet in porosity.inlet:
         if inlet.nodes is not None:
             mask = mask.at[inlet.nodes].set(0.0, mode="drop")
+    return mask
+
+
+def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
+    """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
+    mask = unknown_pressures(porosity, mesh, J.dtype)
     # Everything times dt: the storage term stays of the size of a volume whatever the step.
     J = jnp.maximum(J, LEAST_J)
     by_element = jnp.ndim(porosity.limit_bulk) > 0

@@ -21,7 +21,7 @@ from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import integrals, summed
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Step
-from liverjax.physics.darcy import LEAST_J
+from liverjax.physics.darcy import LEAST_J, unknown_pressures
 from liverjax.physics.porosity import Porosity, inflow, law_in_force, volumetric_slope, volumetric_stress
 from liverjax.physics.volumes.averaged import Averaged
 from liverjax.physics.volumes.mixed import Mixed, MixedVolume
@@ -66,12 +66,7 @@ def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalar
 
 def _of_sponge(porosity: Porosity, mesh: TetMesh, F: Matrix) -> Pressures:
     J, g = jnp.maximum(determinant(F), LEAST_J), volume_gradients(mesh, F)
-    mask = jnp.ones(mesh.number_of_vertices, J.dtype)
-    if porosity.drained is not None:
-        mask = mask.at[porosity.drained].set(0.0, mode="drop")
-    for inlet in porosity.inlet:
-        if inlet.nodes is not None:
-            mask = mask.at[inlet.nodes].set(0.0, mode="drop")
+    mask = unknown_pressures(porosity, mesh, J.dtype)
     pressures, enters = inflow(porosity, mesh, 0.0, 1.0)
     weight = porosity.permeability * mesh.weights / J
     flow = jnp.stack([jnp.stack([summed(mesh, weight * dot(a, b)) for b in g]) for a in g])
