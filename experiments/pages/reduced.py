@@ -42,6 +42,8 @@ def table() -> str:
             ]
         if "change_within_factor_2" in r:
             rows += ["", correction(r)]
+        else:
+            rows += ["", "This model is of before the learnt correction and the choice of rows by their stated error."]
     rows += [
         "",
         "The models that the chapter names, under the weight alone; the viscous full model is the truth. The first",
