@@ -23,12 +23,16 @@ from liverjax.scenes.scene import Scene, with_parameters
 
 #: The most states whose forces are taken: memory and time grow with them and their square.
 MOST_STATES = 120
+#: States whose forces move less than this part of the largest coordinate are left out: roundoff [1].
+LEAST_MOTION = 1e-9
 
 
 def sampled(
     whole: ReducedModel, scene: Scene, values: Mapping[str, Any], q: jax.Array, tolerance: float
 ) -> ReducedModel:
     """The model with few points, from one of all points and coordinates q (R, T, n) of runs with R rows of values.
+
+    States are left out if they are at rest, or if an element is inside out there and its law then has no force.
 
     Args:
         whole: as `with_all_points` makes it.
@@ -43,7 +47,9 @@ def sampled(
         # As motions: forces of stiff modes are large and move little.
         G = compliance @ np.asarray(_contributions(whole, own, q[r], jnp.asarray(times)))
         size = np.linalg.norm(G.sum(axis=2), axis=1)
-        rows.append((G / np.maximum(size, 1e-300)[:, None, None]).reshape(-1, whole.weights.size))
+        # Where modes alone turn an element inside out, some laws have no force; a state at rest has none to share.
+        good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
+        rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
     xi = nonnegative_weights(np.concatenate(rows), np.asarray(whole.weights), tolerance)
     points = np.flatnonzero(xi)
     return replace(
