@@ -5,7 +5,7 @@ drawn in a box of them, and some are corners of it, where a first model stated t
 drawn in a box 10 % wider. The full model on the same mesh is the truth: what the mesh leaves out is in neither. The
 tables give one core's times, compilation apart.
 
-``python -m experiments reduced`` (20 minutes) writes results/reduced.json.
+``python -m experiments reduced`` (8 minutes) writes results/reduced.json.
 """
 
 import itertools

@@ -40,10 +40,7 @@ def table() -> str:
                 "",
                 f"In {r['failed']} of the runs a step failed, or its error was not found: the full model would run.",
             ]
-        if "change_within_factor_2" in r:
-            rows += ["", correction(r)]
-        else:
-            rows += ["", "This model is of before the learnt correction and the choice of rows by their stated error."]
+        rows += ["", correction(r)]
     rows += [
         "",
         "The models that the chapter names, under the weight alone; the viscous full model is the truth. The first",
