@@ -26,9 +26,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 ROOT = Path(__file__).parent.parent
 #: Results of other programs and measured data that are not part of the project.
 SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
-# XLA's newer way to write kernels takes half of the time of a compilation; 0.11 knows no other.
+# XLA's newer way to write kernels takes two thirds of the time of a compilation; 0.11 knows no other. And a program in
+# one part compiles a seventh faster on the one core that a worker has.
 if "XLA_FLAGS" not in os.environ and version("jaxlib").startswith(("0.8.", "0.9.", "0.10.")):
-    os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 #: Files that take seconds: with -x they tell within half a minute what is broken.
 QUICK = {
@@ -49,9 +50,10 @@ QUICK = {
         "stretches",
     )
 }
-#: Programs after which a file begins without any: some 430 live ones fill the memory maps that Linux grants a process,
-#: and jax 0.10.1 crashes then. Files that compile few go on with what is there.
-MANY_PROGRAMS = 100
+#: Programs after which a file begins without any. Each takes a megabyte or two, and ten of the 65,530 memory maps that
+#: Linux grants a process (150 if it is compiled in parts: some 430 programs made jax 0.10.1 crash). Files that compile
+#: few go on with what is there.
+MANY_PROGRAMS = 400
 
 
 def pytest_addoption(parser):
@@ -113,12 +115,14 @@ def pytest_unconfigure(config):
         shutil.rmtree(config.compiled, ignore_errors=True)
 
 
-_compiled: list[float] = []
+#: Programs compiled or found on disk since caches were last emptied. Tests count with it, for to remove a listener of
+#: their own would remove this one too.
+COMPILED: list[float] = []
 
 
 def _count(event: str, seconds: float, **_: object) -> None:
     if event.endswith("backend_compile_duration"):
-        _compiled.append(seconds)
+        COMPILED.append(seconds)
 
 
 jax.monitoring.register_event_duration_secs_listener(_count)
@@ -130,9 +134,9 @@ def _compilation(request):
     changed = quick != jax.config.values["jax_disable_most_optimizations"]
     jax.config.update("jax_disable_most_optimizations", quick)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(quick))  # of commands that tests start
-    if changed or len(_compiled) > MANY_PROGRAMS:
+    if changed or len(COMPILED) > MANY_PROGRAMS:
         jax.clear_caches()
-        _compiled.clear()
+        COMPILED.clear()
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,8 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.laws import gradient_check, homogeneous
 
+pytestmark = pytest.mark.quick_to_compile
+
 HEAD = """
 import jax.numpy as jnp
 import liverjax as lj

@@ -192,18 +192,19 @@ def check_derivatives(scene: lj.Scene, at: dict, hertz: np.ndarray, about: jax.A
     results = [a for a in (found.displacement, found.pressure) if a is not None]
     weights = [jnp.asarray(rng.normal(size=a.shape)) / float(jnp.abs(a).max()) for a in results]
 
-    @jax.jit
     def loss(values):
         r = lj.harmonic(lj.with_parameters(scene, values), hertz, about=about)
         kept = [a for a in (r.displacement, r.pressure) if a is not None]
         return sum(jnp.sum(w * a.real + w[::-1] * a.imag) for w, a in zip(weights, kept, strict=True))
 
-    gradient = jax.jit(jax.grad(loss))(at)
+    # One program for values and gradients: a third fewer to compile.
+    both = jax.jit(jax.value_and_grad(loss))
+    gradient = both(at)[1]
     slope = sum(float(jnp.vdot(gradient[name], way[name])) for name in at)
     forward = jax.jit(lambda v: jax.jvp(loss, (v,), (way,))[1])(at)
 
     def moved(h):
-        return float(loss({name: at[name] + h * way[name] for name in at}))
+        return float(both({name: at[name] + h * way[name] for name in at})[0])
 
     errors = [abs((moved(h) - moved(-h)) / (2 * h) / slope - 1) for h in (1e-3, 1e-4, 1e-5)]
     assert np.isclose(slope, float(forward), rtol=1e-10)

@@ -1,5 +1,6 @@
 """The installed JAX computes element loops correctly, and the package sets what it says it sets."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 from conftest import ROOT
 
 import liverjax as lj
+from liverjax.core import programs
 from liverjax.laws import LAWS
 
 MISCOMPILED = """
@@ -31,21 +33,37 @@ def test_known_miscompilation_is_absent():
     assert run.returncode == 0, run.stderr
 
 
+def _import_again():
+    """Run the package's file once more, under another name."""
+    spec = importlib.util.spec_from_file_location("again", ROOT / "liverjax" / "__init__.py")
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
 @pytest.mark.parametrize("release", ["0.10.2", "0.11.0"])
-def test_affected_release_is_refused(release):
-    code = f"import jax; jax.__version__ = {release!r}\nimport liverjax"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert run.returncode != 0 and f"jax {release}" in run.stderr and "pip install" in run.stderr
+def test_affected_release_is_refused(release, monkeypatch):
+    monkeypatch.setattr(jax, "__version__", release)
+    with pytest.raises(ImportError, match=f"jax {release} .* pip install"):
+        _import_again()
 
 
-@pytest.mark.parametrize(("setting", "expected"), [(None, "True"), ("0", "False")])
-def test_import_turns_on_64_bits_unless_the_user_chose(setting, expected, monkeypatch):
-    monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
-    if setting is not None:
-        monkeypatch.setenv("JAX_ENABLE_X64", setting)
-    code = "import liverjax, jax; print(jax.config.jax_enable_x64)"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == expected
+def test_import_turns_on_64_bits_unless_the_user_chose(monkeypatch):
+    told = []
+    monkeypatch.setattr(type(jax.config), "update", lambda _, *what: told.append(what))
+    monkeypatch.setenv("JAX_ENABLE_X64", "0")
+    _import_again()
+    assert told == []
+    monkeypatch.delenv("JAX_ENABLE_X64")
+    _import_again()
+    assert told == [("jax_enable_x64", True)]
+
+
+def test_the_import_sets_64_bits_and_no_cache():
+    """In a process of its own, as a user has it."""
+    told = "import liverjax, fitting, jax; print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir)"
+    unset = ("JAX_COMPILATION", "JAX_ENABLE_X64", programs.SWITCH)
+    plain = {k: v for k, v in os.environ.items() if not k.startswith(unset)}
+    run = subprocess.run([sys.executable, "-c", told], cwd=ROOT, env=plain, capture_output=True, text=True)
+    assert run.stdout.strip() == "True None", run.stderr
 
 
 def test_types_are_checked():

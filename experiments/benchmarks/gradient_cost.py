@@ -5,6 +5,7 @@ against forward mode (another way to the same number), and for short runs of a s
 of several widths: the V-shaped curve.
 
     python -m experiments gradient_cost [--quick]
+    python -m experiments.benchmarks.gradient_cost complete 1000 all    (these rows again, beside the others)
 """
 
 import json
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
-from experiments.common import plt, save
+from experiments.common import RESULTS, plt, save
 from experiments.liver import models, with_solve
 from liverjax.core.plotting import BLUE, GREEN, ORANGE
 from liverjax.core.struct import replace
@@ -102,19 +103,22 @@ def measure(model: str, steps: int, store: str) -> dict:
     return row
 
 
-def main(quick: bool) -> None:
-    """All rows, table and figure."""
+def main(quick: bool, words: list[str]) -> None:
+    """All rows, or those that have all `words`; table and figure."""
     cases = [("small", n, s) for n in (10, 100, 1000, 10_000) for s in ("all", "sqrt")]
     cases += [("hyperelastic", 100, "all"), ("viscous", 100, "all")]
     cases += [("complete", n, s) for n in (10, 100, 1000) for s in ("all", "sqrt")]
     if quick:
         cases = [("small", 10, "all")]
-    rows = []
-    for case in cases:
+    found = {}
+    if words:
+        kept = json.loads((RESULTS / "gradient_cost.json").read_text())["rows"]
+        found = {(r["model"], r["steps"], r["store"]): r for r in kept}
+    for case in [case for case in cases if set(words) <= set(map(str, case))]:
         command = [sys.executable, "-m", "experiments.benchmarks.gradient_cost", "--case", *map(str, case)]
-        rows.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
-        shown = {k: v for k, v in rows[-1].items() if k != "differences"}
-        print(shown, flush=True)
+        found[case] = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        print({k: v for k, v in found[case].items() if k != "differences"}, flush=True)
+        rows = list(found.values())
         save("gradient_cost", {"rows": rows}, figure(rows))
 
 
@@ -147,4 +151,4 @@ if __name__ == "__main__":
         _, _, model, steps, store = sys.argv
         print(json.dumps(measure(model, int(steps), store)))
     else:
-        main("--quick" in sys.argv[1:])
+        main("--quick" in sys.argv[1:], [a for a in sys.argv[1:] if not a.startswith("-")])
