@@ -11,7 +11,7 @@ import scipy.optimize
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.elements import mjed, projection, reference
-from liverjax.scenes import regions
+from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.scene import with_parameters
 from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.run import prepared
@@ -63,7 +63,7 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(order, kinds):
         lj.Region(elements=jnp.asarray(e), law=lj.laws.typical(kind)) for kind, e in zip(kinds, parts, strict=True)
     )
     by_element = replace(LIVER, mu=jnp.linspace(500.0, 900.0, E))
-    law = regions.law_of_elements(by_element, own, E)
+    law = law_of_elements(by_element, own, E)
     x = mesh.points + 2e-4 * jax.random.normal(jax.random.key(0), mesh.points.shape)
 
     def energy(x):
@@ -91,7 +91,7 @@ def test_projected_stiffness_has_no_negative_eigenvalue():
     E = mesh.number_of_elements
     own = (lj.Region(elements=upper(mesh), law=lj.laws.typical("saint_venant_kirchhoff")),)
     stable = lj.laws.typical("stable_neo_hookean")
-    law = regions.law_of_elements(stable, own, E)
+    law = law_of_elements(stable, own, E)
     F = unpack(jnp.eye(3)[None] + 0.6 * jax.random.normal(jax.random.key(0), (E, 3, 3)))
     D = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
     pairs = tuple((a, b) for a in range(3) for b in range(3))

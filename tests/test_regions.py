@@ -8,7 +8,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.scenes import regions
+from liverjax.scenes.by_element import law_of_elements
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -42,11 +42,11 @@ def test_every_number_of_every_law_may_differ_by_element(name):
             continue  # an exponent's sign is part of how a stretch law is evaluated
         other = 1.1 * float(base)
         changed = replace(law, **{field.name: (other, *value[1:]) if isinstance(value, tuple) else other})
-        whole = regions.law_of_elements(law, (lj.Region(elements=all_of_it, law={label: other}),), E)
+        whole = law_of_elements(law, (lj.Region(elements=all_of_it, law={label: other}),), E)
         force = lj.mjed.internal_force(mesh, changed, x)
         scale = float(jnp.abs(force).max())
         np.testing.assert_allclose(lj.mjed.internal_force(mesh, whole, x), force, atol=1e-13 * scale)
-        mixed = regions.law_of_elements(law, (lj.Region(elements=half, law={label: other}),), E)
+        mixed = law_of_elements(law, (lj.Region(elements=half, law={label: other}),), E)
         parts = []
         for numbers, one in ((np.arange(E // 2), changed), (np.arange(E // 2, E), law)):
             part = lj.tet_mesh(mesh.points, np.asarray(mesh.tetrahedra)[numbers])
@@ -136,7 +136,7 @@ def test_regions_of_a_scene_file(tmp_path):
     np.testing.assert_array_equal(region.elements, np.flatnonzero(middle[:, 0] > 0.02))
     softer = lj.with_parameters(scene, {"region.0.law.mu.1": 10.0})
     assert softer.region[0].law["mu.1"] == 10.0
-    law = regions.law_of_elements(softer.law, softer.region, scene.mesh.number_of_elements)
+    law = law_of_elements(softer.law, softer.region, scene.mesh.number_of_elements)
     assert float(law.mu[1].min()) == 10.0 and float(law.mu[1].max()) == 300.0
 
 

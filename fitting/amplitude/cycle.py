@@ -1,11 +1,11 @@
 """One steady cycle of large shear: storage and loss modulus of the first harmonic, and how large the third is.
 
-The sample is incompressible and isotropic, and keeps its strain energy function W; the part of the second
-Piola-Kirchhoff stress S that W gives relaxes with a memory that no strain changes (chapter, section 4.2). In simple
-shear of amount g(t) = a sin(wt) the shear stress is S12 + g S22, whatever the pressure is. S is a sum of harmonics of
-w, and the memory multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates every ring of the sample is in
-simple shear of its own amount (a universal deformation: Rivlin 1949), so the torque is a sum over rings; a rheometer
-reads it as if the sample were linear.
+The sample is incompressible and isotropic, and keeps its strain energy function W; the stress S (second
+Piola-Kirchhoff) that follows from W relaxes, and strain does not change how fast (chapter, section 4.2). In simple
+shear of amount g(t) = a sin(wt) the shear stress is S12 + g S22 for every pressure. S is a sum of harmonics of w, and
+the memory multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates every ring of the sample is in simple
+shear of its own amount (a universal deformation: Rivlin 1949), so the torque is a sum over rings; a rheometer reads it
+as if the sample were linear.
 """
 
 from typing import NamedTuple

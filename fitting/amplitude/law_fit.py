@@ -66,7 +66,7 @@ def memory_from(path: Path) -> Memory:
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
     """Least squares of the relative misfit of G* at all amplitudes, the best of many starts.
 
-    Without a Prony series the loss tangent is one more number, and the modulus is that of the frequency.
+    Without a Prony series the loss tangent is one more number of the fit, and the modulus holds at this frequency only.
     """
     own = candidate if memory.series is not None else with_loss_tangent(candidate)
     memories = memory.of(sweep.angular_frequency)
@@ -120,7 +120,7 @@ def _as_curves(sweep: StrainSweep) -> list[Curve]:
 
 
 def said_of(sweep: StrainSweep, best: StrainFit) -> list[str]:
-    """Warnings for a reader of the fit."""
+    """Warnings about the fit for its reader."""
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
     change = tangents[-1] / tangents[0] - 1

@@ -268,7 +268,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
 
 
 def _check_master(options: argparse.Namespace) -> None:
-    """Refuse what a master curve does not have."""
+    """Refuse options that do not go with a master curve."""
     if options.master is None:
         if options.vertical:
             raise InputError("--vertical is of a master curve: give --master too")
@@ -382,7 +382,7 @@ def _simulation(options: argparse.Namespace) -> "Simulation":
 
 
 def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Posterior | None":
-    """Samples of the posterior of the last fit, where they are asked for and its numbers are few."""
+    """Samples of the posterior of the last fit, if the user asks for them and the model has few numbers."""
     from fitting.fits import posterior
 
     if not options.samples:

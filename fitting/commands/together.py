@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def read_any(options: argparse.Namespace, path: Path) -> "Measured":
-    """A test in a rig, shear waves, a test in time, or another sweep."""
+    """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep."""
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion
 

@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _forces_that_balance(data: Path) -> Iterator[None]:
-    """One sentence where the equations have no solution."""
+    """Run with one clear sentence if the equations have no solution."""
     try:
         yield
     except np.linalg.LinAlgError:
@@ -100,7 +100,7 @@ def _forces_that_balance(data: Path) -> Iterator[None]:
 
 
 def _organ(options: argparse.Namespace, field) -> "Organ":
-    """The body of the voxels, coarse enough for the memory."""
+    """The body of the voxels, made coarser if it does not fit into the memory."""
     from fitting.waves import elastography, wave_field
 
     stride = options.stride or 1

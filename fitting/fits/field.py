@@ -120,7 +120,7 @@ class _Search:
         self.progress(self.k, self.chi2 / self.problem.components)
 
     def write(self) -> None:
-        """Write the point reached, as a whole."""
+        """Write the point reached to a file that is there whole or not at all."""
         if self.file is None:
             return
         with whole(self.file) as new, h5py.File(new, "w") as f:
@@ -303,7 +303,8 @@ def _bias_of_map(
 
 
 def bias_sentence(found: Field) -> str | None:
-    """Where the mesh moves the map by more than its standard deviation; None: nowhere, or not known."""
+    """A sentence where the mesh moves the map by more than its standard deviation; None if it does so nowhere, or if
+    this is not known."""
     if found.mesh_bias is None:
         return None
     largest, beyond = np.abs(found.mesh_bias).max(), np.abs(found.mesh_bias) > found.sd

@@ -1,7 +1,7 @@
 """A stiff or soft sphere in a uniform body, from measured displacements: where, how large, how stiff.
 
-Few parameters instead of a map: a smooth field spreads what is sharp, so its peak is no measure of an inclusion's
-modulus; a map says where to begin. The edge is as soft as the mesh is coarse, which keeps the sphere's place
+It has few parameters, unlike a map. A smooth map spreads a sharp edge, so its peak does not measure the modulus of an
+inclusion. A map only says where to begin. The edge is as soft as the mesh is coarse, which keeps the sphere's place
 differentiable. Radius and modulus trade off: the elements should be small beside the sphere, or quadratic.
 """
 
@@ -39,7 +39,8 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
-    """u of the sphere that the map suggests: where ln(modulus) is beyond half of its largest departure."""
+    """Unknowns u of the sphere that the map suggests: the places where ln(modulus) departs by more than half of the
+    largest departure."""
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
     volumes = np.asarray(mesh.volumes)

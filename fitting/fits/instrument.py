@@ -1,7 +1,7 @@
 """Errors of the instrument in a fit, shared by all points: inertia and gap, each with a prior; and compression.
 
 The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K where I is off by delta. Fitted without a
-prior, such a term takes up whatever the model misses. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
+prior, such a term takes up the model's misfit. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
 is found from raw columns alone, and it is used only if it stays the same when the end of the band is left out.
 """
 
@@ -43,8 +43,8 @@ class InertiaError(NamedTuple):
 def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     """The fit of Prony modes with the error of the instrument's inertia beside them, and the sweep corrected by it.
 
-    Both are as they were where there are no raw columns, or the model is another one. Where the error moves with the
-    band, it is reported and not used.
+    Fit and sweep stay as they were if there are no raw columns, or if the model has no Prony modes. Where the error
+    moves with the band, it is reported and not used.
     """
     if sweep.inertia is None or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
@@ -144,7 +144,7 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
 
 
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
-    """The fit in closed form with the numbers of the sample at rest, where the sweep is of a compressed one.
+    """The fit in closed form of a compressed sample, with the numbers of the sample at rest.
 
     Storage and loss of the fit stay those that the instrument shows, and so do its residuals.
 

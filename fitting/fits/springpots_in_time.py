@@ -30,7 +30,8 @@ STARTS, AROUND, MOST_STEPS = 4, 0.7, 80
 
 
 class Spans(NamedTuple):
-    """What springpots are computed with: times of their modes [s], and the frequency [rad/s] of their numbers."""
+    """Times [s] of the modes that springpots are computed with, and the frequency [rad/s] at which their numbers are
+    stated."""
 
     low: float  # shortest time [s] that is looked at
     high: float
@@ -39,7 +40,7 @@ class Spans(NamedTuple):
 
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
-    """Of all times that the tests resolve."""
+    """The spans of all times that the tests resolve."""
     ends = np.array([t.resolved for t in tests])
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
@@ -134,7 +135,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans) -> _Springpot
 
 
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
-    """Converged, and the data determine every number."""
+    """Whether the fit converged and the data determine every number."""
     if fit.parameters is not None:
         return fit.converged and bool(np.all(models.determined(fit.parameters)))
     return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
@@ -181,7 +182,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 
 
 def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[Content]:
-    """What the choice rests on, best first."""
+    """The criterion of each model compared, best first."""
     best = min(map(criterion, tried))
     rows: list[Content] = [
         {

@@ -361,7 +361,7 @@ def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[st
 
 
 def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
-    """A sentence for each curve that no law follows."""
+    """A warning for each curve that no law follows."""
     told = []
     for curve in curves:
         best = min(fits, key=lambda f: f.curve_errors[curve.label])

@@ -97,7 +97,7 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
-    """Fits of rising number of modes until the criterion twice fails to fall."""
+    """Fits with more and more modes; two that do not lower the criterion end the search."""
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -147,7 +147,7 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """Points (n,) that the drive needs. A point with the same slope on both sides can be left out."""
+    """Points (n,) that the drive needs: its corners. Points with the same slope on both sides are left out."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))

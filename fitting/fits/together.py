@@ -146,7 +146,7 @@ def _resolved(tests: list[Measured]) -> tuple[float, float]:
 def _raised_together(
     tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
-    """Fits of rising number of modes until the criterion twice fails to fall."""
+    """Fits with more and more modes; two that do not lower the criterion end the search."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -193,7 +193,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
 def misfits(
     tests: list[Measured], parts: list, data: list, residuals: np.ndarray, noise: np.ndarray
 ) -> tuple[list[Share], list[np.ndarray]]:
-    """What a fit leaves of each test, and what it says each test measures."""
+    """Residuals of each test, and the numbers that the fit predicts for it."""
     left = np.split(residuals, np.cumsum([len(y) for _, y, _ in parts])[:-1])
     fitted = [r * scales + y for r, (_, y, scales) in zip(left, data, strict=True)]
     shares = [
@@ -302,7 +302,7 @@ def disagreements(shares: list[Share]) -> list[str]:
 def _shares(fit: Together) -> list[Share]:
     """The contribution of each test: errors without it, and the misfit of a fit to this test alone with as many modes.
 
-    Tests without weight are taken out by infinite deviations: the program is there already.
+    A test is taken out by infinite deviations, so that the same compiled program serves.
     """
     parts = [reported_numbers(t) for t in fit.tests]
     function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)

@@ -214,7 +214,8 @@ EXACT = 1e-7
 
 
 def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) -> tuple[Fit, list[Fit]]:
-    """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact; all that was tried.
+    """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact. Return the chosen
+    fit and all tried.
 
     One failure may be a local minimum: the search ends at the second in a row. A number of modes whose computation
     breaks down is such a failure, and is named in the warnings; the others stay.
@@ -339,7 +340,7 @@ def with_jacobian(
     """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
 
     The derivative is that of the linear rig; with large strain or inertia it is that of the simulation. Gauss-Newton
-    goes to the same minimum with it, in a small part of the time (experiments/benchmarks/torsion_speed.py).
+    finds the same minimum with it in a small part of the time (experiments/benchmarks/torsion_speed.py).
     """
     if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
 

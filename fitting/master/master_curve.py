@@ -64,7 +64,7 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _sentences(found: Shifts) -> list[str]:
-    """What was made of the sweeps, and where superposition does not hold."""
+    """Notes on how the sweeps were shifted, and warnings where superposition does not hold."""
     T = found.temperatures - 273.15
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "

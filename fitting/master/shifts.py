@@ -1,9 +1,9 @@
 """Time-temperature superposition: shift factors that bring sweeps at several temperatures onto one smooth curve.
 
-A sweep at temperature T shows, at the frequency omega, what one at the reference shows at a_T omega, times 1 / b_T. The
-curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors by least squares:
-no model of the material is needed, and every factor has a standard error. Source: Ferry (1980), Viscoelastic properties
-of polymers, chapter 11.
+A sweep at temperature T has at frequency omega the modulus that a sweep at the reference temperature has at a_T omega,
+times 1 / b_T. The curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors
+by least squares: no model of the material is needed, and every factor has a standard error. Source: Ferry (1980),
+Viscoelastic properties of polymers, chapter 11.
 """
 
 from collections.abc import Sequence
@@ -108,7 +108,7 @@ def _smoothness(size: int) -> np.ndarray:
 
 
 def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and right-hand side of a Gauss-Newton step: of log a (K), log b (K), and of both curves' coefficients."""
+    """Rows and right-hand side of a Gauss-Newton step for log a (K), log b (K) and the coefficients of both curves."""
     K, counts = len(columns), [len(c[0]) for c in columns]
     x = np.concatenate([c[0] + a for c, a in zip(columns, log_a, strict=True)])
     own = np.repeat(np.eye(K), counts, axis=0)
@@ -134,7 +134,7 @@ def _errors_of_shifts(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """Each sweep laid over its neighbour, from the reference on."""
+    """First shifts: each sweep is laid over its neighbour, beginning at the reference."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
         before = reference

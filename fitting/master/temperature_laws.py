@@ -57,7 +57,7 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
-    """None where the factors do not bend as the law does: it then has no finite numbers."""
+    """The WLF law; None if the factors bend the other way, for which the law has no finite numbers."""
     w = _weights_of_factors(shifts)
 
     # C2 stays above the distance of the lowest temperature: there the law has its pole.

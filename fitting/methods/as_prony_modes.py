@@ -1,8 +1,8 @@
 """Convert any linear viscoelastic model to Prony modes for the simulation, with the largest error over the band.
 
 The relaxation times are fixed, equally spaced on a log axis. The strengths come from non-negative least squares of the
-relative errors of G' and G''. With the set of non-zero strengths held, they are linear in the moduli of the model, so
-derivatives pass through the conversion.
+relative errors of G' and G''. While the set of non-zero strengths stays the same, the strengths are linear in the
+moduli of the model. So derivatives pass through the conversion.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
 
 
 class Conversion(NamedTuple):
-    """From moduli at `omega` to Prony modes."""
+    """How moduli at `omega` become Prony modes."""
 
     omega: np.ndarray  # (n,) [rad/s], over the band
     times: np.ndarray  # (N,) [s], descending

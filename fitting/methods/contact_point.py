@@ -32,7 +32,7 @@ class ContactFit(NamedTuple):
 
 
 def fit_contact(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
-    """The least squares of the force.
+    """Fit modulus and contact point by least squares of the force.
 
     Args:
         depth: (n,) [m].

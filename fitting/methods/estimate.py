@@ -131,8 +131,8 @@ LARGEST_BIAS = 0.3
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
     """Change of the numbers (P,) by meshes: J^+ times their errors of the data, `missing` (n,) over the noise.
 
-    It is of first order: good while the missing part is below a quarter and numbers are not nearly dependent. Subtract
-    it once to correct.
+    It is of first order. It is good if the missing part is below a quarter and the numbers are not nearly dependent.
+    Subtract it once to correct.
     """
     J, to_natural = np.asarray(found.jacobian), np.asarray(jax.jacfwd(natural_of)(found.u))
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):

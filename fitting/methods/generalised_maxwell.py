@@ -140,8 +140,8 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
 def non_negative(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, float]:
     """The x >= 0 with the smallest distance of A x from b, and this distance.
 
-    An active set that cycles (columns that are nearly the same, which close relaxation times give) leaves the problem
-    to SciPy's bounded least squares, which always comes back with its best point.
+    With close relaxation times columns are nearly equal, and the active set may cycle. Then SciPy's bounded least
+    squares takes over; it always returns its best point.
     """
     norm = np.linalg.norm(A, axis=0)  # columns of equal length keep the active-set iteration short
     norm = np.where(norm > 0, norm, 1.0)

@@ -1,4 +1,4 @@
-"""Formulas of a few numbers that run in NumPy as in JAX: without compilation, with exact derivatives."""
+"""Formulas of a few numbers that run in NumPy and in JAX. In NumPy nothing is compiled, and derivatives are exact."""
 
 from collections.abc import Callable
 from typing import Any

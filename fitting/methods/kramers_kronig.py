@@ -1,13 +1,13 @@
 """Checks of the data without a model: causality, the instrument's mark, order in the residuals.
 
-Every material that relaxes has a spectrum of non-negative strengths. Term by term, with x = omega tau, its moduli obey
+Every material that relaxes has a spectrum of non-negative strengths. With x = omega tau, the moduli of each term obey
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
 because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). Data that break these bounds by more than their scatter are not of the
 material: at the high end the inertia of the instrument breaks them (it adds a term that grows as omega^2 to G'), at the
-low end the start of the test. The distance of the best spectrum of any shape is the same question for the whole band:
-it is the Kramers-Kronig relation together with non-negative dissipation.
+low end the start of the test. The distance of the data from the best spectrum of any shape tests the whole band: this
+is the Kramers-Kronig relation together with non-negative dissipation.
 """
 
 import math
@@ -56,7 +56,8 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
 def without_instrument(sweep: Sweep) -> Sweep:
     """The points before the instrument's mark; those behind it become `grey`, and a note names them.
 
-    The mark is looked for in what is left until there is none; all of it lies in the last half decade of the sweep.
+    The search goes on in the points that are left until it finds no mark. It looks only at the last half decade of the
+    sweep.
     """
     here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
     told = ""
@@ -93,7 +94,7 @@ def onset_of(sweep: Sweep) -> tuple[float, str] | None:
 
 
 def _breach(omega, storage, loss, noise) -> str:
-    """The bound that two neighbours break, or nothing."""
+    """The name of the bound that two neighbouring points break, or an empty text."""
     step = math.log(omega[1] / omega[0])
     # Of all spectra the largest mean of G'' between two values is reached where it changes as fast as it may.
     most = step * min(max(loss) * math.exp(step / 2), math.inf)
@@ -138,7 +139,7 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
 
 
 def _rounded_up(hertz: float) -> float:
-    """Four digits, not below the value: the point itself is kept."""
+    """The value rounded up to four digits, so that the limit does not exclude the point itself."""
     unit = 10.0 ** (math.floor(math.log10(hertz)) - 3)
     return math.ceil(hertz / unit) * unit
 

@@ -1,6 +1,6 @@
 """Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy beside it.
 
-One iteration serves all: its arrays may be JAX's or NumPy's, and may have axes in front, one entry a fit.
+One code serves all: its arrays may be JAX's or NumPy's, and axes in front may hold many fits.
 """
 
 from collections.abc import Callable

@@ -24,7 +24,7 @@ class Population(NamedTuple):
 
 
 def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
-    """Mean and spread of positive values (n,) with standard errors (n,); None where fewer than two are determined."""
+    """Mean and spread of positive values (n,) with standard errors (n,); None if the data determine fewer than two."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
     known = (values > 0) & np.isfinite(values) & np.isfinite(errors) & (errors < 10 * values)
     if known.sum() < 2:

@@ -51,7 +51,8 @@ def to_whitened(p: Prior, g: np.ndarray) -> np.ndarray:
 
 
 def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -> tuple[np.ndarray, np.ndarray]:
-    """Variances (V,) before and after data that leave the part `kept` of the variance of the directions `modes`.
+    """Variances (V,) before and after the data. The data reduce the variance along the directions `modes` to the part
+    `kept`.
 
     Args:
         modes: orthonormal directions of z (V, k).

@@ -1,4 +1,5 @@
-"""A spectrum on a fixed grid of relaxation times: strengths that are not negative, and smooth where data are silent.
+"""A spectrum on a fixed grid of relaxation times. Strengths are not negative, and they are smooth where the data say
+nothing.
 
 For fixed times the moduli are linear in the strengths, so the minimum is the only one. Strengths are measured in the
 size of the data at omega = 1 / tau, and their second differences are held down by a weight that the information

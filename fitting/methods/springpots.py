@@ -40,7 +40,7 @@ class Fractional(NamedTuple):
 
     @property
     def switches(self) -> np.ndarray:
-        """1 or 0 (4,): E is there, gamma is, W is, beta is."""
+        """Four switches (4,), 1 or 0: whether the model has E, gamma, W and beta."""
         return np.array([float(k in self.free) for k in (0, 1, 4, 5)])
 
 
@@ -76,7 +76,7 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
     """Prony modes of the model's own relaxation spectrum, for responses in time.
 
     The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
-    exponentially; what lies beyond the times is two lumps, which make G* exact at one slow and one fast real s.
+    exponentially. Two more terms stand for slower and faster times; they make G* exact at one slow and one fast real s.
 
     Args:
         u, switches: as of `modulus`.
@@ -174,7 +174,7 @@ FRACTIONAL = (
 
 
 def full(model: Fractional, u: jax.Array) -> jax.Array:
-    """All six numbers, those that the model lacks at 0."""
+    """All six numbers; those that the model does not have are 0."""
     return jnp.zeros(SIZE).at[jnp.array(model.free)].set(u)
 
 

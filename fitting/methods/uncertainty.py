@@ -174,7 +174,7 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
 
 
 def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
-    """Warnings on what the data do not tell, each with its number and a remedy."""
+    """Warnings about numbers that the data do not determine, each with a remedy."""
     modes = (len(u.values) - 1) // 2
     tau, tau_err = u.values[modes + 1 :], u.standard_errors[modes + 1 :]
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]

@@ -32,7 +32,7 @@ class Curve(NamedTuple):
 
     @property
     def rises(self) -> bool:
-        """Whether the stress of a stable material must rise with `driven`: only this component does work."""
+        """Whether the stress of a stable material must rise with `driven`. It must if only this component does work."""
         return self.test != "general" and np.ptp(self.F[:, *self.component]) > 0
 
     @property

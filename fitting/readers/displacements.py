@@ -129,7 +129,8 @@ def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The element each point is in, or nearest to: its nodes, the values of their functions, how far the point is off.
+    """The element that holds each point or is nearest to it: its nodes, the values of their functions, and the
+    distance.
 
     Returns nodes (n, 4) and barycentric coordinates (n, 4), of quadratic elements 10 of both; and how far outside the
     point is (n,), in sizes of the element; host side.

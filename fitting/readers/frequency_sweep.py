@@ -42,21 +42,21 @@ class Sweep(NamedTuple):
 
     @property
     def noise_given(self) -> bool:
-        """There are deviations, and they are the noise of each point, not the spread between samples."""
+        """Whether deviations are given and are the noise of each point, not the spread between samples."""
         if self.storage_sd is None:
             return False
         return self.relative_deviation < LARGE or not self.point_scatter < self.relative_deviation / SHARED
 
     @property
     def relative_deviation(self) -> float:
-        """Of the file, over the moduli, in the middle; NaN where there is none."""
+        """Median of the file's deviations over the moduli; NaN if the file has none."""
         if self.storage_sd is None or self.loss_sd is None:
             return np.nan
         return float(np.median(np.concatenate([self.storage_sd / self.storage, self.loss_sd / self.loss])))
 
     @property
     def point_scatter(self) -> float:
-        """How far points lie off a smooth curve, relative; infinite where too few points tell it."""
+        """Relative distance of the points from a smooth curve; infinite if there are too few points."""
         omega, *columns = merged(self.angular_frequency, self.storage, self.loss)
         return max(scatter(omega, column) for column in columns)
 

@@ -53,7 +53,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
 
 
 def _depth_and_force(line: str) -> dict[str, tuple[int, float] | None]:
-    """Places of both columns in a line, None where it does not name one."""
+    """Places of both columns in a line; None if the line does not name one of them."""
     cells = split_cells(line, find_delimiter(line))
     return {quantity: _place_and_factor(cells, quantity) for quantity in _WORDS}
 

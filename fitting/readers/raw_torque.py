@@ -1,7 +1,7 @@
 """Effect of the instrument's inertia on a sweep, from the raw torque and displacement of some exports.
 
 Raw torque M and angle theta obey M e^(i phase) = (K G* - I omega^2) theta, with K the geometry and I the inertia that
-the software has subtracted. I omega^2 / K is its share as a modulus; a part of it, `UNCERTAINTY`, is not known.
+the software has subtracted. I omega^2 / K is its share of the modulus, known up to the relative error `UNCERTAINTY`.
 """
 
 import re
@@ -93,7 +93,7 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
     """The same by the raw phase alone, which needs no torque and no size: I omega^2 / K = G' - G'' / tan(phase).
 
-    None where there is no phase, where the phases do not agree on one inertia, or where it leads nowhere.
+    None if there is no phase, if the phases do not agree on one inertia, or if inertia leads at no frequency.
     """
     if "phase" not in raw:
         return None
@@ -107,7 +107,7 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
 def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
     """The inertia at the highest frequencies if they agree within a tenth; else NaN.
 
-    Where inertia leads it is known best; elsewhere it is a small difference of large numbers.
+    It is known best where inertia is the largest part; elsewhere it is a small difference of large numbers.
     """
     led = np.argsort(omega)[-max(3, len(omega) // 6) :]
     value, apart = float(np.median(values[led])), np.ptp(values[led])

@@ -72,7 +72,8 @@ def is_angular(column: Column) -> bool:
 
 
 def header_columns(cells: list[str]) -> list[Column]:
-    """Columns by quantity; the first of known unit comes first, rad/s before Hz, others after it (to compare)."""
+    """Columns by quantity. The first column with a known unit comes first, rad/s before Hz; the others follow, for
+    comparison."""
     found = [(k, cell, _quantity(cell)) for k, cell in enumerate(cells)]
     columns = [Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
     shear = {c.quantity for c in columns if not is_tensile(c)}

@@ -44,7 +44,7 @@ def choose_table(path: str, tables: list[Table], wanted: str | None) -> tuple[in
 
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
-    """Place of the table with this number, this name, or alone with this in its name."""
+    """Place of the table with this number or name, or of the only table whose name contains the text."""
     if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
         return int(wanted) - 1
     sought = wanted.strip().lower()
@@ -111,7 +111,7 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 
 
 def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, temperature in SI, of the rows of a table; a column with a gap is none."""
+    """Raw torque, angle, phase and temperature in SI of the rows of a table. A column with a gap is left out."""
     found, units = {}, unit_rows[-1] if unit_rows else []
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():

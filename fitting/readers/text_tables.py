@@ -54,7 +54,7 @@ def find_delimiter(line: str) -> str:
 
 
 def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
-    """The delimiter, found where none is given, and the cells of a line."""
+    """The delimiter of a line and its cells; without a given delimiter it is found."""
     delimiter = delimiter or find_delimiter(line)
     return delimiter, split_cells(line, delimiter)
 

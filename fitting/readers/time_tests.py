@@ -63,7 +63,8 @@ class TimeTest(NamedTuple):
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the answers themselves, and a floor for answers that are lost in noise."""
+        """Scales of the residuals: the size of each answer, but not less than a floor for answers that are lost in
+        noise."""
         answer = self.answer[self.used]
         smooth = np.abs(np.diff(answer, 3))  # three differences of independent noise have 20 times its variance
         noise = float(np.median(smooth)) / 0.6745 / np.sqrt(20) if len(smooth) else 0.0
@@ -170,7 +171,8 @@ def of_columns(
 
 
 def kind_of(path: str | os.PathLike) -> str:
-    """ "relaxation" or "creep": by the modulus or compliance, or by which of two columns is held, the other moving."""
+    """ "relaxation" or "creep". A modulus or a compliance decides; else the column that stays constant is the driven
+    one."""
     columns, _ = read_columns(path)
     form = next((f for f in FORMS if set(f) <= set(columns)), ("modulus",))
     if len(form) == 1:
@@ -268,7 +270,7 @@ def _in_si(path, found, rows, units):
 
 
 def _as_a_step(path, time, modulus, ramp):
-    """A strain (or stress) of 1, at once or over a ramp."""
+    """A driven strain (or stress) of 1, reached at once or over a ramp."""
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
     kept = time > 0
@@ -279,7 +281,7 @@ def _as_a_step(path, time, modulus, ramp):
 
 
 def _from_rest(time, driven, answer):
-    """A first point at rest, where the record begins under load."""
+    """The test with a first point at rest, if the record begins under load."""
     if time[0] > 0:
         time, driven, answer = (np.concatenate([[0.0], v]) for v in (time, driven, answer))
     return time, driven, answer

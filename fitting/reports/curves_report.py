@@ -103,10 +103,10 @@ def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
 
 
 def fine(curve: Curve) -> Curve:
-    """The path of a curve at `FINE` places, its stress left as zeros.
+    """The path of a curve at `FINE` places; its stress is set to zero.
 
-    Between two points F12 and F21 are straight and the logarithms of the diagonal too, so that every homogeneous test
-    stays one: a side of stretch^(-1/2) does. F33 keeps the volume.
+    Between two points F12, F21 and the logarithms of the diagonal change linearly. So a tension test stays a tension
+    test: its sides keep the stretch lambda^(-1/2). F33 keeps the volume.
     """
     at, places = np.linspace(0, len(curve.stress) - 1, FINE), np.arange(len(curve.stress))
     F = np.zeros((FINE, 3, 3))

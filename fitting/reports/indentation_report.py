@@ -61,7 +61,7 @@ def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) ->
 
 
 def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> list[str]:
-    """Warnings for a reader of the modulus."""
+    """Warnings about the modulus for its reader."""
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
         told.append(f"{fit.before} points are before contact: measure the approach too, it fixes the contact point")

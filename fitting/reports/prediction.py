@@ -32,13 +32,15 @@ class Prediction(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """The factor by which the prediction fits best. Another sample or strain often changes all by one factor."""
+        """The factor by which the prediction fits best. Another sample or another strain often changes all numbers by
+        one factor."""
         y, p = (v[self.inside] / self.scales[self.inside] for v in (self.measured, self.predicted))
         return float(p @ y / (p @ p))
 
     @property
     def covered(self) -> float:
-        """Part of the numbers inside the band within two standard errors of the prediction and their own scatter."""
+        """Share of the measured numbers in the band that lie within two standard errors; these contain the scatter of
+        the numbers."""
         off = (self.predicted - self.measured)[self.inside]
         own = self.scales[self.inside] * _scatter(off / self.scales[self.inside])
         return float(

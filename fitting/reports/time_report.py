@@ -73,7 +73,7 @@ def _equilibrium_in_time(fit: TimeFit) -> float:
 
 
 def table(test: TimeTest, fit: TimeFit) -> str:
-    """Parameters ± standard error, and what the choice of the number of modes rests on."""
+    """Parameters ± standard error, and the criterion of each number of modes."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
     rows += _rows_of_modes(fit) if fit.parameters is None else own_rows(fit.parameters, fit.kind, fit.details)
     errors = fit.relative_errors

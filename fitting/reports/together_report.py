@@ -70,7 +70,7 @@ def write(out: Path, found: Together) -> Content:
 
 
 def _waves(found: Together) -> Content:
-    """Shear waves over the band of all tests, four a decade."""
+    """Shear waves over the band of all tests, at four frequencies a decade."""
     high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
     density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)

@@ -65,7 +65,8 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 
 
 def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarray | None) -> list[Content]:
-    """One dictionary a region, lists over the frequencies. Errors are of noise, of elements and of edges together."""
+    """One dictionary a region, lists over the frequencies. Errors contain noise, the error of the elements and that of
+    the edges."""
     omega, rows = organ.waves.omega, []
     for r in range(found.modulus.shape[1]):
         G, e = found.modulus[:, r], found.standard_errors[:, r]
@@ -96,7 +97,7 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarra
 
 
 def _complex_parts(*values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Real parts of all, imaginary parts of all."""
+    """Lists of the real parts and of the imaginary parts of all numbers."""
     return [v.real for v in values], [v.imag for v in values]
 
 

@@ -3,14 +3,14 @@
 The sample has the plates' radius at rest and is not trimmed. It is held until its stress has relaxed. Moduli are those
 that the instrument shows: by the plates' radius and by the gap at which the test is made.
 
-Where the plates let the sample slide sideways it stays a cylinder, of stretches a along the radius and l along the
-axis and of the axial stress s. By an isotropic law a shear between both has the modulus l^2 s / (l^2 - a^2), of which
-the stress that stands makes s (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The torque has the
-radius to the fourth power, and so the instrument shows
+Where the plates let the sample slide sideways it stays a cylinder, of stretches a along the radius and l along the axis
+and of the axial stress s. An isotropic law gives a shear between both directions the modulus l^2 s / (l^2 - a^2). The
+standing stress contributes s to it (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The torque has
+the radius to the fourth power, and so the instrument shows
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
-with s of the law before it relaxes. So what relaxes and the equilibrium modulus have a factor each.
+with s of the law before it relaxes. So the relaxing part and the equilibrium modulus have different factors.
 """
 
 from typing import NamedTuple

@@ -58,7 +58,8 @@ class Described(NamedTuple):
 
 
 def read_described(path: str | Path) -> TimeTest:
-    """The test of a description, as shear: strain f(d)/S, stress F/S, with S such that small strains are d over a size.
+    """The described test as a test of shear: strain f(d)/S and stress F/S. S is chosen so that small strains are d over
+    a length of the sample.
 
     Args:
         path: TOML with test, data (a table of time, displacement and force), the sizes that the test needs in metres,
@@ -99,7 +100,7 @@ def read_described(path: str | Path) -> TimeTest:
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Rows between the measured ones, without a force: d is straight between two rows, and f(d) is not."""
+    """The rows, and more rows between them without a force: between two rows d is linear in time, f(d) is not."""
     if time[0] > 0:
         time, d, force = (np.append(0.0, v) for v in (time, d, force))
     parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))

@@ -178,7 +178,7 @@ def creep(
 ) -> Rig:
     """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the mean displacement of the top.
 
-    The pull comes up over the first step, as it does in a rheometer over some time. The mean is that over the area.
+    The pull grows during the first step, as it does in a rheometer. The mean is taken over the area.
     """
     cells = _cells(radius, height, dt, cell_size)
     rim = cells.rim * min(radius, height)

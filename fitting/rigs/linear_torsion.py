@@ -93,7 +93,7 @@ def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
 def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
     """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the stress that stands.
 
-    A motion only turns a stress S that has stood for long; the second part is that of the unrelaxed S.
+    A motion only turns a stress S that has stood for long. The second part is computed with the unrelaxed S.
     """
     mesh = rig.mesh
     rest = jnp.zeros(number_of_coordinates(rig), mesh.points.dtype)
@@ -138,9 +138,9 @@ def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
     """The limit of `moduli` as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
 
-    The rig is linear there, and its bias is divided out, so they hold neither mesh nor plates. They give the
-    derivatives of `moduli` by the parameters to the order of the strain, without a derivative of the simulation. They
-    have no inertia.
+    The rig is linear there and its bias is divided out. So the moduli depend neither on the mesh nor on the plates.
+    They give the derivatives of `moduli` by the parameters to the order of the strain, without a derivative of the
+    simulation. They have no inertia.
 
     Args:
         law: scaled to G0, its modulus at rest.

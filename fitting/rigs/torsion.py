@@ -60,7 +60,7 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class Drive(NamedTuple):
-    """How the rig is driven and resolved; static under jit.
+    """How the rig is driven, and in how many steps; fixed when compiled.
 
     `steps` a cycle, `cycles` run (the last is demodulated), `by` "torque" or "angle", `start` "cycle" or "rest".
     """

@@ -1,13 +1,13 @@
 """The balance of forces in measured waves, and the modulus that follows from it.
 
-At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M there,
-K of the shear stress alone. B p are the forces of a pressure p (linear in the elements, continuous), which is whatever
-it must be: no bulk modulus is needed. What is measured is d = u + noise, at all nodes. With a pressure of a large
-variance g sd^2 before the data, the likeliest motion that obeys this is
+At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M at
+these nodes, where K contains the shear stress alone. B p are the forces of a pressure p (linear in the elements,
+continuous), which is whatever it must be: no bulk modulus is needed. What is measured is d = u + noise, at all nodes.
+If the pressure has a large prior variance g sd^2, the likeliest motion that obeys this is
 
     u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2:
 
-nothing is asked of the motion at the body's surface, which is measured with noise as everything else is. By the
+no condition is set at the body's surface, whose motion is measured with noise like all other motion. By the
 modulus, chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2
 (variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on u, not on d, noise does
 not pull the modulus down, as it does in the direct inversion of second derivatives.

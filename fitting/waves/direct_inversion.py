@@ -5,9 +5,9 @@ By least squares over the three components and a window of voxels
 
     G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
 
-(Oliphant et al. 2001, Magn. Reson. Med. 45, 299; Papazoglou et al. 2008, Phys. Med. Biol. 53, 3147). Noise of
-laplace(q) is squared below the line, so noise pulls the modulus down; and a window over an edge mixes both sides. Both
-are known faults of the method, and left as they are.
+(Oliphant et al. 2001, Magn. Reson. Med. 45, 299; Papazoglou et al. 2008, Phys. Med. Biol. 53, 3147). The denominator
+has the square of the noise of laplace(q), so noise makes the modulus too small. A window over an edge mixes both sides.
+Both are known faults of the method, and are left in it.
 """
 
 import math

@@ -81,7 +81,7 @@ def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.C
 
 
 def plane_wave_bias(G: complex, omega: float, organ: Organ) -> complex:
-    """Relative error of the modulus that these elements find in plane waves without noise, a mean of directions."""
+    """Relative error of the modulus that these elements find in plane waves without noise; a mean over directions."""
     spacing, density = organ.field.spacing, organ.density
     body = voxels.voxel_body(np.ones((7, 7, 7), bool), spacing)
     m, X = balance.matrices(body, density), np.asarray(body.mesh.points)

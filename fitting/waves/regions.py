@@ -1,4 +1,4 @@
-"""Complex moduli of the regions of an organ from its waves, one by one frequency, with their uncertainty."""
+"""Complex moduli of the regions of an organ from its waves, at each frequency by itself, with their uncertainty."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -83,7 +83,7 @@ def moduli_of_regions(
 def geometric(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Moduli of elements (E,) from shares (E, R) and moduli of regions (R,) [Pa], and their derivatives (E, R).
 
-    Between springs in a row and springs side by side, which are the least and the most that a mixture can have.
+    They lie between springs in a row, the least that a mixture can have, and springs side by side, the most.
     """
     elements = np.exp(shares @ np.log(G))
     return elements, elements[:, None] * shares / G

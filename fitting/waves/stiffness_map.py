@@ -1,11 +1,11 @@
 """A map of the complex modulus from measured waves: a smooth field, with its uncertainty.
 
-At frequency f the modulus of an element is g_f exp(c), g_f that of the whole organ and c = ln(size) + i (loss angle)
-the mean of a complex nodal field (P,), one field for all frequencies. Its real and its imaginary part have the prior of
-`fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number of
-equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. The deviation
-with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by Gauss-Newton. The
-uncertainty comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value.
+At frequency f the modulus of an element is g_f exp(c). g_f is the modulus of the whole organ; c = ln(size) + i (loss
+angle) is the mean of a complex nodal field (P,), the same for all frequencies. Its real and its imaginary part have the
+prior of `fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number
+of equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. The
+deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by
+Gauss-Newton. The uncertainty comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value.
 """
 
 import time
@@ -255,7 +255,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, point: _Reached, history: list[dict[str, float]]) -> None:
-    """Write the point reached, as a whole."""
+    """Write the point reached to a file that is there whole or not at all."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:

@@ -6,7 +6,7 @@ from liverjax.core.errors import InputError
 
 
 def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Phases without jumps, NaN where they are not measured; and a note where jumps are left.
+    """Phases without jumps, NaN where they are not measured; then a note if jumps are left.
 
     In space by sorting of reliable edges (Herraez et al. 2002, Appl. Opt. 41, 7437). The level of each volume is then
     known up to multiples of 2 pi. From one instant of the period to the next it is taken to move by less than pi.

@@ -53,7 +53,7 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
 def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
     """Corners (6 n, 4) of the elements of bricks (n, 3); every second brick is a mirror image along each axis.
 
-    So no diagonal is in all bricks alike, and waves of all directions are about as fast.
+    So diagonals have no common direction, and waves of all directions have about the same speed.
     """
     out = []
     for order in itertools.permutations(range(3)):

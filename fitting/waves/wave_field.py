@@ -203,9 +203,9 @@ _FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 def noise_of(field: WaveField) -> np.ndarray:
     """Standard deviation (F,) [m] of real and imaginary part of one component, from the data themselves.
 
-    Fourth differences along the axis on which they are smallest: they hardly see a smooth wave, and their median is
-    blind to few bad voxels. A wave leaves (k h)^4 / 8 of its motion in them: 0.12 % at 20 voxels in a wave, 4 % at 8.
-    NaN where no five voxels stand in a row.
+    It is found from fourth differences along the axis on which they are smallest. A smooth wave adds little to them,
+    and a few bad voxels do not change their median. A wave adds (k h)^4 / 8 of its motion: 0.12 % at 20 voxels a wave,
+    4 % at 8. NaN where no five voxels stand in a row.
     """
     out = np.full(len(field.frequencies), np.nan)
     for f, U in enumerate(field.displacement):
@@ -227,7 +227,7 @@ def noise_of(field: WaveField) -> np.ndarray:
 
 
 def coarsened(field: WaveField, stride: int) -> WaveField:
-    """Means of stride^3 voxels that are all in the mask; they stay a wave of the same length in a uniform organ."""
+    """Means of stride^3 voxels that are all in the mask. In a uniform organ the means are a wave of the same length."""
     if stride == 1:
         return field
     n = np.array(field.mask.shape) // stride

@@ -1,4 +1,4 @@
-"""Addresses of modules before they moved into rooms: what users have written goes on working."""
+"""Old addresses of modules that have moved, so that scripts of users still work."""
 
 import importlib
 import sys

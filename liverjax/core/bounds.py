@@ -1,4 +1,5 @@
-"""Bounds stand beside the fields of a struct; here they are read, for every struct, from files and Python alike."""
+"""Check numbers against the bounds that stand beside the fields of a struct, whether they come from files or from
+Python."""
 
 import dataclasses
 import math

@@ -1,7 +1,7 @@
-"""A function compiled for given arguments, found on disk without being traced where the programs are kept.
+"""A function compiled for given arguments. If its program is kept on disk, it is found without tracing the function.
 
-JAX's own cache spares the compilation alone: it has to trace a program before it can find it, which takes seconds
-for a large one. Here the arguments' structure and shapes are the key, within the folder of `liverjax.core.programs`.
+JAX's own cache saves only the compilation. It must trace a program to find it, which takes seconds for a large one.
+Here the arguments' structure and shapes are the key, within the folder of `liverjax.core.programs`.
 """
 
 import dataclasses
@@ -122,7 +122,7 @@ def _key(function: Callable[..., Any], arguments: tuple) -> str:
 
 
 def _said(thing: Any, static: bool = False) -> Any:
-    """What a program depends on: types, static values, and the shapes of all other numbers."""
+    """The text of all that a program depends on: types, static values, and the shapes of all other numbers."""
     if thing is None or isinstance(thing, (str, bool)):
         return repr(thing)
     if isinstance(thing, FunctionType) and static:

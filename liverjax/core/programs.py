@@ -120,7 +120,8 @@ def _processor() -> str:
 
 
 def _forgotten(folder: Path, message: str) -> bool:
-    """Whether a warning is about the cache. The broken entries that it names are removed: JAX would keep them."""
+    """Whether a warning is about the cache. The broken entries that it names are removed here, since JAX would keep
+    them."""
     if "persistent compilation cache" not in message:
         return False
     if "reading" in message:

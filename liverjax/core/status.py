@@ -1,4 +1,4 @@
-"""Result codes of solves, each with a sentence of advice. Numbers inside jit, words on the host."""
+"""Result codes of solves, each with a sentence of advice. Inside jit they are numbers; the host has the words."""
 
 CONVERGED = 0
 STALLED = 1

@@ -19,7 +19,7 @@ def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
 def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
     """J of every element at positions x (V, 3) [m]: (1, E), or (Q + 4, E) at points and vertices of quadratic ones.
 
-    Between its points a quadratic element may be folded although they are not: the vertices show it first.
+    A quadratic element may be folded between its points, although it is not folded at them. The vertices show it first.
     """
     J = determinant(deformation_gradient(mesh, x))
     if mesh.order == 1:

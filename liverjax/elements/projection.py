@@ -5,8 +5,8 @@ For F = U diag(s) V^T an isotropic energy has, in the axes of U and V, a 3 x 3 m
 De Goes, Kim 2019, Analytic eigensystems for isotropic distortion energies). Negative eigenvalues become their absolute
 value (Chen et al. 2024) and the blocks are turned back.
 
-Fibres, energies of Green's strain and the memory of a viscosity have other axes. Their geometric stiffness takes the
-projected S; the negative part of a fibre's own stiffness is dropped. Each part then has no negative eigenvalue, so
+Fibres, energies of Green's strain and the memory of a viscosity have other axes. Their geometric stiffness uses the
+projected S. The negative part of a fibre's own stiffness is left out. Each part then has no negative eigenvalue, so
 their sum has none.
 """
 

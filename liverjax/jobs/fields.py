@@ -1,7 +1,7 @@
 """Fields of a finished run, on demand: stress, strain, stretches, volume ratio, energy, the fluid's velocity.
 
-The positions of every step are put into its equations again, so memories (viscosity, fluid) are as in the run. Nothing
-is solved.
+The positions of every step are put into its equations again. So memories (viscosity, fluid) are those of the run.
+Nothing is solved.
 """
 
 from typing import Any

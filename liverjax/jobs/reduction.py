@@ -23,7 +23,7 @@ from liverjax.solvers.problem import StepStatistics
 
 
 def learnt(model: ReducedModel) -> str:
-    """What the correction of a model came to, in words."""
+    """A sentence on the correction that a model has learnt."""
     if model.correction is None:
         return "no correction: too few rows, or none made the errors smaller"
     left = np.asarray(model.correction.left)

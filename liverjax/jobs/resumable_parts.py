@@ -77,7 +77,7 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def same(identity: Mapping[str, object], file: Path) -> None:
-    """Write down what decides the results; refuse to go on if the parts on disk were made with something else.
+    """Write down the input that decides the results; refuse to go on if the parts on disk were made with other input.
 
     Raises:
         InputError: the parts beside `file` are of something else.

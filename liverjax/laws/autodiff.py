@@ -21,7 +21,7 @@ def tangent(law: Law, F: jax.Array) -> jax.Array:
 def derivative(function: Callable[[jax.Array], jax.Array], A: jax.Array) -> jax.Array:
     """Derivative of an element-wise function of matrices (…, n, m): (…, its shape, n, m), by forward mode.
 
-    One direction for all elements at a time, so that a law may have numbers of its own for each element.
+    It takes one direction for all elements at a time, so that a law may have one number for each element.
     """
     n, m = A.shape[-2:]
     directions = jnp.eye(n * m, dtype=A.dtype).reshape(n * m, n, m)

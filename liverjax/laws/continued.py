@@ -79,7 +79,7 @@ class Continued(Law):
         return self.law if part is None else part
 
     def _replaced(self, J: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """c^2/(2c - J) below c and J above, its slope and curvature."""
+        """The replaced volume ratio, c^2/(2c - J) below c and J above, with its slope and curvature."""
         c, lower = self.below, self.below > J
         inverse = 1 / (2 * c - jnp.minimum(J, c))
         squared = c * c * inverse * inverse

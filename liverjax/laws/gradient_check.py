@@ -196,7 +196,8 @@ def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None =
 
 
 def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
-    """Energy, stress and moduli of the undeformed state; Voigt's means, of an isotropic law every direction's."""
+    """Energy, stress and moduli of the undeformed state. Moduli are Voigt's means; those of an isotropic law hold in
+    every direction."""
     W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     normal, coupled = np.trace(np.einsum("iijj->ij", A)), A[0, 0, 1, 1] + A[0, 0, 2, 2] + A[1, 1, 2, 2]
     shear = (normal - coupled) / 15 + (A[0, 1, 0, 1] + A[0, 2, 0, 2] + A[1, 2, 1, 2]) / 5
@@ -261,7 +262,7 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """The nominal stress rises; at the ends by one-sided differences."""
+    """Whether the nominal stress rises; one-sided differences decide at the ends."""
     stress = np.asarray(homogeneous.measured(test, jnp.asarray(P)))
     with np.errstate(all="ignore"):
         return np.gradient(stress, driven) > 0

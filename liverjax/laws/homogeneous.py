@@ -43,9 +43,9 @@ def deformation_gradient(test: str, driven: Number, stretch: Any = 1.0) -> jax.A
 def nominal_stress(law: Law, F: jax.Array, constant: bool = False) -> jax.Array:
     """First Piola-Kirchhoff stress (..., 3, 3) [Pa] of an incompressible sample whose face 3 is free: P_33 = 0.
 
-    P = dW/dF - p cof F. The volumetric energy of a law has no part in it; a law without such a split is taken at
-    det F = 1 as it is. `constant` says that F is data, with respect to which nothing will be differentiated: a
-    stretch-based law is then much cheaper to differentiate with respect to its parameters.
+    P = dW/dF - p cof F. The volumetric energy of a law does not contribute. A law without such a split is evaluated at
+    det F = 1. `constant` says that F is data, with respect to which nothing will be differentiated: a stretch-based law
+    is then much cheaper to differentiate with respect to its parameters.
     """
     split = law.isochoric_part()
     if constant and split is not None and split.stretch_energy is not None:

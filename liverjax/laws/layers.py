@@ -1,4 +1,4 @@
-"""Laws in thin parts of a body: layers without stress across them, and bars; isotropic ones."""
+"""Isotropic laws in thin parts of a body: layers without stress across them, and bars."""
 
 import dataclasses
 from typing import Any
@@ -16,7 +16,7 @@ _ITERATIONS, _LONGEST = 30, 0.5
 
 
 def read_layer(table: object, name: str) -> Law:
-    """The law of a thin part by its table; its bulk modulus may be left out, since it does not act.
+    """Read the law of a thin part from its table. Its bulk modulus does not act and may be left out.
 
     Raises:
         InputError: an unknown law or number, in a sentence that begins with `name`.

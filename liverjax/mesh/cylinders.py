@@ -1,7 +1,7 @@
 """Cylinders with rings and layers at given places: whole ones, and sectors of axisymmetric problems.
 
-A ring is a regular polygon. Its corners lie outside the circle, by so much that the polygon has the circle's area: a
-stiffness then differs from that of the circle by the fourth power of the polygon's angle, not by its square.
+A ring is a regular polygon. Its corners lie a little outside the circle, so that the polygon has the circle's area. The
+error of a stiffness is then of fourth order in the polygon's angle, not of second order.
 """
 
 import itertools
@@ -48,8 +48,8 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
 def graded_cylinder(radii: np.ndarray, heights: np.ndarray, match_area: bool = True) -> TetMesh:
     """A cylinder about the z axis with rings of nodes at `radii` and layers of nodes at `heights`.
 
-    Edges around the axis are about as long as the widest ring is wide. The number of corners grows across wide rings
-    only: a thin one has as many outside as inside.
+    Edges around the axis are about as long as the widest ring is wide. The number of corners grows only across wide
+    rings. A thin ring has as many corners outside as inside.
 
     Args:
         radii: of the rings (n,) [m], rising from 0 (the axis).
@@ -157,7 +157,8 @@ def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np
 
 
 def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
-    """Triangles between two rings: always the next edge, inside or outside, whose middle comes first."""
+    """Triangles between two rings. Each takes the next edge, inside or outside, whose middle comes first around the
+    ring."""
     n, m = len(inner), len(outer)
     if n == 1:
         return [[inner[0], outer[j], outer[(j + 1) % m]] for j in range(m)]

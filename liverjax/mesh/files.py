@@ -162,7 +162,7 @@ _MOST_GROUPS = 100
 def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
     """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups of whole numbers.
 
-    A group has its name in the file (Gmsh's physical names), or one of array and number, ``medit:ref=2``.
+    A group is named by the file (Gmsh's physical names), or by array and number, as in ``medit:ref=2``.
     """
     kinds = [block.type for block in data.cells]
     first = np.cumsum([0, *(len(block.data) if block.type == cell else 0 for block in data.cells)])

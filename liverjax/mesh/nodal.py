@@ -28,7 +28,7 @@ def integrals(mesh: TetMesh, density: jax.Array) -> jax.Array:
 
 
 def gathered(mesh: TetMesh, shares: jax.Array) -> jax.Array:
-    """The transpose of `interpolated`: it adds values of the points (Q, E) up at the vertices (V,)."""
+    """The transpose of `interpolated`: sums (V,) at the vertices of values at the points (Q, E)."""
     if mesh.order == 1:
         return to_nodes(mesh, shares / 4)
     parts = jnp.asarray(basis(mesh.order).L, shares.dtype) @ shares

@@ -66,12 +66,13 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
 
 
 def _code(triples: np.ndarray, V: int) -> np.ndarray:
-    """One number a sorted triple: below 2^63 for two million vertices."""
+    """One number for each sorted triple; it stays below 2^63 up to two million vertices."""
     return (triples[:, 0] * V + triples[:, 1]) * V + triples[:, 2]
 
 
 def with_functions(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
-    """Nodes (n,) of the quadratic elements, then the functions of order 3 on the edges and faces they hold; host."""
+    """Nodes (n,) of the quadratic elements, then the functions of order 3 on the edges and faces between these nodes;
+    host side."""
     inside = np.zeros(mesh.number_of_nodes, bool)
     inside[nodes] = True
     V, N = mesh.number_of_vertices, mesh.pattern.edges.shape[1]

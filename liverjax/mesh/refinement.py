@@ -14,8 +14,8 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     """The mesh with every tetrahedron cut into eight (Bey 1995), of the same order; host side.
 
     The old vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`: the vertices
-    are the nodes of `quadratic(mesh)`. A node set takes in the new nodes on all faces that it holds. Curved surfaces
-    stay as they were drawn: refinement does not bring them nearer to the organ.
+    are the nodes of `quadratic(mesh)`. A node set takes in the new nodes on all faces that it holds. The surface keeps
+    its flat triangles: refinement does not bring it nearer to the organ.
 
     Args:
         near: node numbers (n,). With them only the edges that meet these nodes are halved, and as many others as keep
@@ -37,7 +37,7 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """Those of some surface nodes (n,) at the edge of the surface that they hold, (m,): where strain is largest."""
+    """Of some surface nodes (n,), those (m,) at the edge of the patch that they cover. Strain is largest there."""
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
     triangles = boundary_triangles(mesh, held)
     sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
@@ -57,7 +57,7 @@ def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
 
 
 def _by_length(mesh: TetMesh) -> np.ndarray:
-    """Places (N,) of the edges by length: no two are equal, so two elements cut the face between them alike."""
+    """Ranks (N,) of the edges by length. No two are equal, so two elements cut their common face in the same way."""
     low, high = np.asarray(mesh.pattern.edges)
     points = np.asarray(mesh.points)
     # Rounded, so that edges of one length are told by their number on every machine.
@@ -68,7 +68,8 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
 
 
 def _halved(mesh: TetMesh, near: np.ndarray) -> np.ndarray:
-    """Which edges (N,) are halved: at the nodes, and the longest of every element and face that has a halved one."""
+    """Which edges (N,) are halved: those at the nodes, and the longest edge of every element and face with a halved
+    edge."""
     edges, place = np.asarray(mesh.pattern.element_edges), _by_length(mesh)
     groups = [edges, *(edges[[k for k, pair in enumerate(PAIRS) if set(pair) <= set(face)]] for face in FACES)]
     longest = [np.take_along_axis(g, place[g].argmax(axis=0)[None], axis=0)[0] for g in groups]

@@ -43,8 +43,9 @@ def areas(points: jax.Array, triangles: Indices) -> jax.Array:
 def nodal_shares(mesh: TetMesh, triangles: Indices) -> list[tuple[Indices, float]]:
     """Nodes (m,) of flat triangles that share a uniform load, and the share of each.
 
-    A third at each vertex of a linear element. The functions of the vertices of a quadratic one have no integral: a
-    third at the middle of each edge. Triangles (m, 4) of a mesh of order 3 name their face in the last column.
+    In a linear element each vertex has a third. In a quadratic element the functions of the vertices have the integral
+    0, and the middle of each edge has a third. Triangles (m, 4) of a mesh of order 3 name their face in the last
+    column.
     """
     nodes = triangle_nodes(mesh, triangles)
     if mesh.order == 1:

@@ -40,7 +40,7 @@ class Tied(Protocol):
     """Nodes that move together in a step, by a few numbers; a field of the nodes carries these numbers."""
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The part of a field (V, 3) along the free motions. Those of forces depend on the positions x (V, 3)."""
+        """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
         """Put the numbers of the motions at positions x (V, 3) into the field (V, 3). `placed` is the inverse."""
@@ -178,7 +178,7 @@ class NodalForce:
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
         """An energy [J] at x whose gradient at `start` (V, 3) is the force there, for a search that begins there.
 
-        The energy itself where there is one. Else what keeps the force from having one is held as it is at `start`.
+        It is the energy itself where there is one. Otherwise the part that has no energy is held as it is at `start`.
         """
         return self.energy(mesh, x)
 
@@ -196,7 +196,8 @@ class NodalForce:
         return None if own is None else without_negative(own)
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
-        """What a number that adapts to motion takes from that stiffness, or from its definite form; None: nothing."""
+        """The loss of stiffness by a number that adapts to motion (`definite`: that of the definite form); None:
+        nothing adapts."""
         return None
 
     def predicted(self) -> jax.Array | None:

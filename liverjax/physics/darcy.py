@@ -90,7 +90,7 @@ def right_side(flow: Flow, b: jax.Array) -> jax.Array:
 
 
 class Guess(NamedTuple):
-    """Pressures to begin a solve with, and how exact it need be."""
+    """Pressures to begin a solve with, and the accuracy that it needs."""
 
     pressure: jax.Array  # (V,) [Pa], without derivative
     looser: Number  # tolerance over that of the flow
@@ -137,7 +137,8 @@ def solved(mesh: TetMesh, flow: Flow, b: jax.Array, guess: Guess | None = None) 
 
 
 def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
-    """A p, by differences of neighbours: where p is uniform nothing flows, however large dt and however few digits."""
+    """The product A p, made of differences between neighbours. So a uniform p gives no flow at all, for every dt and
+    precision."""
     rows, nodes = flow.matrix.rows[0][0], flow.matrix.nodes
     # One kernel for all neighbours: a third of the time of a loop over them, on small and on large meshes.
     return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
@@ -150,7 +151,7 @@ _POLYNOMIAL_ERROR = 0.1
 def nearly_solved(mesh: TetMesh, flow: Flow, b: jax.Array) -> jax.Array:
     """Approximate A^-1 b for b (V,), with A the matrix of the pressure: linear, symmetric, positive definite.
 
-    The slow waves exactly, by the coarse space, the others by a polynomial.
+    The coarse space solves the slow waves exactly; a polynomial treats the others.
     """
     d = flow.matrix.diagonal[0][0]
     degree = jnp.ceil(0.5 * jnp.sqrt(flow.high / flow.low) * jnp.log(2 / _POLYNOMIAL_ERROR)).astype(jnp.int32)

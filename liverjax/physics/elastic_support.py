@@ -1,9 +1,9 @@
 """An elastic support: springs between the body and a wall that does not move, on nodes or on a part of the surface.
 
 Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
-(a Winkler foundation). They begin without tension. With a history of factors their stiffness changes in time; with one
-of displacements the wall moves, and the springs with it. A third of every triangle counts at each of its nodes; of
-quadratic elements, at the middles of its edges.
+(a Winkler foundation). They begin without tension. A history of factors changes their stiffness in time. A history of
+displacements moves the wall, and the springs with it. Each node of a triangle has a third of it; in quadratic elements
+the middles of its edges have these thirds.
 """
 
 from typing import Any, ClassVar

@@ -8,7 +8,7 @@ at the beginning of a step, so that it is linear in P:
 
 * "implicit": P belongs to the end of the step, with the volume change of the step itself. P is eliminated, P(x), which
   leaves a symmetric problem in x alone: stable at any step. Newton's direction comes from the coupled matrix of (x, P).
-* "lagged": P from the volume change of the step before, as the chapter has it; conditionally stable. Its old name here,
+* "lagged": P follows from the volume change of the step before, as in the chapter; conditionally stable. Its old name,
   "chapter", is accepted.
 """
 
@@ -74,7 +74,7 @@ class Porosity(Physics):
         return initial_fluid(self, start.mesh)
 
     def freeze(self, memory: "Fluid", step: Step) -> "Sponge":
-        """The equation of the pressure; where it does not depend on the step's end, it is solved here."""
+        """Make the equation of the pressure. It is solved here if it does not depend on the step's end."""
         F = deformation_gradient(step.mesh, step.x)
         found = darcy.flow(self, step.mesh, memory.J, F, step.dt, 1e-2 * step.tolerance)
         if self.inlet:
@@ -136,7 +136,8 @@ def check_sponge(porosity: Porosity) -> None:
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law beside the sponge, without its own volumetric energy (bulk would count twice) unless asked for."""
+    """The law beside the sponge. It has no volumetric energy of its own, unless asked for, since bulk would count
+    twice."""
     if porosity is None or porosity.keep_bulk:
         return law
     return law.each(lambda own: own if isochoric_part(own) is None else isochoric_part(own))
@@ -168,7 +169,8 @@ def volumetric_slope(porosity: Porosity, J: Number) -> jax.Array:
 
 
 def volumetric_energy(porosity: Porosity, J: Number) -> Number:
-    """The integral of sigma_Heq from 1 to J [Pa]: K0 r_w^2 (u ln u - u + 1), u = (r_w + J - 1)/r_w, and a parabola."""
+    """The integral of sigma_Heq from 1 to J [Pa]: K0 r_w^2 (u ln u - u + 1) with u = (r_w + J - 1)/r_w; a parabola
+    below J0."""
     K0, K_lim, r_w = porosity.bulk, porosity.limit_bulk, porosity.fluid_fraction
     J0 = 1 - r_w + r_w * K0 / K_lim
     u = 1 + (jnp.maximum(J, J0) - 1) / r_w

@@ -34,12 +34,12 @@ NAMED: tuple[type[Physics], ...] = (
 
 
 def law_at_rest(scene: Any) -> Law:
-    """The law that holds the body together at rest, in whole."""
+    """The whole law of the body at rest: beside a sponge, the law without its own volumetric energy."""
     return porosity.law_in_force(scene.porosity, scene.law)
 
 
 def physics_of(scene: Any) -> tuple[Physics, ...]:
-    """The physics that act in a `liverjax.scenes.scene.Scene`; it has no others."""
+    """All physics that act in a `liverjax.scenes.scene.Scene`."""
     law, averaged, mixed = law_at_rest(scene), scene.solve.volumetric == "nodal", scene.solve.volumetric == "mixed"
     if averaged or mixed:
         law = isochoric_part(scene.law)

@@ -1,6 +1,6 @@
 """A rigid plate: nodes that turn about an axis as one body, by an angle or a torque given over time.
 
-The plate takes away all motions of its nodes but two: the turn, and the way along the axis where that is free.
+The nodes of the plate keep two motions only: the turn, and the way along the axis if that is free.
 Unknowns stay nodal vectors. The turn is carried by the field b = e x (x - c) / R of the plate's nodes at the beginning
 of a step. R^2 is the sum of their squared distances from the axis. A field a b stands for the angle a / R. Positions
 follow the circle exactly, so angles may be large.
@@ -139,7 +139,7 @@ class Plate(NamedTuple):
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The part of a field (V, 3) along the free motions. Those of forces depend on the positions x (V, 3)."""
+        """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
         return self.spread(field, *self.amplitudes(field, self._arms(self.carrier) if x is None else self.arms(x)))
 
     def given(self, s: Number) -> jax.Array:

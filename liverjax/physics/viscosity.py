@@ -116,7 +116,8 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
 
 
 def lasting(prony: Prony, order: int = 1) -> jax.Array:
-    """The part of the stress that never relaxes: (), or by element with the axes of the points of that order."""
+    """The part of the stress that never relaxes: one number (), or one an element with the axes of the points of that
+    order."""
     left = 1 - jnp.sum(jnp.asarray(prony.ratios), axis=0)
     return left[None] if left.ndim and order > 1 else left
 
@@ -142,8 +143,8 @@ def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
 def complex_ratios(prony: Prony, omega: Number, dt: Number | None = None) -> jax.Array:
     """gamma_k / S_h at angular frequency omega [rad/s] on the steady cycle, complex, shape (N, ...).
 
-    With `dt` [s] that of the recursion (the discrete formula, exact for it), without that of continuous time,
-    g/(1 + i omega tau). The modulus is G*/G0 = 1 - sum over modes.
+    With `dt` [s] it is the exact ratio of the discrete recursion; without `dt` that of continuous time, g/(1 + i omega
+    tau). The modulus is G*/G0 = 1 - sum over modes.
     """
     omega = jnp.asarray(omega)[None]
     column = (-1,) + (1,) * (omega.ndim - 1)
@@ -282,7 +283,7 @@ class Viscoelastic(Solid):
         return blocks(self.prony, self.recall, self.law, F, D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
-        """(1 - sum a) W - past : C/2, and U in full where it does not relax: an incremental potential."""
+        """Incremental potential: (1 - sum a) W - past : C/2. U is added in full if it does not relax."""
         law, past = relaxing(self.prony, self.law), self.recall.past
         C = right_cauchy_green(F)
         stored = sum(past[i][j] * C[i][j] for i in range(3) for j in range(3))
@@ -291,7 +292,7 @@ class Viscoelastic(Solid):
         return W if rest is None else W + rest.strain_energy(rest.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], Matrix]:
-        """The relaxing part with its weight, the part that does not relax, and minus the memory."""
+        """The relaxing part with its weight, the part that does not relax, and the memory with a minus sign."""
         rest = volumetric_part(self.law) if self.prony.part == "isochoric" else None
         weighted = [(self.recall.now, relaxing(self.prony, self.law))]
         return weighted if rest is None else [*weighted, (1.0, rest)], scale_matrix(-1.0, self.recall.past)

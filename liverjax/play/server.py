@@ -72,7 +72,7 @@ class Answer(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Thirty lines a second would say nothing."""
+        """Print nothing: there would be thirty lines a second."""
 
 
 def stepped(playing: Playing, asked: Content) -> Playing:

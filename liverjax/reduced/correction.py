@@ -5,9 +5,9 @@ and the part of each field is a polynomial of the coordinates: linear in all, qu
 time, the rates of the coordinates count too. The numbers are those of least squares with a small ridge (closures of
 reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301).
 
-Groups of runs are left out in turn. How far off the runs left out are decides how many coordinates have products. The
-polynomials made without a group are a committee: what they differ by tells how far off the corrected motion may be
-(the jackknife; Tukey 1958), times an effectivity that the runs left out tell.
+Groups of runs are left out in turn. The errors of these runs decide how many coordinates have products. Each group left
+out gives other polynomials. The difference between their answers, times a factor found from the runs left out,
+estimates the error of the corrected motion (the jackknife; Tukey 1958).
 """
 
 from functools import partial
@@ -77,7 +77,7 @@ def stated_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """The correction with the smallest errors of runs left out; None with too few runs or where none is better."""
+    """The correction with the smallest errors in the runs left out; None if runs are too few or no correction helps."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -156,7 +156,8 @@ def _least_squares(A: np.ndarray, parts: np.ndarray, group: np.ndarray) -> _Leas
 
 
 def _spreads(A: np.ndarray, sums: _LeastSquares, committee: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Largest spread along each run (R,) [m^2.5]: of what is known without its group, and without another one too."""
+    """Largest spread along each run (R,) [m^2.5] of the polynomials made without its group, and without a second group
+    too."""
     found = np.zeros(len(A))
     for g in range(GROUPS):
         apart = np.stack([sums.without(g, other) - committee[g] for other in range(GROUPS) if other != g])

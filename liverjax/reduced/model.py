@@ -22,7 +22,8 @@ from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.loads import follows
 from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.reduced.correction import Correction
-from liverjax.scenes import regions
+from liverjax.scenes.by_element import law_of_elements
+from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 
@@ -74,7 +75,7 @@ def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
 def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
     """The physics in the elements of the full model; its law has the numbers of the sampled points."""
     E = scene.mesh.number_of_elements
-    law = regions.law_of_elements(scene.law, scene.region, E)
+    law = law_of_elements(scene.law, scene.region, E)
     elements = model.points % E
     law = jax.tree.map(lambda a: jnp.asarray(a)[elements] if jnp.shape(a) in ((E,), (E, 3)) else a, law)
     assert isinstance(law, Law)
@@ -104,7 +105,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
     """
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: leave that of regions out, or run the full model")
-    if len(regions.laws_of(scene.law, scene.region)) > 1:
+    if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError("a reduced model has one kind of law: give regions other numbers of it, or run the full model")
     if scene.porosity is not None:
         raise InputError("a reduced model has no pore pressures: leave [porosity] out, or run the full model")

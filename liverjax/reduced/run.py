@@ -26,7 +26,7 @@ from liverjax.reduced.model import (
     solid_at_points,
 )
 from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import check_bounds, check_choices
+from liverjax.scenes.scene_checks import check_before_run
 from liverjax.tensors.matrices import IDENTITY, determinant
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -269,7 +269,8 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """Coordinates, memory, motion at rest, no inverse yet, mass matrix; motion and mass None without inertia."""
+    """What a run begins with: coordinates, memory, motion at rest, an empty inverse, mass matrix. Without inertia
+    motion and mass are None."""
     n, S = model.slopes.shape[0], model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
     inverse = jnp.zeros((n, n), q.dtype)
@@ -283,7 +284,8 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
-    """One step: (coordinates, memory, motion) before it and its loads -> the same after it, and a row of the result."""
+    """One step: from (coordinates, memory, motion) before it and its loads to the same after it, and a row of the
+    result."""
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
@@ -335,8 +337,7 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
         InputError: another scene, or numbers that `simulate` refuses too.
     """
     refuse_another_scene(model, scene)
-    check_choices(scene)
-    check_bounds(scene)
+    check_before_run(scene)
     return _reduced_run(model, scene)
 
 
@@ -353,9 +354,9 @@ def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) 
 
 
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Largest distance of a node from the full model (T,) [m], as learnt from runs left out; of use in every step.
+    """Estimated largest distance of a node from the full model (T,) [m], learnt from the runs left out.
 
-    It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` asks the full mesh.
+    It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` uses the full mesh.
 
     Args:
         model, scene, result: as of `simulate_reduced`.

@@ -61,9 +61,8 @@ def sampled(
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
-    """Runs and, of each, the steps whose forces are taken: evenly apart, from another place in every run.
-
-    So all times are seen, however few steps each run has; the first steps alone would know of no large motion.
+    """Runs, and the steps of each whose forces are used. Steps are evenly spaced and begin at another place in every
+    run. So all times are used, also if each run gives few steps; the first steps alone have no large motion.
     """
     chosen = np.unique(np.linspace(0, runs - 1, min(runs, MOST_STATES)).round().astype(int))
     each = min(steps, max(1, MOST_STATES // len(chosen)))

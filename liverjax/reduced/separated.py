@@ -3,9 +3,10 @@
     u(x, p_1 ... p_n) = sum over m of w_m(x) f_m1(p_1) ... f_mn(p_n)
 
 is the form of proper generalised decomposition (chapter, section 3.3; Chinesta, Ladeveze, Cueto 2011, Arch. Comput.
-Methods Eng. 18, 395). Laws of soft tissue have no products of their own, so the terms come from full runs at a grid of
-parameters: one after another, each by alternating least squares on what those before left out, and after each the
-fields w_m of all by least squares. Functions of a parameter are polynomials of Chebyshev.
+Methods Eng. 18, 395). Laws of soft tissue are not such products, so the terms come from full runs at a grid of
+parameters. They are found one after another, each by alternating least squares on the part that the terms before leave
+out. After each term all fields w_m are found anew by least squares. Functions of a parameter are polynomials of
+Chebyshev.
 """
 
 from collections.abc import Mapping

@@ -141,8 +141,8 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
     """Modes (n, V, 3) that leave out at most `tolerance` of fields u (N, V, 3), in the norm of lumped volumes (V,).
 
-    They come from the eigenvalues of the fields' products (Sirovich 1987), which have half of the digits: the least
-    tolerance is 1e-7.
+    They come from the eigenvalues of the fields' products (Sirovich 1987). Products keep only half of the digits, so
+    the smallest tolerance is 1e-7.
     """
     flat = (u * np.sqrt(volumes)[:, None]).reshape(len(u), -1)
     size, vectors = np.linalg.eigh(flat @ flat.T)

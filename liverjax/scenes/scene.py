@@ -32,7 +32,7 @@ class Body:
 
 @struct
 class Solve:
-    """How the scene is solved; all but the time step and the tolerance is static."""
+    """How the scene is solved. Time step, tolerances and frequencies may change; the rest is fixed when compiled."""
 
     dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
     kind: str = static(default="static", about="static: no inertia; dynamic; harmonic: waves at `frequencies`")

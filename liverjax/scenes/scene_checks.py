@@ -10,10 +10,12 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import porosity, viscosity
 from liverjax.physics.base import Physics
-from liverjax.physics.prescribed import free_places
+from liverjax.physics.loads import Traction
+from liverjax.physics.prescribed import Displaced, free_places
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.volumes.mixed import check as check_mixed_law
-from liverjax.scenes import regions
+from liverjax.scenes.region_checks import check_region_elements, check_region_numbers
+from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Body, Scene
 
 #: What the choices of [solve] may be.
@@ -28,8 +30,18 @@ CHOICES = {
 }
 
 
+def check_before_run(scene: Scene) -> None:
+    """Refuse choices that mean nothing and numbers out of bounds; traced numbers pass. Compiles nothing.
+
+    Raises:
+        InputError: as `check_choices` and `check_bounds`.
+    """
+    check_choices(scene)
+    check_bounds(scene)
+
+
 def check_choices(scene: Scene) -> None:
-    """Refuse choices that mean nothing; looks at no numbers, so that a traced scene passes as well.
+    """Refuse choices that mean nothing. Numbers are not looked at, so a traced scene passes as well.
 
     Raises:
         InputError: unknown choices; a load or motion given twice, not at all, of wrong shape.
@@ -52,22 +64,11 @@ def check_choices(scene: Scene) -> None:
     if scene.solve.volumetric == "mixed":
         _mixed(scene)
     for k, load in enumerate(scene.traction):
-        history.check(load.times, load.history, f"traction.{k}")
-        if np.ndim(load.history) == 2:
-            if load.value is not None or load.pressure is not None:
-                raise InputError(f"traction.{k} has a value and a history of values: leave one of them out")
-            continue
-        if (load.value is None) == (load.pressure is None):
-            raise InputError(f"traction.{k} needs either value (3,) or pressure, in Pa: give one of them")
-        name, shape = ("pressure", ()) if load.value is None else ("value", (3,))
-        if np.shape(getattr(load, name)) != shape:
-            raise InputError(f"traction.{k} {name} has shape {np.shape(getattr(load, name))}: give shape {shape}")
+        _check_traction(load, f"traction.{k}")
     if scene.body is not None:
         _body(scene.body, scene.mesh.number_of_nodes)
     for k, motion in enumerate(scene.displaced):
-        history.check(motion.times, motion.history, f"displaced.{k}", (3,) if motion.by is None else (1,))
-        if motion.by is None and motion.history is None:
-            raise InputError(f"displaced.{k} needs either by (3,) or times and history: give one of them")
+        _check_motion(motion, f"displaced.{k}")
 
 
 def _loaded(scene: Scene) -> None:
@@ -77,6 +78,25 @@ def _loaded(scene: Scene) -> None:
         raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
     if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
         raise InputError('[mesh] is = "loaded" knows no nodes that move together: leave the rigid plate out')
+
+
+def _check_traction(load: Traction, name: str) -> None:
+    history.check(load.times, load.history, name)
+    if np.ndim(load.history) == 2:
+        if load.value is not None or load.pressure is not None:
+            raise InputError(f"{name} has a value and a history of values: leave one of them out")
+        return
+    if (load.value is None) == (load.pressure is None):
+        raise InputError(f"{name} needs either value (3,) or pressure, in Pa: give one of them")
+    key, shape = ("pressure", ()) if load.value is None else ("value", (3,))
+    if np.shape(getattr(load, key)) != shape:
+        raise InputError(f"{name} {key} has shape {np.shape(getattr(load, key))}: give shape {shape}")
+
+
+def _check_motion(motion: Displaced, name: str) -> None:
+    history.check(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
+    if motion.by is None and motion.history is None:
+        raise InputError(f"{name} needs either by (3,) or times and history: give one of them")
 
 
 def _body(body: Body, nodes: int) -> None:
@@ -94,7 +114,7 @@ def _mixed(scene: Scene) -> None:
     name = "[solve] volumetric = 'mixed'"
     if scene.solve.robust != "off":
         raise InputError(f"{name} has no energy that a solution makes least, which robust needs: leave one of them out")
-    for law in regions.laws_of(scene.law, scene.region):
+    for law in laws_of(scene.law, scene.region):
         check_mixed_law(law, name)
 
 
@@ -102,7 +122,7 @@ def _own_volumes(scene: Scene) -> None:
     name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
         raise InputError(f"{name} holds a law's own volumetric energy, a sponge has another: use 'element'")
-    several = regions.laws_of(scene.law, scene.region)
+    several = laws_of(scene.law, scene.region)
     for law in several:
         if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
             raise InputError(f"{name} needs a law with bulk apart from its shear, {type(law).__name__} is none")
@@ -119,19 +139,17 @@ def check_bounds(scene: Scene) -> None:
     bounds.check(scene, leave=("mesh", "physics"))
     for name, physics in _named_physics(scene):
         bounds.check(physics, name)
-    regions.check_regions(scene.law, scene.region)
-    regions.check_viscosity(scene.viscosity, scene.region)
-    regions.check_porosity(scene.porosity, scene.region)
+    check_region_numbers(scene)
 
 
 def check_numbers(scene: Scene) -> None:
-    """Refuse numbers that cannot be used, alone or together; looks at no mesh; host side.
+    """Refuse numbers that cannot be used, alone or together. The mesh is not looked at; host side.
 
     Raises:
         InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.
     """
     check_bounds(scene)
-    for law in regions.laws_of(scene.law, scene.region):
+    for law in laws_of(scene.law, scene.region):
         law.check()
         if scene.viscosity is not None:
             viscosity.check(scene.viscosity, law)
@@ -148,7 +166,7 @@ def check_scene(scene: Scene) -> None:
     check_choices(scene)
     check_numbers(scene)
     check_mesh(scene.mesh)
-    regions.check(scene.law, scene.region, scene.mesh.number_of_elements)
+    check_region_elements(scene)
     for name, physics in _named_physics(scene):
         physics.check(scene.mesh, name)
         if scene.points_are != "loaded":
@@ -187,7 +205,7 @@ def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:
 
 
 def _no_two_normals(scene: Scene) -> None:
-    """A node may slide along one oblique plane only, and be held along none or all of the axes of its normal."""
+    """Refuse a node in two oblique planes, or held along some but not all axes of its plane's normal."""
     taken: dict[int, str] = {}
     mask = free_places(scene.mesh, scene.fixed, scene.displaced)
     for name, physics in _named_physics(scene):
@@ -215,7 +233,7 @@ def _no_contradiction(scene: Scene) -> None:
 
 
 def _held(scene: Scene) -> None:
-    """Every connected piece needs something that holds it, else a static solution does not exist."""
+    """Refuse a connected piece that nothing holds: a static solution does not exist then."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

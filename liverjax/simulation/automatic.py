@@ -16,8 +16,18 @@ from liverjax.scenes.scene_checks import check_choices
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
 
 
+def chosen(scene: Scene) -> Scene:
+    """The scene with choices in place of `auto`: form for volumes, then linear solver."""
+    solve = replace(scene.solve, volumetric=form_of_volumes(scene))
+    if solve.newton_iterations == 1:
+        solve = replace(solve, newton="one_step")
+    if solve.linear_solver == "auto":
+        solve = replace(solve, linear_solver=linear_solver(replace(scene, solve=solve)))
+    return replace(scene, solve=solve)
+
+
 def linear_solver(scene: Scene) -> str:
-    """The solver for a scene: cg or direct. If its numbers are traced, they are not known: cg."""
+    """The solver for a scene: cg or direct. It is cg if its numbers are traced, since they are not known then."""
     mesh, solve = scene.mesh, scene.solve
     # A quadratic element has about eight times the unknowns of a linear one.
     small = mesh.number_of_elements * (1 if mesh.order == 1 else 8) <= LARGEST

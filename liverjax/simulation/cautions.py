@@ -74,7 +74,7 @@ _LOCKING = 100.0
 
 
 def _of_locking(scene: Scene) -> list[str]:
-    """Quadratic elements that lock although they need not."""
+    """A sentence on quadratic elements that lock although another form would not."""
     if scene.mesh.order == 1 or scene.solve.volumetric != "element" or scene.porosity is not None:
         return []
     try:
@@ -91,7 +91,7 @@ def _of_locking(scene: Scene) -> list[str]:
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:
-    """Elements beyond `LEAST_J` or `MOST_J` at any step."""
+    """A sentence on elements beyond `LEAST_J` or `MOST_J` at any step."""
     said = []
     positions = jnp.asarray(result.positions)
     found = [np.asarray(a) for a in compiled(_extremes, scene.mesh, positions)(scene.mesh, positions)]

@@ -105,7 +105,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
     physics, free = physics_of(scene), free_directions(scene)
 
     def force() -> jax.Array:
-        """What acts on the nodes at x, without inertia, which begins with it."""
+        """Forces on the nodes at x without inertia; the first acceleration follows from them."""
         begin = _first_step(scene, x, free)
         acting = [p.freeze(None, begin) for p in physics if type(p).begin is Physics.begin]
         forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce)]

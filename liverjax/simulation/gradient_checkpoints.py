@@ -1,5 +1,5 @@
-"""Checkpoints of reverse mode: it keeps the state and the root of every step, or a few states, and computes the rest
-again.
+"""Checkpoints of reverse mode. It keeps the state and the root of every step, or only a few states, and computes the
+rest again.
 
 The root of a step (its name is set in `liverjax.solvers.step_cutting`) is kept. The derivative evaluates forces and
 tangent at the root again, but does not repeat Newton's iterations. If fewer states than steps are kept (Griewank and

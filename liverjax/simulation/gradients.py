@@ -18,10 +18,9 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation import gradient_checkpoints
-from liverjax.simulation.equations import equations, initial_state, unknowns
+from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.run import Result, simulate
-from liverjax.simulation.step import problem_of
-from liverjax.solvers import step_cutting
+from liverjax.simulation.step import beginning
 
 MODES = ("reverse", "forward")
 #: The scene's positions at the beginning, beside the dotted names of `with_parameters`.
@@ -100,7 +99,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     def carry(scene):
         start = initial_state(scene)
         first = equations(scene, start, jnp.ones(()))
-        return start, step_cutting.nothing_kept(problem_of(first), unknowns(first, start.x))
+        return start, beginning(first)[0]
 
     state, tangent = (_bytes(part) for part in jax.eval_shape(carry, scene))
     root = _bytes(scene.mesh.points)

@@ -5,9 +5,9 @@ ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which 
 A reaction changes by its derivative along du. Memories of viscosity, fluid and inertia go along with the richer run.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
-moderate strain; with du added, about a tenth is left. For quadratic ones the cubic functions show about two thirds of
-the error, so du counts 1.5 times. It knows nothing of the shape of the body, of time steps, nor of the fluid's own
-space.
+moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds
+of the error, so du is multiplied by 1.5. It leaves out the errors of the body's shape, of the time steps and of the
+fluid's pressures.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
-from liverjax.scenes import regions
+from liverjax.scenes.by_element import sponge_at_points
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.scene import Scene
 from liverjax.simulation import automatic, tangent
@@ -89,14 +89,14 @@ def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> M
     # Linear elements lock: their error is that against elements which do not.
     volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
     solve = replace(rich.solve, linear_solver="cg", robust="off", volumetric=volumetric)
-    sponge = None if rich.porosity is None else regions.sponge_at_points(rich.porosity, rich.mesh)
+    sponge = None if rich.porosity is None else sponge_at_points(rich.porosity, rich.mesh)
     rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, solve=solve)
     rich = replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
     return _estimate(scene, rich, positions, reactions)
 
 
 def refuse(scene: Scene) -> None:
-    """Refuse a scene whose error is not the mesh's alone.
+    """Refuse a scene for which this estimate is not made.
 
     Raises:
         InputError: a scheme of one linear solve a step.
@@ -148,7 +148,7 @@ def padded(rich: TetMesh, x: jax.Array) -> jax.Array:
 
 
 def _on_nodes(mesh: TetMesh, rich: TetMesh, force: jax.Array) -> jax.Array:
-    """Forces of the richer functions as the run's nodes feel them (V, 3)."""
+    """Forces (V, 3) on the nodes of the run, from forces on the richer functions."""
     if mesh.order == 2:
         return force[: mesh.number_of_nodes]
     return jnp.stack([restricted(rich, column) for column in force.T], axis=-1)

@@ -12,15 +12,14 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.tetrahedra import with_points
-from liverjax.scenes import regions
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import check_bounds, check_choices
+from liverjax.scenes.scene_checks import check_before_run
 from liverjax.simulation import automatic, gradient_checkpoints
-from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs, unknowns
+from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs
 from liverjax.simulation.mesh_error import MeshError, mesh_error_of, refuse
-from liverjax.simulation.step import problem_of, step
+from liverjax.simulation.step import beginning, step
 from liverjax.simulation.unloaded import Unloaded, unload
-from liverjax.solvers import step_cutting
 from liverjax.solvers.problem import StepStatistics
 
 
@@ -46,7 +45,7 @@ class Result:
 
 
 def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any) -> Callable:
-    """(state and tangent, k) -> those after step k, and what `_result` takes."""
+    """A function (state and tangent, k) -> state and tangent after step k, and the rows for `_result`."""
 
     def physics(carry, k):
         state, kept = carry
@@ -82,10 +81,8 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
-    method, q = problem_of(first), unknowns(first, start.x)
-    kept, one = step_cutting.nothing_kept(method, q), jnp.ones((), dtype)
     # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
-    near = None if steps == 1 else method.tangent(q, one, method.residual(q, one)[2], None)
+    kept, near = beginning(first, tangent_too=steps > 1)
     advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))
 
@@ -95,8 +92,7 @@ def _run_part(
     scene: Scene, state: State, numbers: jax.Array, report: Callable[[int], None] | None
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
-    first = equations(scene, state, numbers[0], sizes)
-    kept = step_cutting.nothing_kept(problem_of(first), unknowns(first, state.x))
+    kept, _ = beginning(equations(scene, state, numbers[0], sizes))
     advance = _step_by_step(scene, sizes, report, None)
 
     def unless_over(carry, k):
@@ -190,8 +186,8 @@ def unloaded(scene: Scene) -> Unloaded:
     """The scene whose loads lead to the given mesh; its points have derivatives by all numbers of the scene.
 
     Loads are those at the beginning of the run: histories count at time 0, and prescribed motion has not begun. Forces
-    are those of a body that has lain there long: viscosity has relaxed. Of quadratic elements the vertices are those
-    given; the middles of edges are straight in the reference shape.
+    are those of a body that has lain there long: viscosity has relaxed. Quadratic elements keep the given vertices;
+    their edges are straight in the reference shape.
 
     Raises:
         InputError: as `simulate`; a porous scene; no reference shape was found (traced: its points are NaN).
@@ -203,8 +199,7 @@ def unloaded(scene: Scene) -> Unloaded:
 
 def _ready(scene: Scene) -> Scene:
     """`prepared`, with the points as they are given."""
-    check_choices(scene)
-    check_bounds(scene)
+    check_before_run(scene)
     if scene.solve.kind == "harmonic":
         raise InputError("[solve] kind = 'harmonic' has no run in time: call lj.harmonic(scene)")
     if scene.solve.reduced:
@@ -213,21 +208,7 @@ def _ready(scene: Scene) -> Scene:
             f"[solve] reduced = {file!r} is for python -m liverjax simulate: in Python leave it out and call "
             "lj.simulate_reduced(lj.load_reduced(file), scene)"
         )
-    if scene.solve.newton_iterations == 1:
-        scene = replace(scene, solve=replace(scene.solve, newton="one_step"))
-    if scene.region:
-        E = scene.mesh.number_of_elements
-        law, prony = regions.law_of_elements(scene.law, scene.region, E), scene.viscosity
-        if prony is not None:
-            prony = regions.viscosity_of_elements(prony, scene.region, E)
-        sponge = scene.porosity
-        if sponge is not None:
-            sponge = regions.porosity_of_elements(sponge, scene.region, scene.mesh)
-        scene = replace(scene, law=law, viscosity=prony, porosity=sponge, region=())
-    scene = replace(scene, law=scene.mesh.at_points(scene.law))
-    scene = replace(scene, solve=replace(scene.solve, volumetric=automatic.form_of_volumes(scene)))
-    if scene.solve.linear_solver == "auto":
-        scene = replace(scene, solve=replace(scene.solve, linear_solver=automatic.linear_solver(scene)))
+    scene = automatic.chosen(by_element(scene))
     if scene.solve.precision == "float32":
         scene = jax.tree.map(partial(_cast, dtype=jnp.float32), scene)
     elif jnp.result_type(float) != jnp.float64:  # 64-bit mode is off

@@ -56,6 +56,16 @@ def problem_of(e: Equations) -> Problem:
     )
 
 
+def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
+    """The empty `Kept` of a run that begins with these equations, and the tangent at its beginning where asked for."""
+    method, q = problem_of(first), unknowns(first, first.state.x)
+    kept = step_cutting.nothing_kept(method, q)
+    if not tangent_too:
+        return kept, None
+    one = jnp.ones((), q.dtype)
+    return kept, method.tangent(q, one, method.residual(q, one)[2], None)
+
+
 def _flowing(e: Equations) -> Beside | None:
     """Pressures that flow, where they depend on motion."""
     volume: Any = e.volume

@@ -95,7 +95,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: str) -> tuple[Attached | GivesWay, ...]:
-    """Stiffness of elements between nodes that the physics bring, and what takes from it."""
+    """Stiffness of the physics' elements between nodes, and its losses by numbers that adapt."""
     found: list[Attached | GivesWay | None] = []
     for a in e.nodal:
         found.append(a.attached(e.mesh, x, s) if kind == "true" else a.definite(e.mesh, x, s))
@@ -104,7 +104,8 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: str) -> tuple[Attache
 
 
 def _symmetric(e: Equations, more: tuple[Attached | GivesWay, ...]) -> tuple[Attached, ...]:
-    """What a preconditioner takes of elements between nodes: friction has a stiffness without symmetry."""
+    """The part of elements between nodes that a preconditioner uses: the symmetric one, since friction has a stiffness
+    without symmetry."""
     elements = tuple(own for own in more if isinstance(own, Attached))
     return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
@@ -276,7 +277,7 @@ def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[ja
     schur = volume.unit**2 * volume.schur(e.mesh)
 
     def triangular(r: jax.Array) -> jax.Array:
-        """Pressures first, then the motions that they leave to the forces."""
+        """Solve for the pressures first, then for the motions under the forces that are left."""
         dp = -r[n:] / schur
         pulled = mixed_system.pulled(e.mesh, K.matrix, volume.unit * dp)
         left = [f - p for f, p in zip(block_matrix.columns(r[:n]), pulled, strict=True)]
@@ -393,14 +394,15 @@ def _refined(
 ) -> tuple[jax.Array, jax.Array]:
     """Solution of K x = b where pressures flow, and its residual over |b|: iterative refinement of the mixed system.
 
-    Motions and pressures are refined together, so no solve for pressures is more accurate than one refinement can use.
+    Motions and pressures are refined together, so no solve for pressures is more accurate than needed.
     """
     volume: Any = _coupled(e)
     A, flow, goal = K.matrix, volume.flow, tolerance * jnp.linalg.norm(b)
     loose = flow._replace(tolerance=_INNER_PRESSURE)
 
     def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """What forces lack with pressures that answer the balance of volumes, and the change of pressures for it."""
+        """The forces still out of balance after the pressures balance the volumes, and the change of pressures for
+        that."""
         motion = e.free.columns(block_matrix.columns(x))
         force, balance = mixed_system.balances(e.mesh, A, motion)
         dP = mixed_system.pressure_change(e.mesh, loose, A, balance - darcy.flow_product(flow, P), exactly=True)

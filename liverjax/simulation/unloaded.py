@@ -99,7 +99,7 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _free_part(e: Equations, z: jax.Array) -> jax.Array:
-    """The part of the unknowns that is free: displacements, then pressures that are unknown."""
+    """The free part of the unknowns: displacements, then unknown pressures."""
     n = 3 * e.mesh.number_of_nodes
     return jnp.concatenate([jnp.concatenate(e.free.columns(columns(z[:n]))), z[n:]])
 

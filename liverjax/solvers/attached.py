@@ -18,7 +18,7 @@ class Attached(NamedTuple):
 
 
 class GivesWay(NamedTuple):
-    """What one number that adapts to the motion takes from a stiffness: -h h^T / size."""
+    """The change -h h^T / size of a stiffness by one number that adapts to the motion."""
 
     h: jax.Array  # (V, 3) [N/m] force of the nodes for a unit of the number
     size: jax.Array  # () [N/m] stiffness of the number by itself
@@ -63,7 +63,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """The same for motions that are linear in every element: half of a middle moves with either end of its edge."""
+    """The same for motions that are linear in every element: the middle of an edge moves by the mean of its ends."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V

@@ -48,8 +48,8 @@ def solve_points(
 ) -> jax.Array:
     """The same of quadratic elements, flat: positions (3 V,), and pressures of the vertices where A has them.
 
-    `free` and `b` are two arrays each, of positions (3, V) and of pressures. Without numbers, pressures are free and
-    their part of `b` is 0.
+    `free` and `b` are two arrays each, of positions (3, V) and of pressures. Empty arrays for the pressures mean that
+    all are free and that their part of `b` is 0.
     """
     blocks = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in sorted(A.blocks)])
     own = None if A.own is None else _filled(A.own, b[0][0])
@@ -111,7 +111,7 @@ def _solve(*given: object) -> np.ndarray:
 
 
 def _given_ways(attached: tuple[Attached | GivesWay, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of all numbers that adapt, h (size, n) in the order of the unknowns and their own stiffness (n,)."""
+    """h (size, n) of all numbers that adapt, in the order of the unknowns, and the stiffness (n,) of each."""
     found = [own for own in attached if isinstance(own, GivesWay)]
     H = np.zeros((size, len(found)))
     for column, own in zip(H.T, found, strict=True):
@@ -158,7 +158,7 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
     """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0, for `ways` H and S.
 
-    `along`: normals that x is 0 along, or None, and what stands for A along them.
+    `along`: normals along which x is 0, or None, and the numbers that replace A along them.
     """
     import scipy.sparse.linalg
 

@@ -131,7 +131,7 @@ def symmetric_solve(
     solver: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
     tolerance: Number,
 ) -> WithLast:
-    """x of A x = b, A symmetric, as a linear map of b, and the last two solutions of such solves.
+    """The solution of A x = b for symmetric A, as a linear map of b; then the last two solutions of such solves.
 
     Its derivatives are solves as well, in both modes. NaN as of `differentiable_solve`.
 
@@ -172,7 +172,8 @@ def started(
     near: jax.Array,
     tolerance: Number,
 ) -> tuple[jax.Array, jax.Array]:
-    """Solution of A x = b, begun at `near` if that is nearer than 0: then less is left for the solver.
+    """Solution of A x = b. It begins at `near` if that is nearer to the solution than 0, so that the solver has less to
+    do.
 
     `solver` is (b, tolerance) -> solution and its residual over |b|, `tolerance` that of |b - A x| over |b|. Returns
     the solution and its residual over |b|.
@@ -210,9 +211,9 @@ def differentiable_solve(
 ) -> jax.Array:
     """A solve as a linear map of `b`: its derivatives are solves as well, not derivatives of the iterations.
 
-    It takes conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. NaN where the true residual
-    stays above 6e-6 |b| (float32: 1e-3) and ten times the tolerance: no wrong solution passes for one. A residual below
-    4 eps |D x| is accepted too, with the `diagonal` D of a diagonally dominant A: rounding x alone causes eps |D x|.
+    It takes conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the
+    true residual stays above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. A residual below 4 eps |D x|
+    is accepted too, with the `diagonal` D of a diagonally dominant A: rounding x alone causes eps |D x|.
     """
     symmetric, solver, diagonal = known
     method = conjugate_gradients if symmetric else stabilised_biconjugate_gradients

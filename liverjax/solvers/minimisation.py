@@ -1,13 +1,13 @@
 """Minimise the energy of a step. This serves steps that begin inverted, or whose load could not be followed.
 
-The true tangent is used where conjugate gradients find no negative curvature in it, else one without negative
-eigenvalues (`liverjax.elements.projection`); every step is shortened until the energy falls (Armijo). So the energy
-falls from point to point, and near the minimum convergence is quadratic. A start with inverted elements is first
+The true tangent is used if conjugate gradients find no negative curvature in it. Otherwise a tangent without negative
+eigenvalues serves (`liverjax.elements.projection`). Every step is shortened until the energy falls (Armijo). So the
+energy falls from point to point, and near the minimum convergence is quadratic. A start with inverted elements is first
 untangled as a stable neo-Hookean body of the same moduli, whose energy is finite everywhere: so any law may start
 there.
 
-Forces without an energy, as those of friction, are held in each iteration as they are where it begins: so they have one
-for that iteration, and its gradient there is the residual.
+Forces without an energy, such as friction, are held constant during each iteration. So they have an energy for that
+iteration, whose gradient at its beginning is the residual.
 """
 
 from typing import NamedTuple

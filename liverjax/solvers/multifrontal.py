@@ -21,7 +21,7 @@ STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
 
 class Front(NamedTuple):
-    """A group of unknowns, and those after it that it is coupled with."""
+    """A group of unknowns, and the later unknowns that are coupled with it."""
 
     own: np.ndarray  # (n,)
     border: np.ndarray  # (m,)
@@ -29,7 +29,7 @@ class Front(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """What is left of an elimination: of every group L U of its own matrix A, and X = A^-1 B of its border."""
+    """The result of an elimination: for every group L U of its own matrix A, and X = A^-1 B of its border."""
 
     matrix: "scipy.sparse.csr_array"  # scaled
     scale: np.ndarray  # (N,)
@@ -43,7 +43,7 @@ class Factor(NamedTuple):
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
-    """Groups of nodes and their children, each after its children.
+    """Groups of nodes with the numbers of their children; a group stands after its children.
 
     Args:
         elements: nodes (n, E) of every element; one that has fewer repeats one of them.
@@ -76,7 +76,7 @@ def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray
 
 
 def fronts(A: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray) -> list[Front]:
-    """The groups in unknowns of A (N, N), of which `node` (N,) are the nodes."""
+    """The groups as unknowns of A (N, N); `node` (N,) is the node of each unknown."""
     order = np.argsort(node, kind="stable")
     ends = np.searchsorted(
         node[order], np.arange(max(node.max(initial=0), max(g.max(initial=0) for g, _ in groups)) + 2)
@@ -173,7 +173,8 @@ def _without(F: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
-    """x (N,) of A x = b, refined, and the part of the terms of an equation that is left out of balance."""
+    """The refined solution x (N,) of A x = b, and its backward error: the residual of a line over the size of its
+    terms."""
     A, scale = factor.matrix, factor.scale
     b, x = scale * b, np.zeros(len(b), A.dtype)
     size, left, last = abs(A), b, np.inf
@@ -190,7 +191,7 @@ def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _backward_error(size: Any, x: np.ndarray, b: np.ndarray, out: np.ndarray) -> float:
-    """|b - A x| over |A| |x| + |b|, of the whole."""
+    """Backward error of the whole system: |b - A x| over |A| |x| + |b|."""
     terms = np.linalg.norm(size @ abs(x)) + np.linalg.norm(b)
     return float(np.linalg.norm(out) / terms) if terms > 0 else 0.0
 

@@ -27,7 +27,8 @@ class Coarse(NamedTuple):
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
-    """The coarse space for the leading m x m blocks. Left out if they are not positive definite or `used` is false.
+    """The coarse space for the leading m x m blocks. It is left out if the blocks are not positive definite, or if
+    `used` is false.
 
     Args:
         mesh: `TetMesh`.

@@ -24,7 +24,7 @@ class StepStatistics(NamedTuple):
 
 
 class StepOptions(NamedTuple):
-    """Limits of a step's solver; all but the tolerance is static."""
+    """Limits of a step's solver; all except the tolerance are fixed when compiled."""
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
     max_iterations: int = 25  # a part
@@ -50,7 +50,7 @@ class Kept(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """What the residual solves for at every q, by iterations that a guess shortens."""
+    """Unknowns that the residual solves for at every q. Its iterations are fewer with a guess."""
 
     before: jax.Array  # a guess at the beginning of the step
     #: (q, s, guess) -> its solution at q.

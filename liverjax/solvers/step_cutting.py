@@ -1,8 +1,8 @@
 """Newton's problem along a load: the solution is followed from the last equilibrium, in parts where it fails in one go.
 
-The residual r(q, s) has the loads and prescribed motion of a step's end at s = 1, of its beginning at s = 0. Forces
-that are out of balance at the beginning (inertia, a fluid) are reduced in proportion: r - (1 - s) r(start, 0) is 0
-where a step begins. Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted
+The residual r(q, s) has the loads and prescribed motion of the step's beginning at s = 0 and of its end at s = 1.
+Forces that are out of balance at the beginning (inertia, a fluid) are reduced in proportion: r - (1 - s) r(start, 0) is
+0 where a step begins. Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted
 through the tangent, never jumped to. A part that fails is halved. Only the root at s = 1 counts, and derivatives are
 those of the root.
 """
@@ -156,7 +156,7 @@ def _with_derivative(
 ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
     """The root q with the derivative of the residual's root, and the solutions for the next derivative to begin near.
 
-    To be carried from step to step, these solutions pass for unknowns of their own, equal to `last`. Forward mode
+    These solutions must be carried from step to step. So they count as further unknowns, equal to `last`. Forward mode
     hands them on, and reverse mode hands them back, from the later step to the earlier.
     """
     one = jnp.ones((), q.dtype)
@@ -223,10 +223,10 @@ def _follow(
 def _robust(
     problem: Problem, potential: Potential, start: jax.Array, guess: jax.Array, kept: Kept, options: StepOptions
 ) -> tuple[jax.Array, jax.Array]:
-    """The load is followed; where that fails, or elements are inverted at the beginning, the energy is made least.
+    """Follow the load. If that fails, or if elements are inverted at the beginning, minimise the energy.
 
-    At rest a start is but a guess: where it is nearly flat or leads nowhere, the load is followed from the reference
-    shape.
+    Without inertia a start is only a guess. If it is nearly flat or leads nowhere, the load is followed from the
+    reference shape.
     """
     zero = jnp.zeros((), start.dtype)
     nothing = StepStatistics(zero + status.STALLED, zero, zero, zero, zero)
@@ -406,9 +406,9 @@ _BESIDE = 0.1
 
 
 def _looser(options: StepOptions, v: _Verdict, expected: jax.Array, before: jax.Array) -> jax.Array:
-    """Tolerance of the next solve beside the root over the usual one: no finer than the residual to come can use.
+    """Factor on the tolerance of the next solve for pressures: as loose as the next residual allows.
 
-    Where a part begins nothing is known of it, so the tolerance is the usual one.
+    At the beginning of a part the next residual is not known, so the factor is 1.
     """
     wanted = jnp.maximum(1.0, _BESIDE * expected / options.tolerance)
     return jnp.where(v.failed | v.lost, 1.0, jnp.where(v.go_on, wanted, before)).astype(before.dtype)
@@ -424,7 +424,7 @@ def _direction(
 ) -> tuple[jax.Array, jax.Array, Kept, jax.Array]:
     """Solve dr/dq dq = load to `forcing`; return dq, the iterations, the tangent and whether it is positive.
 
-    `when`: whether the tangent is made anew, and whether a solution is wanted.
+    `when` says whether the tangent is made anew, and whether a solution is needed.
     """
     near, (renew, wanted) = (kept.made & ~kept.worn, kept.tangent), when
     q, s, by = at

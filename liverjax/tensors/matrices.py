@@ -136,7 +136,7 @@ def pack(A: Matrix) -> jax.Array:
 def stored(values: Any) -> Any:
     """The same pytree, written to memory: a branch keeps XLA:CPU from computing it again for every use.
 
-    Its leaves are one number, or arrays of which the first has numbers.
+    Its leaves are one number, or arrays; the first array is not empty.
     """
     values = jax.tree.map(jnp.asarray, values)
     number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]

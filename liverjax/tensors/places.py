@@ -6,10 +6,10 @@ from liverjax.core.struct import Indices
 
 
 def taken(values: jax.Array, places: Indices) -> jax.Array:
-    """`values` (n, …) at `places`, whole numbers from 0 to n - 1 of any shape."""
+    """Read `values` (n, …) at `places`, an array of whole numbers from 0 to n - 1 of any shape."""
     return values.at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def given(total: jax.Array, places: Indices, shares: jax.Array) -> jax.Array:
-    """`total` (n, …) with `shares` added at `places`, whole numbers from 0 to n - 1, as often as they occur."""
+    """Add `shares` to `total` (n, …) at `places`, whole numbers from 0 to n - 1; a place may occur several times."""
     return total.at[places].add(shares, mode="promise_in_bounds", wrap_negative_indices=False)

@@ -34,7 +34,7 @@ class Stretches(NamedTuple):
 def principal(F: Matrix) -> tuple[Vector, Matrix]:
     """ln lambda_m and the columns n_m: C = F^T F diagonalised by Jacobi rotations, no LAPACK call.
 
-    The stretches are |F n_m|: a small one keeps its relative accuracy beside large ones.
+    The stretches are |F n_m|, so that a small stretch keeps its relative accuracy beside large ones.
     """
     F = jax.lax.stop_gradient(F)
     axes = symmetric_axes(right_cauchy_green(F))

@@ -24,7 +24,7 @@ class Subsets(NamedTuple):
 
 
 def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
-    """Subsets: first the elements of no group, if there are any, then each group.
+    """Make subsets: first the elements without a group, if there are any, then each group.
 
     Args:
         groups: element numbers (n,) of groups that share none; they may be traced.

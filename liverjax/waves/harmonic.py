@@ -166,7 +166,7 @@ def _prescribed_and_loads(
 
 
 def _part(out: jax.Array, work: jax.Array) -> jax.Array:
-    """(F,) norms of what is out of balance, over those of what is at work."""
+    """Norms (F,) of the forces out of balance, over those of the forces at work."""
     sizes = [jnp.linalg.norm(a.reshape(len(a), -1), axis=1) for a in (out, work)]
     return sizes[0] / jnp.where(sizes[1] > 0, sizes[1], 1.0)
 

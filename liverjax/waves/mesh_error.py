@@ -21,10 +21,9 @@ def harmonic_mesh_error(
 ) -> jax.Array:
     """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
 
-    Quadratic elements are solved where the result is of linear ones, cubic where it is of quadratic ones. Too few
-    elements a wave show as an error of the size of the motion: the phase of the waves is wrong then. The cost is that
-    of a mesh with eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is
-    left out.
+    A result of linear elements is solved again with quadratic ones, and one of quadratic elements with cubic ones. With
+    too few elements a wave the phase is wrong, and the error is as large as the motion. The cost is that of a mesh with
+    eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is left out.
 
     Args:
         scene, factors, about, motion: as of `harmonic`.

@@ -1,6 +1,7 @@
 """Pressures of the vertices in harmonic motion: of a fluid that flows, or of volumes that hardly change.
 
-With the volume B^T u that a motion u takes from what a pressure pushes on, both are one symmetric system,
+A motion u takes the volume B^T u from the fluid or from the volume that the pressure acts on. Both cases are one
+symmetric system,
 
     K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega).
 
@@ -43,7 +44,7 @@ class Pressures(NamedTuple):
 
 
 def law_beside(scene: Scene) -> Any:
-    """The law without what pressures stand for."""
+    """The law without the energy that the pressures replace."""
     if scene.solve.volumetric in ("nodal", "mixed"):
         return isochoric_part(scene.law)
     return law_in_force(scene.porosity, scene.law)

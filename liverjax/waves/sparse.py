@@ -144,7 +144,7 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, key: 
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:
-    """Up to `KEPT` bytes: of the same matrix those of the first frequencies."""
+    """Keep factors up to `KEPT` bytes; of one matrix, those of the first frequencies."""
     for other in [other for other in _factors if other[:16] != key[:16]]:
         del _factors[other]
     if factor.nbytes + sum(own.nbytes for own in _factors.values()) < KEPT:

@@ -1,7 +1,7 @@
-"""The whole error of every number: noise, and beside it what noise does not know of, each a share of its own.
+"""The total error of every number: the share of noise, and the shares of other sources.
 
 Shares are independent of each other, so the total is the root of the sum of their squares. The spread between samples
-is none of them: the numbers are of the curve that was measured.
+is not among them: the numbers describe the measured curve, not the material.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ GAP, RADIUS = 50e-6, 10e-6
 def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     """Relative error of all moduli by the size of the sample between its plates; torque over twist is G pi R^4 / 2 h.
 
-    A `gap_error` [m] that is told is one of the standard errors already.
+    If a `gap_error` [m] is given, the standard errors contain it already.
     """
     gap = 0.0 if gap_error is not None else GAP / simulation.height
     return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
@@ -25,7 +25,7 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
-    The ends of the band: the larger of the two changes, as far as it exceeds the standard error.
+    The share of the band's ends is the larger of the two changes minus the standard error, or 0.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -59,7 +59,7 @@ def _moduli(fit: Fit) -> set[str]:
 
 
 def _of_modes(fit: Fit, moved: np.ndarray) -> dict[str, float]:
-    """Size of what moves G0, ratios and times (P,), and with them the equilibrium modulus."""
+    """Size of the changes (P,) of G0, ratios and times, then that of the equilibrium modulus."""
     n, G0, ratios = fit.modes, fit.uncertainty.values[0], fit.uncertainty.values[1 : fit.modes + 1]
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
     out["equilibrium_modulus"] = abs(float(moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()))

@@ -3,8 +3,8 @@
 The likelihood is raised to a power that grows from 0 to 1. Each step resamples the particles by the weights that it
 gives them, and moves them by differential evolution until they have forgotten where they were (Del Moral, Doucet and
 Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18, 435). Runs begin at the
-prior, so that they agree only if they have found all of the posterior, tails and further maxima included. A density of
-many points at once is all that it needs: no derivative, nothing to tune or to compile.
+prior. So they agree only if each has found the whole posterior, with its tails and all of its maxima. It needs only a
+density that takes many points at once: no derivative, nothing to tune or to compile.
 """
 
 from collections.abc import Callable

@@ -153,7 +153,8 @@ def _node(s: _At, D: Vector) -> _Node:
 
 
 def _written(values: Any) -> Any:
-    """The same with its arrays written to memory (`stored`). Plain numbers stay: products with 0 are left out."""
+    """The same with its arrays written to memory (`stored`). Plain numbers stay as they are, so that products with 0
+    can be left out."""
     leaves, tree = jax.tree.flatten(values)
     arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))
     return jax.tree.unflatten(tree, [next(arrays) if jnp.ndim(v) else v for v in leaves])

@@ -76,7 +76,7 @@ class Pieces(NamedTuple):
 
 
 def state(law: "Law", F: Matrix) -> State | Pieces:
-    """The law (`liverjax.laws.base.Law`) at F."""
+    """The invariants and derivatives of the law (`liverjax.laws.base.Law`) at F."""
     if law.subsets is not None:
         own = (_state_of_law(law.piece(k), in_subset(law.subsets, k, F)) for k in range(len(law.pieces())))
         return Pieces(law.subsets, tuple(own), F, cofactor(F))
@@ -104,7 +104,7 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Any]:
-    """Names of the invariants a . C a of a sum of laws: each has its own fibre."""
+    """Names of the invariants a . The products C a for a sum of laws; each law has its own fibre a."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}
@@ -159,7 +159,8 @@ _FLAT = 1e-3
 def second_piola(F: Matrix, resultant: Stress) -> Matrix:
     """S + p J C^-1 [Pa] of P = F S + p cof F, with J C^-1 = cof(F)^T cof(F) / J.
 
-    Section 4.2 needs F^-1 here, so it is not defined at J = 0: an element flatter than |J| = 1e-3 counts as that flat.
+    Section 4.2 needs F^-1 here, which does not exist at J = 0. So an element flatter than |J| = 1e-3 is treated as if
+    it had |J| = 1e-3.
     """
     S, p = resultant
     cof = cofactor(F)

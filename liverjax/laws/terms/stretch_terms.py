@@ -7,8 +7,8 @@ In the principal axes S is diagonal, S_m = tau_m / lambda_m^2 with tau_m = dw/d 
 
 The chapter's A H A form (section 4.1.2) has a geometric mean there: wrong except for alpha = 2 and 4.
 
-Values are these formulas. Their derivatives, one order higher each, come from the energy expanded in frozen principal
-axes (`liverjax.tensors.principal`), which is smooth where stretches are equal and the axes are not.
+Values are these formulas. Their derivatives come from the energy expanded in frozen principal axes
+(`liverjax.tensors.principal`). This expansion is smooth where stretches are equal; the axes themselves are not.
 """
 
 from functools import partial
@@ -122,7 +122,7 @@ def blocks(law: "Law", F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -
 
 
 def _arrays(law: "Law", F: Matrix) -> jax.Array:
-    """The law with its parameters in the precision of F: whole numbers have no derivative."""
+    """The law with its parameters in the precision of F, since whole numbers have no derivative."""
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.result_type(F[0][0])), law)
 
 
@@ -139,7 +139,7 @@ def _square(upper: tuple) -> list[list]:
 
 
 def stress_at_constant(law: "Law", F: Matrix) -> Matrix:
-    """`stress` for an F that is data: its axes do not move, so plain differentiation by parameters will do."""
+    """`stress` for an F that is data. Its axes do not move, so plain differentiation by parameters is right."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 

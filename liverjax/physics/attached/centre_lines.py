@@ -1,8 +1,8 @@
 """Centre lines and radii of tubes from their surface, as a segmentation writes it: one tube, or a tree of them.
 
-Lines of equal distance along the surface, from one end, are rings about the tubes, one a branch. Their centres, joined
-across the bands between them, are the centre lines. The radius of a piece is the mean distance of its rings from it.
-Lines begin and end where the surface does.
+Lines of equal distance from one end, measured along the surface, are rings about the tubes: one ring for each branch.
+Their centres, joined across the bands between them, are the centre lines. The radius of a piece is the mean distance of
+its rings from it. Lines begin and end where the surface does.
 
 Source: level sets of geodesic distance (Verroust and Lazarus 2000, Extracting skeletal curves from 3D scattered data).
 """
@@ -117,7 +117,8 @@ def _from_one_end(graph: "scipy.sparse.csr_array", own: np.ndarray) -> np.ndarra
 
 
 def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> float:
-    """Distance between rings: by the area of the surface over its length; no edge crosses two of them."""
+    """Distance between rings: from the area of the surface over its length, but so large that no edge crosses two
+    rings."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     longest = max(np.ptp(away[triangles], axis=1).max(), 1e-300)
@@ -125,7 +126,7 @@ def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> flo
 
 
 def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _Rings:
-    """Where edges cross the levels, in the middle of each spacing."""
+    """The points where edges cross the levels in the middle of each spacing."""
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 

@@ -130,7 +130,7 @@ class Fibres(Elements):
         return self.at
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
-        """The whole fibre is its tangent vector."""
+        """The tangent vector is the whole fibre."""
         return jnp.asarray(self.weights)[None, :, None, :]
 
     def away(self) -> jax.Array | None:

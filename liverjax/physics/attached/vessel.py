@@ -1,8 +1,8 @@
 """A vessel: bars along a centre line, which stiffen the tetrahedra they cross. They bend without force.
 
 The line is cut at the faces of the tetrahedra. A piece has no unknowns of its own: its points move with the functions
-of its element, so that it ties nothing that the elements do not tie. Its section is a ring, or a disc without `wall`;
-its law acts in tension along it, at constant volume. The tissue that the wall displaces is not taken off.
+of its element. Its section is a ring, or a disc without `wall`; its law acts in tension along it, at constant volume.
+The tissue in the place of the wall is not removed.
 """
 
 from collections.abc import Mapping

@@ -2,8 +2,8 @@
 
 Every point of contact has an elastic slip e along the obstacle's surface [m], which the next steps remember. Within a
 step it grows with the motion of the point past the obstacle; beyond mu times the point's depth it is cut to that, and
-the point slides. The shear is `stiffness` times e, as the pressure is `stiffness` times the depth: so the slip that
-sticking needs is at most mu times the depth that the contact leaves, and nothing creeps. An open contact forgets.
+the point slides. The shear is `stiffness` times e, and the pressure is `stiffness` times the depth. So a point that
+sticks slips by at most mu times its depth, and it does not creep. An open contact forgets.
 
 The force has no energy: sliding takes it away. Its tangent is exact, and not symmetric where points slide.
 
@@ -106,7 +106,7 @@ class Rubbing(Touching):
         return trial * jnp.where(size > most, most / size, 1.0)[None]
 
     def _law(self, at: jax.Array, s: Number) -> tuple[jax.Array, jax.Array]:
-        """Normals (3, Q, m), and the most slip (Q, m) [m] that the pressure bears."""
+        """Normals (3, Q, m), and the largest slip (Q, m) [m] that the pressure allows."""
         d = distances(self.obstacle, at, self.now(s))
         return jnp.stack(d.normal), jnp.multiply(self.friction, jnp.maximum(-d.value, 0.0))
 
@@ -116,7 +116,7 @@ class Rubbing(Touching):
         return trial - n * jnp.sum(n * trial, axis=0, keepdims=True)
 
     def _guessed(self, mesh: TetMesh, at: jax.Array, s: Number) -> jax.Array:
-        """Where a surface just touches (1, 1, Q, m): the first guess is that it will be pressed, and stick."""
+        """Points (1, 1, Q, m) where the surface just touches; the first guess is that they are pressed and stick."""
         d = distances(self.obstacle, at, self.now(s))
         return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
 
@@ -133,7 +133,8 @@ class Rubbing(Touching):
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Half of stiffness times slip squared, up to the most slip that the pressure at `start` bears; then linear."""
+        """Half of stiffness times slip squared, up to the largest slip that the pressure at `start` allows; linear
+        beyond."""
         one = jnp.ones((), x.dtype)
         n, most = self._law(self.points(start), one)
         size = _of_slip(self._trial(self.points(x), one, n))
@@ -141,7 +142,7 @@ class Rubbing(Touching):
         return self.energy(mesh, x) + jnp.sum(weighted_stiffness(self.obstacle, mesh) * stored)
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of that energy: a point that slides is held across its way alone."""
+        """Second derivative of that energy. A point that slides is held only across its direction of sliding."""
         at, plain = self.points(x), super().definite(mesh, x, s)
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
@@ -157,7 +158,7 @@ class Rubbing(Touching):
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, shear))
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
-        """Nothing is left: `attached` has the whole derivative."""
+        """Zero, since `attached` has the whole derivative."""
         return jnp.zeros_like(dx)
 
 

@@ -2,10 +2,10 @@
 
 At three points of every triangle a pressure `stiffness` times the depth acts along the obstacle's normal, per reference
 area; where the surface is outside, nothing acts, so nothing sticks. It has no friction
-(`liverjax.physics.contact.friction` has). The energy is half of
-pressure times depth, its gradient and second derivative are exact. The depth that is left is the pressure over the
-stiffness: `HARDNESS` times the body's own stiffness over the size of a triangle keeps it below a hundredth of the
-triangle's size at a pressure of that stiffness. `lj.obstacle_forces` tells force and largest depth.
+(`liverjax.physics.contact.friction` has). The energy is half of pressure times depth. Its gradient and second
+derivative are exact. The surface stays in the obstacle by the pressure over the stiffness. By default the stiffness is
+`HARDNESS` times the body's own over the size of a triangle. At a pressure as large as the body's stiffness the depth is
+then below a hundredth of the triangle's size. `lj.obstacle_forces` tells force and largest depth.
 
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
@@ -87,7 +87,7 @@ class Obstacle(Physics):
         return cls(triangles=jnp.asarray(triangles, jnp.int32), shape=shape, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """A known shape, numbers that make one, and triangles of the mesh."""
+        """Refuse an unknown shape, numbers that make no shape, and triangles that are not in the mesh."""
         if self.shape not in SHAPES:
             raise InputError(f"{name} shape = {self.shape!r} is not known: use {', '.join(SHAPES)}")
         numbers = np.asarray(self.triangles)
@@ -104,7 +104,7 @@ class Obstacle(Physics):
             raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """A body that is outside at the beginning; a loaded one may lie in it as deep as the contact leaves it."""
+        """Refuse a body that begins inside. A loaded body may lie in the obstacle as deep as the contact leaves it."""
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         first = self.displacement(0, 1, 0.0)
         deepest = -float(np.min(np.asarray(_distances(self, mesh, mesh.points, first).value)))
@@ -197,7 +197,7 @@ class Touching(NodalForce):
         return Attached(touching_nodes(self.obstacle, mesh), between_nodes(mesh, H))
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Along the normal alone: what bends it is never positive."""
+        """The stiffness along the normal alone: the part by the change of the normal is never positive."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         k = k * just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack([jnp.stack([k * a * b for b in d.normal]) for a in d.normal])

@@ -4,9 +4,8 @@ The obstacle moves along its force alone. Its travel t follows from the balance 
 
     dE/dt(x, t) = F,
 
-E the energy of the contact at positions x. Eliminated, t(x) adds -h h^T / E_tt to the stiffness of the contact, with
-h = d2E/dx dt. That is one dense matrix of rank one, so no matrix holds it: products apply it, and a factorisation is
-corrected for it.
+E the energy of the contact at positions x. Eliminated, t(x) adds -h h^T / E_tt to the stiffness of the contact, with h
+= d2E/dx dt. This dense matrix of rank one is not stored: products apply it, and a factorisation is corrected for it.
 """
 
 from collections.abc import Mapping
@@ -54,7 +53,8 @@ class PressedObstacle(Obstacle):
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Besides: a force, no given motion, and factors as history."""
+        """Refuse, beside what `Obstacle` refuses, a missing force, a given motion, and a history that is not of
+        factors."""
         super().check(mesh, name)
         history.check(self.times, self.history, name, (1,))
         if self.by is not None:
@@ -200,7 +200,8 @@ class Pressing(Touching):
         return 0.5 * jnp.sum(self.hardness * depth**2) - self.load[1] * travel
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay:
-        """By its travel; `definite`: what bends the normals is left out, as in the stiffness of the contact then."""
+        """The loss of stiffness by the obstacle's travel. With `definite` the change of the normals is left out, as in
+        the stiffness of the contact."""
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)
         along = self.hardness * (d.value < 0) * sum(n * t for n, t in zip(d.normal, self.direction, strict=True))

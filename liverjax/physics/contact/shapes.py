@@ -1,6 +1,6 @@
 """Rigid shapes: signed distance of points, its gradient (the normal) and its second derivative.
 
-A point is given from the shape's own place: a point of the plane, the centre of a sphere, a point on the axis of a
+A point is given relative to the shape's place: a point of the plane, the centre of a sphere, a point on the axis of a
 cylinder, the tip of a cone. Distances are positive outside. All functions take columns of any shape.
 """
 
@@ -66,7 +66,8 @@ def _round(y: list[jax.Array], radius: Number, axis: Array | None = None) -> Dis
 
 
 def _cone(y: list[jax.Array], axis: jax.Array, radius: Number, half_angle: Number) -> Distance:
-    """Distance from a cone: from its side or its tip. A round tip: from a sharp cone further in, less the radius."""
+    """Distance from a cone: from its side or its tip. For a round tip it is the distance from a sharp cone further in,
+    less the radius."""
     c, s = jnp.cos(half_angle), jnp.sin(half_angle)
     y = [v - radius * a for v, a in zip(y, axis, strict=True)]
     along, tip, side = (

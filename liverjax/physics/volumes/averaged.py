@@ -2,8 +2,9 @@
 
 The volumetric energy is sum_a V_a U(J_a) over nodes, J_a the mean J of the elements around node a weighted by their
 volumes, V_a a quarter of these. There are about five times fewer nodes than elements, so five times fewer constraints
-where the bulk modulus is large. Pressure is p_a = U'(J_a), an element's the mean over its nodes; the stiffness is that
-at given pressures and G^T D^-1 G with D = V_a/U'': the system of a porous step in which nothing flows.
+where the bulk modulus is large. The pressure of a node is p_a = U'(J_a); that of an element is the mean over its nodes.
+The stiffness is that at given pressures plus G^T D^-1 G with D = V_a/U''. This is the system of a porous step in which
+nothing flows.
 
 Where elements have different volumetric energies, that of a node is their mean, weighted by volume.
 """
@@ -101,7 +102,7 @@ class Averaged(VolumeStress):
         return scale_matrix(interpolated(mesh, pressure), cofactor(F))
 
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
-        """The pressure of an element; it has no slope, since the pressures of the nodes are given."""
+        """The pressure of an element. Its slope is 0, since the pressures of the nodes are given."""
         p = interpolated(mesh, pressure)
         return Scalars({"J": p}, {("J", "J"): jnp.zeros_like(p)})
 

@@ -161,6 +161,6 @@ class Mixed(VolumeStress):
         return BlockMatrix(rows, ((given(zero, mesh.tetrahedra.T, own),),), mesh.pattern.row_nodes)
 
     def schur(self, mesh: TetMesh) -> jax.Array:
-        """Near the matrix of the pressures alone (V,) [m^3/Pa], displacements eliminated: lumped."""
+        """Lumped approximation (V,) [m^3/Pa] of the matrix of the pressures after the displacements are eliminated."""
         soft = 1 / (1.5 * self.shear + self.part) + 1 / self.rest
         return integrals(mesh, jnp.broadcast_to(soft, mesh.weights.shape))

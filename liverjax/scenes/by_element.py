@@ -1,0 +1,88 @@
+"""Numbers of regions as arrays: one number an element, where a region of the body has its own.
+
+A law of another kind is computed for the elements of its region alone.
+"""
+
+import jax.numpy as jnp
+
+from liverjax.core import names
+from liverjax.core.struct import replace
+from liverjax.laws import Law
+from liverjax.laws.by_region import ByRegion
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.porosity import Porosity
+from liverjax.physics.viscosity import Prony
+from liverjax.scenes.regions import POROUS, VISCOUS, Region, changed_numbers, law_number, refused_name
+from liverjax.scenes.scene import Scene
+from liverjax.tensors.subsets import subsets
+
+
+def by_element(scene: Scene) -> Scene:
+    """The scene without regions: law, viscosity and porosity have one number an element where a region has its own."""
+    mesh, law, prony, sponge = scene.mesh, scene.law, scene.viscosity, scene.porosity
+    if scene.region:
+        law = law_of_elements(law, scene.region, mesh.number_of_elements)
+        if prony is not None:
+            prony = viscosity_of_elements(prony, scene.region, mesh.number_of_elements)
+        if sponge is not None:
+            sponge = porosity_of_elements(sponge, scene.region, mesh)
+    return replace(scene, law=mesh.at_points(law), viscosity=prony, porosity=sponge, region=())
+
+
+def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
+    """The law of every element.
+
+    A number has one value an element (E,) if a region changes it. Laws stand side by side if a region has a law of its
+    own.
+
+    Raises:
+        InputError: a name that the law does not have.
+    """
+    for region in regions:
+        for name, value in changed_numbers(region).items():
+            base = jnp.broadcast_to(jnp.asarray(law_number(law, name), float), (number_of_elements,))
+            law = names.put(law, name, base.at[region.elements].set(value), refused_name(name))
+    own = [(region.law, region.elements) for region in regions if isinstance(region.law, Law)]
+    if not own:
+        return law
+    groups = subsets([elements for _, elements in own], number_of_elements)
+    kinds = tuple(kind for kind, _ in own)
+    return ByRegion(laws=kinds if len(kinds) == len(groups.elements) else (law, *kinds), subsets=groups)
+
+
+def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
+    """The series with one number a mode and element (N, E) where a region has its own."""
+    found = {}
+    for name in VISCOUS:
+        own = {
+            k: region.viscosity[name]
+            for k, region in enumerate(regions)
+            if region.viscosity and name in region.viscosity
+        }
+        if own:
+            base = jnp.asarray(getattr(prony, name), float)[:, None]
+            numbers = jnp.broadcast_to(base, (base.shape[0], number_of_elements))
+            for k, values in own.items():
+                numbers = numbers.at[:, regions[k].elements].set(jnp.asarray(values, float)[:, None])
+            found[name] = numbers
+    if not found:
+        return prony
+    shape = next(iter(found.values())).shape
+    plain = {name: jnp.broadcast_to(jnp.asarray(getattr(prony, name), float)[:, None], shape) for name in VISCOUS}
+    return replace(prony, **plain | found)
+
+
+def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
+    """The porosity with one number an element (E,), or (1, E) of quadratic ones, where a region has its own."""
+    found: dict[str, object] = {}
+    for region in regions:
+        for name, value in (region.porosity or {}).items():
+            before = jnp.asarray(found.get(name, getattr(porosity, name)), float)
+            base = jnp.broadcast_to(before, (mesh.number_of_elements,))
+            found[name] = base.at[region.elements].set(value)
+    return sponge_at_points(replace(porosity, **found), mesh)
+
+
+def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
+    """The porosity, its numbers by element as they go with arrays over the points."""
+    return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))

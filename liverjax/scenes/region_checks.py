@@ -1,0 +1,120 @@
+"""Checks of the regions of a scene: one pass over them for numbers, one for elements; each refusal is one sentence."""
+
+import jax
+import numpy as np
+
+from liverjax import laws
+from liverjax.core import names
+from liverjax.core.did_you_mean import hint
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.laws import Law
+from liverjax.physics.porosity import Porosity, check_sponge
+from liverjax.physics.viscosity import Prony, check_series
+from liverjax.scenes.regions import POROUS, VISCOUS, Region, changed_numbers, law_number, refused_name
+from liverjax.scenes.scene import Scene
+
+
+def check_region_numbers(scene: Scene) -> None:
+    """Refuse numbers of regions that no step can use; traced ones pass.
+
+    Raises:
+        InputError: a part that the scene has not, an unknown name, numbers out of bounds, another number of modes.
+    """
+    for k, region in enumerate(scene.region):
+        _check_law(scene.law, region, f"region.{k}")
+        check_viscosity(scene.viscosity, region, f"region.{k}")
+        check_porosity(scene.porosity, region, f"region.{k}")
+
+
+def check_region_elements(scene: Scene) -> None:
+    """Refuse regions of elements that no scene can use; host side.
+
+    Raises:
+        InputError: no or unknown elements, a region that changes nothing, two laws for an element.
+    """
+    last = scene.mesh.number_of_elements - 1
+    for k, region in enumerate(scene.region):
+        elements = np.asarray(region.elements)
+        if elements.size == 0 or elements.min() < 0 or elements.max() > last:
+            raise InputError(f"region.{k} names elements outside 0 to {last}: renumber them")
+        if not region.law and not region.viscosity and not region.porosity:
+            raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
+    _check_own_laws(scene.region)
+
+
+def _check_law(law: Law, region: Region, name: str) -> None:
+    for number, value in changed_numbers(region).items():
+        law_number(law, number)
+        metadata = names.metadata(law, number, refused_name(number)) | {"each": False}
+        laws.check_value(f"{name}: law.{number}", metadata, value)
+
+
+def check_viscosity(prony: Prony | None, region: Region, name: str) -> None:
+    """Refuse viscous numbers of a region that no step can use; traced ones pass.
+
+    Raises:
+        InputError: no [viscosity] in the scene, another number of modes, numbers out of bounds.
+    """
+    own = region.viscosity
+    if not own:
+        return
+    if prony is None:
+        raise InputError(
+            f"{name}: viscosity needs a [viscosity] of the scene: give one, with ratios = [0.0] where it has none"
+        )
+    unknown = sorted(set(own) - set(VISCOUS))
+    if unknown:
+        raise InputError(f"{name}: viscosity has {unknown[0]}: only {' and '.join(VISCOUS)} can differ in a region")
+    modes = np.shape(prony.ratios)[0]
+    for key, value in own.items():
+        if np.shape(value) != (modes,):
+            n = np.size(value)
+            raise InputError(f"{name}: viscosity.{key} has {n} numbers and the scene {modes} modes: give {modes}")
+    if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
+        return
+    try:
+        check_series(replace(prony, **{key: np.asarray(value, float) for key, value in own.items()}))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def check_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
+    """Refuse porous numbers of a region that no step can use; traced ones pass.
+
+    Raises:
+        InputError: no [porosity] in the scene, an unknown name, numbers out of bounds.
+    """
+    own = region.porosity or {}
+    if not own:
+        return
+    if porosity is None:
+        raise InputError(f"{name}: porosity needs a [porosity] of the scene: give one")
+    for key, value in own.items():
+        if key not in POROUS:
+            raise InputError(f"{name}: porosity has {key}, which cannot differ in a region: {hint(key, POROUS)}")
+        if np.ndim(value):
+            raise InputError(f"{name}: porosity.{key} has {np.size(value)} numbers: give one")
+    numbers = (*own.values(), *(getattr(porosity, key) for key in POROUS))
+    if any(isinstance(value, jax.core.Tracer) for value in numbers):
+        return
+    try:
+        check_sponge(replace(porosity, **own))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def _check_own_laws(regions: tuple[Region, ...]) -> None:
+    """Refuse regions that leave open which law an element has."""
+    for k, region in enumerate(regions):
+        if not isinstance(region.law, Law):
+            continue
+        elements = np.asarray(region.elements)
+        if np.unique(elements).size < elements.size:
+            raise InputError(f"region.{k} names an element twice: name each once")
+        for later, other in enumerate(regions[k + 1 :], k + 1):
+            if other.law and np.isin(np.asarray(other.elements), elements).any():
+                raise InputError(
+                    f"region.{later} changes the law of elements to which region.{k} gives a law of its own: give them "
+                    "elements apart, or write the numbers into that law"
+                )
