@@ -8,7 +8,8 @@ import pytest
 from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
-from fitting.fits import models, viscoelastic
+from fitting.fits import viscoelastic
+from fitting.fits.families import models
 from fitting.fits.honesty import edges, total_error
 from fitting.methods import generalised_maxwell, kramers_kronig
 from fitting.methods.kramers_kronig import runs_probability

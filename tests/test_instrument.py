@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 from fitting.__main__ import main
 from fitting.fits import instrument, viscoelastic
@@ -67,6 +68,62 @@ def test_a_misfit_that_poses_as_inertia_is_not_corrected():
     fit, same = corrected(s)
     assert same is s and fit.details["instrument"]["moves_with_the_band"]
     assert "poses as inertia, so it is not corrected" in fit.warnings[-1]
+
+
+FRICTION = 0.4 * OMEGA  # [Pa] by one standard deviation: 40 Pa at the end, half of the loss modulus
+
+
+def test_friction_and_inertia_are_found_together():
+    """Both within their errors, which are those of least squares with the priors as rows."""
+    z = []
+    for seed in range(8):
+        s = sweep(5e-4, seed)._replace(friction=FRICTION, friction_error=2e-7)
+        s = s._replace(loss=s.loss + 0.7 * FRICTION)  # the bearing has 0.7 deviations more than what was subtracted
+        fit, _ = corrected(s)
+        found = fit.details["instrument"]
+        z.append(
+            [
+                (found["inertia_off_by"] - 5e-4) / found["standard_error"],
+                (found["friction_off_by_N_m_s"] - 1.4e-7) / found["friction_standard_error"],
+            ]
+        )
+    assert np.all(np.abs(np.mean(z, axis=0)) < 1.1) and 0.5 < np.std(z) < 1.6
+    assert 0 < found["friction_standard_error"] < 0.2 * found["friction_prior_standard_deviation"] == 4e-8
+
+
+def test_the_error_of_friction_is_that_of_scipy():
+    s = sweep(0.0, 3)._replace(inertia=None, friction=FRICTION, friction_error=2e-7)
+    s = s._replace(loss=s.loss + 0.7 * FRICTION)
+    found, better = corrected(s)
+    noise = found.uncertainty.noise
+
+    def rows(v):
+        storage, loss = generalised_maxwell.moduli(generalised_maxwell.natural(v[:-1]), OMEGA)
+        off = (storage - s.storage) / better.storage, (loss + v[-1] * FRICTION - s.loss) / better.loss
+        return np.append(np.concatenate(off) / noise, v[-1])
+
+    start = np.append(np.asarray(found.solution.u), 0.0)
+    best = scipy.optimize.least_squares(rows, start, x_scale="jac", xtol=1e-14, ftol=1e-14)
+    error = np.sqrt(np.linalg.inv(best.jac.T @ best.jac)[-1, -1])
+    numbers = found.details["instrument"]
+    # The scales follow the correction in the one, and stay in the other: of second order, some percent.
+    assert numbers["friction_off_by_N_m_s"] == pytest.approx(2e-7 * best.x[-1], abs=0.2 * 2e-7 * error)
+    assert numbers["friction_standard_error"] == pytest.approx(2e-7 * error, rel=0.05)
+    assert "the friction that the instrument subtracted" in better.notes[-1]
+
+
+def test_the_command_fits_friction_and_refuses_it_without_a_size(tmp_path, capsys):
+    s = sweep(0.0, 3)
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", np.column_stack(s[:3]), delimiter=",", header=head, comments="")
+    words = [str(tmp_path / "s.csv"), "--method", "closed-form", "--friction-error", "1e-6", "--out", str(tmp_path)]
+    assert main([*words, "--radius", "0.01", "--height", "0.004"]) == 0
+    found = json.loads((tmp_path / "fit.json").read_text())["details"]["instrument"]
+    assert found["friction_prior_standard_deviation"] == 1e-6
+    assert abs(found["friction_off_by_N_m_s"]) < 4 * found["friction_standard_error"]
+    assert main(words) == 2 and "give a positive number, e.g. 1e-7, and --radius" in capsys.readouterr().err
+    sized = [*words, "--radius", "0.01", "--height", "0.004"]
+    assert main([*sized, "--model", "auto"]) == 2 and "leave out --model auto" in capsys.readouterr().err
 
 
 def test_without_raw_columns_nothing_happens():

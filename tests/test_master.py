@@ -7,7 +7,7 @@ import pytest
 from conftest import SHARED
 
 from fitting.__main__ import main
-from fitting.fits import models
+from fitting.fits.families import models
 from fitting.master import master_curve, shifts, temperature_laws, temperature_sweeps
 from fitting.readers.frequency_sweep import Sweep
 

@@ -10,7 +10,8 @@ import scipy.optimize
 from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
-from fitting.fits import models, viscoelastic
+from fitting.fits import viscoelastic
+from fitting.fits.families import models
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep, read_sweep

@@ -171,15 +171,15 @@ BAD = {
     "frequency unit": (HEADER.replace("_Hz", "_rpm") + ROWS, "unit 'rpm'"),
     "negative": (HEADER + ROWS.replace("60", "-60"), "line 3: loss_modulus_Pa = -60 is not positive"),
     "zero": (HEADER + ROWS.replace("60", "0"), "loss_modulus_Pa = 0 is not positive"),
-    "nan": (HEADER + ROWS.replace("400", "nan"), "line 3: storage_modulus_Pa = nan is not finite"),
+    "nan": (HEADER + ROWS.replace("400", "nan"), "line 3: storage_modulus_Pa is empty"),
     "inf": (HEADER + ROWS.replace("400", "inf"), "is not finite"),
     "negative frequency": (HEADER + ROWS.replace("0.1", "-0.1"), "frequency_Hz = -0.1 is not positive"),
     "text": (HEADER + ROWS.replace("400", "soft"), "line 3: storage_modulus_Pa = 'soft' is not a number"),
-    "short row": (HEADER + "0.1,300,30\n1,400\n", "line 3: loss_modulus_Pa = missing is not a number"),
+    "short row": (HEADER + "0.1,300,30\n1,400\n", "line 3: loss_modulus_Pa is empty; fill it in"),
     "milli": (HEADER.replace("storage_modulus_Pa", "storage_modulus_mPa") + ROWS, "unit 'mPa'"),
     "angular in Hz": (HEADER.replace("frequency_Hz", "angular_frequency_Hz") + ROWS, "angular frequency in Hz"),
     "disagree": ("angular_frequency_rad_s," + HEADER + "1,1,300,30\n2,2,400,60\n", "disagree"),
-    "decimal comma": (HEADER + '"1,5","337,8","34,7"\n', "is not a number"),
+    "decimal comma": (HEADER + '"1,5","337,8","34,7"\n', "it holds 1 frequency"),
     "decimal comma bare": (HEADER + "1,5,337,8,34,7\n", "6 cells under 3 headings"),
     "one frequency": (HEADER + "1,300,30\n1,310,31\n1,320,33\n", "at least two different"),
     "huge": (HEADER + ROWS.replace("400", "1e200"), "beyond any measurement"),
@@ -288,7 +288,8 @@ def test_unusable_points_are_left_out_and_named(tmp_path, bad):
     s = read_sweep(_write(tmp_path, HEADER + rows))
     assert s.storage.tolist() == [200, 300, 400] and s.loss.tolist() == [20, 30, 60]
     (note,) = s.notes
-    assert "1 of 4 points is left out" in note and f"line 5: loss_modulus_Pa = {float(bad):g} is " in note
+    told = "loss_modulus_Pa is empty" if bad == "nan" else f"loss_modulus_Pa = {float(bad):g} is "
+    assert "1 of 4 points is left out" in note and f"line 5: {told}" in note
 
 
 def test_too_few_usable_points_are_refused(tmp_path):

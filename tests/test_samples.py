@@ -95,7 +95,6 @@ def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
     [
         (["--method", "torsion"], "--method torsion is of one sample, 2 files are given"),
         (["--profile"], "--profile is of one sample"),
-        (["--model", "spectrum"], "give --model prony, fractional or auto"),
     ],
 )
 def test_what_only_one_sample_has_is_refused(options, sentence, tmp_path, capsys):

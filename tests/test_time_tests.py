@@ -246,3 +246,18 @@ def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
     error = np.abs(predicted / relaxed.answer[relaxed.used][both] - 1)
     # Found: 4 %. Creep and relaxation are two loadings of the sample; how far it repeats itself nobody has measured.
     assert np.median(error) < 0.1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time_s;relaxation_modulus_Pa\n1;1.200,5\n2;\n3;1.100,25\n4;987,5\n5;950,0\n;;\n",
+        'time_s,relaxation_modulus_Pa\n1,"1,200.5"\n2,n/a\n3,"1,100.25"\n4,987.5\n5,950\nend of test,\n',
+        "Time\tRelaxation Modulus\n[s]\t[Pa]\n1\t1200,5\n2\t---\n3\t1100,25\n4\t987,5\n5\t950\n",
+    ],
+)
+def test_empty_cells_and_thousands_of_records(text, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    found = read_time_test(tmp_path / "a.csv", "relaxation")
+    assert found.answer[found.used].tolist() == [1200.5, 1100.25, 987.5, 950]
+    assert any("1 of 5 rows are left out: a cell in them is empty" in n for n in found.notes)

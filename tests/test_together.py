@@ -127,7 +127,6 @@ def test_points_on_a_straight_drive_are_not_needed():
     ("more", "words"),
     [
         (["--method", "torsion"], "leave out --method torsion"),
-        (["--model", "spectrum"], "leave out --model spectrum"),
         (["--samples", "1000"], "leave out --samples"),
     ],
 )

@@ -2,7 +2,8 @@
 
 1,000 synthetic sweeps with what laboratories have: noise of 2 %, an inertia that is subtracted 0.05 % wrong, a gap off
 by 50 um, a sample trimmed under a compression of 0 to 20 %. Truths are Prony modes, springpots, and a wide spectrum.
-All sweeps are fitted side by side in NumPy, by the residuals, the iteration and the criterion of the program.
+For the intervals all sweeps are fitted side by side in NumPy, by the residuals, the iteration and the criterion of the
+program; models are chosen by the program itself.
 
     python -m experiments coverage [--quick]
 """
@@ -15,12 +16,19 @@ import numpy as np
 import scipy.special
 
 from experiments.common import either, plt, save
+from fitting.fits import viscoelastic
+from fitting.fits.families import models
+from fitting.fits.families.choice import contains, label_of
+from fitting.fits.viscoelastic import Fit, information_criterion
 from fitting.methods import generalised_maxwell, host
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import GAIN, State, accept, begin
+from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.plotting import BLUE, GREY, ORANGE
 
 SWEEPS, STARTS, NOISE = either(1000, 40), 6, 0.02
+#: Sweeps whose first decade is left out; of all the last one is.
+FIRST = either(300, 40)
 OMEGA = np.geomspace(0.1, 100, 31)
 #: Frequencies [rad/s] at which intervals of the fitted moduli are looked at, and the ones that are left out at the end.
 LOOKED_AT, LAST_DECADE = np.geomspace(0.1, 100, 7), OMEGA > 10 * (1 + 1e-9)
@@ -240,24 +248,67 @@ def parameters(truth: Truth, names: list[str], fits: dict[str, Fits], order: np.
     return {key: float(value) for key, value in out.items()}
 
 
+def beyond(fit: Fit, omega: np.ndarray) -> np.ndarray:
+    """G* (n,) [Pa] of a fit at frequencies outside its band, by its own model."""
+    if fit.kind.moduli is not None:
+        return np.asarray(fit.kind.moduli(fit.solution.u, omega))
+    storage, loss = generalised_maxwell.moduli(fit.model, omega)
+    return storage + 1j * loss
+
+
+class Predicted(NamedTuple):
+    """Models fitted to two decades, in the third: root mean squares of ln(G* / true), of G' and G''."""
+
+    chosen: float
+    second: float  # the next by the criterion, whatever it is
+    rival: float  # the next that does not contain the chosen one as a special case
+    decided: bool  # the criterion is strong evidence against the rival
+    best: float  # the closest of all models
+
+
+def predicted(truth: Truth, data: np.ndarray, k: int, kept: np.ndarray) -> Predicted:
+    """The choice of the program (`--model auto`) for sweep k without the frequencies that are not `kept`."""
+    sweep, out = Sweep(OMEGA[kept], *(half[kept] for half in np.split(data[k], 2))), OMEGA[~kept]
+    true = Truth(*(field[k : k + 1] for field in truth)).moduli(out)[0]
+    dense = generalised_maxwell.spectrum(sweep)
+    tried = models.every_model(sweep, "auto", viscoelastic.choose_modes(sweep, dense)[0], dense)
+    chosen, able = models.best_of_models(tried, sweep)
+
+    def off(fit: Fit) -> float:
+        G = beyond(fit, out)
+        with np.errstate(all="ignore"):
+            apart = np.sqrt(np.mean(np.log(np.concatenate([G.real / true.real, G.imag / true.imag])) ** 2))
+        return float(apart) if np.isfinite(apart) else np.inf
+
+    others = sorted((f for f in able if f is not chosen), key=information_criterion)
+    different = [f for f in others if not contains(label_of(f), label_of(chosen))]
+    decided = not different or information_criterion(different[0]) > information_criterion(chosen) + models.STRONG
+    second, rival = (off(rest[0]) if rest else np.inf for rest in (others, different))
+    return Predicted(off(chosen), second, rival, decided, min(map(off, able)))
+
+
 def prediction(truth: Truth, rng: np.random.Generator) -> dict:
-    """Does the model chosen on two decades predict the third better than the runner-up?"""
-    data = measured(rng, truth, 0)
-    kept = np.tile(~LAST_DECADE, 2)
-    names, fits, order = ranked(data[:, kept], OMEGA[~LAST_DECADE])
-    true = truth.moduli(OMEGA[LAST_DECADE])
-    true = np.concatenate([true.real, true.imag], axis=1)
-    with np.errstate(all="ignore"):
-        apart = np.stack(
-            [np.sqrt(np.mean(np.log(MODELS[n][1](fits[n].u, OMEGA[LAST_DECADE]) / true) ** 2, axis=1)) for n in names],
-            axis=1,
-        )
-    apart = np.where(np.isfinite(apart), apart, np.inf)
-    rows = np.arange(len(apart))
-    first, second = apart[rows, order[:, 0]], apart[rows, order[:, 1]]
-    each = {kind: float(np.mean((first <= second)[truth.kind == k])) for k, kind in enumerate(TRUTHS)}
-    error = {kind: float(np.median(first[truth.kind == k])) for k, kind in enumerate(TRUTHS)}
-    return {"better": float(np.mean(first <= second)), "better_by_truth": each, "median_error": error}
+    """Does the model chosen on two decades predict the last or the first one better than the next model?"""
+    data, out = measured(rng, truth, 0), {}
+    for name, left_out, count in (("last", LAST_DECADE, len(data)), ("first", OMEGA < 1 - 1e-9, FIRST)):
+        rows, kinds = [], truth.kind[:count]
+        for k in range(count):
+            rows.append(predicted(truth, data, k, ~left_out))
+            if k % 100 == 99:
+                print(f"{name} decade: {k + 1} sweeps", flush=True)
+        chosen, second, rival, decided, best = (np.array(column) for column in zip(*rows, strict=True))
+        better = chosen <= rival
+        out[name] = {
+            "sweeps": count,
+            "better": float(np.mean(better)),
+            "better_by_truth": {kind: float(np.mean(better[kinds == k])) for k, kind in enumerate(TRUTHS)},
+            "better_than_any_second": float(np.mean(chosen <= second)),
+            "decided": float(np.mean(decided)),
+            "better_where_decided": float(np.mean(better[decided])),
+            "median_error": {kind: float(np.median(chosen[kinds == k])) for k, kind in enumerate(TRUTHS)},
+            "median_error_of_the_closest": {kind: float(np.median(best[kinds == k])) for k, kind in enumerate(TRUTHS)},
+        }
+    return out
 
 
 def figure(rows: list[dict]) -> plt.Figure:

@@ -272,8 +272,20 @@ def _coverage() -> str:
         f"{listed('noise')}; with the inertia off: {listed('inertia')}; with the gap off: {listed('gap')} (told of it "
         f"by `--gap-error`: {listed('gap', 'moduli_with_gap_error')}); trimmed under compression: "
         f"{listed('compression')}. Relaxation times of two modes: {percent(p['times'])}, with all disturbances "
-        f"{percent(squeezed['times'])}; G0: {percent(p['G0'])}, with the gap off {percent(gap['G0'])}. The model "
-        f"chosen on two decades predicts the third better than the runner-up in {percent(data['prediction']['better'])}"
+        f"{percent(squeezed['times'])}; G0: {percent(p['G0'])}, with the gap off {percent(gap['G0'])}. "
+        f"{_predicted_decades(data['prediction'])}"
+    )
+
+
+def _predicted_decades(found: dict) -> str:
+    last, first = found["last"], found["first"]
+    return (
+        f"The model chosen on two decades predicts the last one better than the next different model in "
+        f"{percent(last['better'])}, the first one in {percent(first['better'])} of {first['sweeps']} (where the "
+        f"criterion decides, "
+        f"{percent(last['better_where_decided'])} and {percent(first['better_where_decided'])}). Against the next "
+        f"model of any kind, which mostly has the chosen one as a special case and says nearly the same, it "
+        f"is {percent(last['better_than_any_second'])} and {percent(first['better_than_any_second'])}"
     )
 
 

@@ -5,10 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.sweep_columns import is_angular
-from fitting.readers.sweep_tables import Table, tables_of
-from fitting.readers.text_tables import text_of
-from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS
+from fitting.readers.tables.complex_moduli import column_in_si, storage_and_loss
+from fitting.readers.tables.sweep_tables import tables_of
+from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN = 4, 10.0
@@ -42,12 +41,16 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     if not found:
         raise InputError(f"{path}: no table{f' {table!r}' if table else ''} has a column strain in % or 1: add it")
     chosen = max(found, key=lambda t: np.ptp(np.log(np.maximum(t.raw["strain"], 1e-12))))
-    omega = _column_in_si(path, chosen, "frequency")
-    G = [_column_in_si(path, chosen, quantity) for quantity in ("storage", "loss")]
+    notes: list[str] = []
+    columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
+    rows = np.asarray(chosen.rows)
+    values = {q: column_in_si(str(path), c, rows[:, j], notes) for q, (c, j) in columns.items()}
+    omega, both = values["frequency"], storage_and_loss(values, notes)
+    G = both["storage"], both["loss"]
     strain = chosen.raw["strain"]
     good = np.isfinite(strain) & (strain > 0) & np.isfinite(G[0]) & np.isfinite(G[1]) & (G[0] > 0) & (G[1] > 0)
     kept = good & (strain <= (np.inf if max_strain is None else max_strain))
-    notes = [f"{(~good).sum()} points without a positive strain or modulus are left out"] if not good.all() else []
+    notes += [f"{(~good).sum()} points without a positive strain or modulus are left out"] if not good.all() else []
     if good.sum() > kept.sum():
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as asked for")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
@@ -68,14 +71,3 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         str(path),
         tuple(notes),
     )
-
-
-def _column_in_si(path: Path, table: Table, quantity: str) -> np.ndarray:
-    j = next(k for k, c in enumerate(table.columns) if c.quantity == quantity)
-    column = table.columns[j]
-    units = FREQUENCY_UNITS if quantity == "frequency" else MODULUS_UNITS
-    plain = ("rad/s" if is_angular(column) else "hz") if quantity == "frequency" else "Pa"
-    unit = plain if column.unit is None else column.unit.lower() if quantity == "frequency" else column.unit
-    if unit not in units:
-        raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known: use {', '.join(units)}")
-    return units[unit] * np.asarray(table.rows)[:, j]

@@ -32,9 +32,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     shared_options.add_modes(command)
     command.add_argument(
         "--model",
-        choices=("prony", "fractional", "auto"),
+        choices=("prony", "fractional", "spectrum", "auto"),
         default="prony",
-        help="free Prony modes (default), springpots, or the best of all by the criterion",
+        help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
     )
     command.add_argument(
         "--ramp", type=float, default=0.0, metavar="S", help="seconds of the ramp, where no column has it"
@@ -66,7 +66,7 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
 
 def run(options: argparse.Namespace) -> int:
     """Fit the test; 1 if the fit did not converge."""
-    from fitting.fits import springpots_in_time as fits
+    from fitting.fits.families import springpots_in_time as fits
     from fitting.readers import time_tests as reader
     from fitting.reports import time_report
     from liverjax.core.files import writable
@@ -76,9 +76,10 @@ def run(options: argparse.Namespace) -> int:
         if value is not None and not 0 < value <= 0.2:
             raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
     shared_options.check_samples(options.samples)
-    for name, asked in (("--modes", options.modes != "auto"), ("--samples", options.samples is not None)):
-        if asked and options.model != "prony":
-            raise InputError(f"{name} is of --model prony: leave it out for --model {options.model}")
+    if options.modes != "auto" and options.model != "prony":
+        raise InputError(f"--modes is of --model prony: leave it out for --model {options.model}")
+    if options.samples is not None and options.model == "spectrum":
+        raise InputError("--samples is of models of a few numbers; leave it out for --model spectrum")
     out = options.out or Path(options.kind)
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":

@@ -95,6 +95,12 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
         "--gap-error", type=float, metavar="M", help="standard deviation of the gap [m]; it widens the errors of moduli"
     )
     command.add_argument(
+        "--friction-error",
+        type=float,
+        metavar="NMS",
+        help="standard deviation of the friction of the instrument's bearing [N m s]: it is fitted too",
+    )
+    command.add_argument(
         "--density", type=float, metavar="KG_M3", help="of the sample: simulate its inertia (default: none)"
     )
     command.add_argument(
@@ -226,6 +232,7 @@ def _check(options: argparse.Namespace) -> None:
             f"--gap-error {options.gap_error:g} is the gap's standard deviation in metres: give --height, and an error "
             "below it"
         )
+    _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form":
@@ -248,6 +255,26 @@ def _check(options: argparse.Namespace) -> None:
     laws.find(options.law)
 
 
+def _check_friction(options: argparse.Namespace) -> None:
+    """Refuse a friction without a size, or where it is not fitted."""
+    error = options.friction_error
+    if error is None:
+        return
+    if not (options.radius and options.height and 0 < error <= 1e-3):
+        raise InputError(
+            f"--friction-error {error:g} is the standard deviation of the bearing's friction in N m s: give a positive "
+            "number, e.g. 1e-7, and --radius and --height"
+        )
+    for name, asked in (
+        (f"--model {options.model}", options.model != "prony"),
+        ("--with", bool(options.others)),
+        ("--master", options.master is not None),
+        (f"{len(options.sweep)} samples", len(options.sweep) > 1),
+    ):
+        if asked:
+            raise InputError(f"--friction-error is fitted beside the Prony modes of one sample: leave out {name}")
+
+
 def _check_precompression(options: argparse.Namespace) -> None:
     """Refuse an impossible compression, and options that do not go with a compression."""
     if options.precompression == 0:
@@ -256,15 +283,18 @@ def _check_precompression(options: argparse.Namespace) -> None:
 
     compression.check_strain(options.precompression)
     for name, asked in (
-        (f"--model {options.model}", options.model != "prony"),
         ("--with", bool(options.others)),
-        ("--density", options.density is not None),
         ("--profile", options.profile),
         ("--samples", options.samples is not None),
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--precompression fits Prony modes to one sample without inertia: leave out {name}")
+            raise InputError(f"--precompression is of the fit of one sample: leave out {name}")
+    if options.model != "prony" and options.method != "closed-form":
+        raise InputError(
+            f"--precompression with --model {options.model} is computed in closed form, since the modes that a "
+            "simulation needs mix what stands with what relaxes slowly: give --method closed-form"
+        )
 
 
 def _check_master(options: argparse.Namespace) -> None:
@@ -291,7 +321,6 @@ def _check_samples(options: argparse.Namespace) -> None:
         ("--samples", options.samples is not None, "leave it out, or give one file"),
         ("--report", options.report, "leave it out, or give one file"),
         ("--predict", bool(options.predict), "leave it out, or give one file"),
-        ("--model spectrum", options.model == "spectrum", "give --model prony, fractional or auto"),
     ):
         if asked:
             raise InputError(f"{name} is of one sample, {len(options.sweep)} files are given: {instead}")
@@ -305,7 +334,6 @@ def _check_together(options: argparse.Namespace) -> None:
         ("--samples", options.samples is not None),
         ("--report", options.report),
         ("--predict", bool(options.predict)),
-        ("--model spectrum", options.model == "spectrum"),
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
@@ -314,7 +342,8 @@ def _check_together(options: argparse.Namespace) -> None:
 
 def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "Fit":
     """The fit of the chosen model in closed form."""
-    from fitting.fits import models, viscoelastic
+    from fitting.fits import viscoelastic
+    from fitting.fits.families import models
 
     prony = None
     if options.model in ("prony", "auto"):
@@ -333,6 +362,7 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     from fitting.fits import instrument, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
+    from fitting.readers import frequency_sweep
     from fitting.rigs import compression
 
     if options.modes != "auto":
@@ -343,6 +373,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     if options.precompression:
         factors = compression.shares(laws.typical(options.law), options.precompression)
         closed = instrument.of_compressed_sample(closed, sweep, factors)
+    if options.friction_error:
+        sweep = frequency_sweep.with_friction(sweep, options.friction_error, simulation.radius, simulation.height)
     closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)

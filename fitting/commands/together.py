@@ -16,7 +16,7 @@ def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form; 1 if the fit did not converge."""
     from tqdm import tqdm
 
-    from fitting.fits import springpots_in_time
+    from fitting.fits.families import springpots_in_time
     from fitting.reports import together_report
     from liverjax.core.files import writable
 

@@ -1,19 +1,21 @@
-"""Errors of the instrument in a fit, shared by all points: inertia and gap, each with a prior; and compression.
+"""Errors of the instrument in a fit, shared by all points: inertia, friction, gap, each with a prior; and compression.
 
 The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K where I is off by delta. Fitted without a
 prior, such a term takes up the model's misfit. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
-is found from raw columns alone, and it is used only if it stays the same when the end of the band is left out.
+is found from raw columns alone, and it is used only if it stays the same when the end of the band is left out. The
+friction b of the bearing adds b omega / K to G''; its error is normal around 0 with the standard deviation of the user.
 """
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.honesty.edges import HALF_DECADE
-from fitting.fits.viscoelastic import Fit
-from fitting.methods import host, uncertainty
-from fitting.methods.estimate import Estimate, errors_and_correlation
+from fitting.fits.viscoelastic import Fit, Kind
+from fitting.methods import as_prony_modes, host, uncertainty
+from fitting.methods.estimate import Estimate, errors_and_correlation, estimated
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import Sweep, some
@@ -24,111 +26,159 @@ from liverjax import laws
 ROUNDS = 4
 
 
-class InertiaError(NamedTuple):
-    """How far the inertia that was subtracted is off, relative."""
+class Nuisance(NamedTuple):
+    """An error of the instrument, in standard deviations of its prior."""
 
-    value: float
-    standard_error: float
-    part: float | None  # the same without the last half decade; None where too few points are left
-    part_error: float | None
+    name: str
+    moved: np.ndarray  # (n,) change of G* [Pa] by one standard deviation
+    unit: float  # the standard deviation, as it is reported
+    words: str  # what is off, for a sentence; {} is the number
+
+    def told(self, deviations: float) -> str:
+        """The number for a sentence."""
+        value = self.unit * deviations
+        return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
+
+
+class InstrumentErrors(NamedTuple):
+    """How far what was subtracted is off, in standard deviations of the priors."""
+
+    values: np.ndarray  # (k,)
+    covariance: np.ndarray  # (k, k)
+    part: np.ndarray | None  # the values without the last half decade; None where too few points are left
+    part_errors: np.ndarray | None
 
     @property
-    def steady(self) -> bool:
-        """It does not move with the band by more than two standard errors of the shorter one."""
-        return (
-            self.part is not None and self.part_error is not None and abs(self.value - self.part) <= 2 * self.part_error
-        )
+    def steady(self) -> np.ndarray:
+        """Which do not move with the band by more than two standard errors of the shorter one (k,)."""
+        if self.part is None or self.part_errors is None:
+            return np.zeros(len(self.values), bool)
+        return np.abs(self.values - self.part) <= 2 * self.part_errors
+
+
+def nuisances_of(sweep: Sweep) -> list[Nuisance]:
+    """The errors that the sweep can tell."""
+    out = []
+    if sweep.inertia is not None:
+        moved, words = raw_torque.UNCERTAINTY * sweep.inertia, "the inertia that the instrument subtracted is off by {}"
+        out.append(Nuisance("inertia", moved + 0j, raw_torque.UNCERTAINTY, words))
+    if sweep.friction is not None:
+        words = "the friction that the instrument subtracted is too small by {}"
+        out.append(Nuisance("friction", -1j * sweep.friction, sweep.friction_error, words))
+    return out
 
 
 def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
-    """The fit of Prony modes with the error of the instrument's inertia beside them, and the sweep corrected by it.
+    """The fit of Prony modes with the instrument's errors beside them, and the sweep corrected by them.
 
-    Fit and sweep stay as they were if there are no raw columns, or if the model has no Prony modes. Where the error
-    moves with the band, it is reported and not used.
+    Fit and sweep stay as they were if nothing tells of the instrument, or if the model has no Prony modes. Where one of
+    the errors moves with the band, they are reported and not used.
     """
-    if sweep.inertia is None or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
+    known = nuisances_of(sweep)
+    if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
-    value, error, refitted = _error_of_inertia(fit, sweep)
+    values, covariance, refitted = _errors_of_instrument(fit, sweep)
     kept = sweep.angular_frequency < sweep.angular_frequency[-1] / HALF_DECADE * (1 - 1e-9)
     part: tuple[Any, Any] = (None, None)
     if len(np.unique(sweep.angular_frequency[kept])) > len(fit.solution.u) // 2 + 1:
         shorter = some(sweep, kept)
-        part = _error_of_inertia(viscoelastic.closed_form(shorter, fit.modes), shorter)[:2]
-    found = InertiaError(value, error, *part)
-    details = fit.details | {"instrument": inertia_numbers(found)}
-    if not found.steady:
-        moved = "too few points are left to check it" if found.part is None else f"it is {_cent(found.part)} there"
-        told = (
-            f"the instrument's inertia seems off by {_cent(value)} (standard error {_cent(error)}), but not "
-            f"without the last half decade ({moved}): the misfit of the model poses as inertia, so it is not corrected"
-        )
-        return fit._replace(details=details, warnings=(*fit.warnings, told)), sweep
-    corrected = _shifted(sweep, value)
-    note = (
-        f"the inertia that the instrument subtracted is taken to be off by {_cent(value)} (standard error "
-        f"{_cent(error)}, prior {_cent(raw_torque.UNCERTAINTY)}), and the storage moduli are corrected for it"
-    )
-    corrected = corrected._replace(notes=(*sweep.notes, note))
-    spread = _with_direction(refitted, corrected, error)
+        found, spread, _ = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
+        part = found, np.sqrt(np.diag(spread))
+    errors = InstrumentErrors(values, covariance, *part)
+    details = fit.details | {"instrument": instrument_numbers(errors, known)}
+    if not errors.steady.all():
+        return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
+    corrected = _shifted(sweep, known, values)
+    notes = [
+        f"{n.words.format(n.told(v))} (standard error {n.told(e)}, prior {n.told(1.0)}), and the moduli are corrected "
+        "for it"
+        for n, v, e in zip(known, values, np.sqrt(np.diag(covariance)), strict=True)
+    ]
+    corrected = corrected._replace(notes=(*sweep.notes, *notes))
+    spread = _with_directions(refitted, corrected, known, covariance)
     return refitted._replace(details=refitted.details | details, uncertainty=spread), corrected
+
+
+def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
+    """A sentence on each error that moves with the band."""
+    out, e = [], np.sqrt(np.diag(errors.covariance))
+    for k in np.flatnonzero(~errors.steady):
+        n = known[k]
+        there = "too few points are left to check it"
+        if errors.part is not None:
+            there = f"it is {n.told(errors.part[k])} there"
+        out.append(
+            f"the instrument's {n.name} seems off by {n.told(errors.values[k])} (standard error {n.told(e[k])}), but "
+            f"not without the last half decade ({there}): the misfit of the model poses as {n.name}, so it is not "
+            "corrected"
+        )
+    return out
 
 
 def _cent(value: float) -> str:
     return f"{100 * value:.2g} %"
 
 
-def inertia_numbers(found: InertiaError) -> dict[str, object]:
+def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[str, object]:
     """The part `instrument` of fit.json."""
-    return {
-        "inertia_off_by": found.value,
-        "standard_error": found.standard_error,
-        "prior_standard_deviation": raw_torque.UNCERTAINTY,
-        "without_last_half_decade": found.part,
-        "moves_with_the_band": not found.steady,
-    }
+    out: dict[str, object] = {}
+    errors = np.sqrt(np.diag(found.covariance))
+    for k, n in enumerate(known):
+        off, sd = ("friction_off_by_N_m_s", "friction_") if n.name == "friction" else ("inertia_off_by", "")
+        out |= {
+            off: n.unit * float(found.values[k]),
+            f"{sd}standard_error": n.unit * float(errors[k]),
+            f"{sd}prior_standard_deviation": n.unit,
+            f"{sd}without_last_half_decade": None if found.part is None else n.unit * float(found.part[k]),
+        }
+    return out | {"moves_with_the_band": not bool(found.steady.all())}
 
 
-def _residuals_per_error(sweep: Sweep) -> np.ndarray:
-    """Change of the residuals (2n,) by an error of 1."""
-    assert sweep.inertia is not None
-    return np.concatenate([sweep.inertia, np.zeros(len(sweep.inertia))]) / np.concatenate(sweep.deviations)
+def _directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:
+    """Change of the residuals (2n, k) by one standard deviation of each error."""
+    scales = np.concatenate(sweep.deviations)
+    return np.stack([np.concatenate([n.moved.real, n.moved.imag]) / scales for n in known], axis=1)
 
 
-def _shifted(sweep: Sweep, value: float) -> Sweep:
-    assert sweep.inertia is not None
-    return sweep._replace(storage=sweep.storage + value * sweep.inertia)
+def _shifted(sweep: Sweep, known: list[Nuisance], values: np.ndarray) -> Sweep:
+    moved = sum((v * n.moved for v, n in zip(values, known, strict=True)), np.zeros(len(sweep.storage), complex))
+    return sweep._replace(storage=sweep.storage + moved.real, loss=sweep.loss + moved.imag)
 
 
-def _error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[float, float, Fit]:
-    """The error of the inertia, its standard error, and the fit to the moduli that it corrects."""
-    value = 0.0
+def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit]:
+    """The errors (k,) and their covariance, in standard deviations of the priors; the fit to the corrected moduli."""
+    known = nuisances_of(sweep)
+    values = np.zeros(len(known))
     for _ in range(ROUNDS):
-        here = _shifted(sweep, value)
+        here = _shifted(sweep, known, values)
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
         noise = max(fit.uncertainty.noise, 1e-12)
-        d = _residuals_per_error(here)
+        d = _directions(here, known)
         own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # what the modes cannot follow
-        precision = own @ own / noise**2 + raw_torque.UNCERTAINTY**-2
+        precision = own.T @ own / noise**2 + np.eye(len(known))
         # The prior is of the whole error, the residuals are of what is left of it.
-        step = (own @ r / noise**2 - value / raw_torque.UNCERTAINTY**2) / precision
-        value, error = value + step, precision**-0.5
-        corrected = _shifted(sweep, value)
-        if np.any(corrected.storage <= 0):  # a sweep that is the instrument's
-            return value - step, error, fit
+        step = np.linalg.solve(precision, own.T @ r / noise**2 - values)
+        values, covariance = values + step, np.linalg.inv(precision)
+        corrected = _shifted(sweep, known, values)
+        if np.any(corrected.storage <= 0) or np.any(corrected.loss <= 0):  # a sweep that is the instrument's
+            return values - step, covariance, fit
         fit = viscoelastic.modes_from(corrected, fit.solution.u[None], fit.kind)._replace(details=fit.details)
-        if abs(step) < 1e-3 * error:
+        if np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))):
             break
-    return float(value), float(error), fit
+    return values, covariance, fit
 
 
-def _with_direction(fit: Fit, sweep: Sweep, error: float) -> Estimate:
-    """The estimate with the part of its errors that the inertia's error causes."""
+def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: np.ndarray) -> Estimate:
+    """The estimate with the part of its errors that the instrument's errors cause."""
     J = np.asarray(fit.solution.jacobian)
     _, slope = host.with_jacobian(
         lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
     )
-    moved = slope @ np.linalg.lstsq(J, _residuals_per_error(sweep), rcond=1e-12)[0]
-    return _wider(fit.uncertainty, moved * error)
+    moved = slope @ np.linalg.lstsq(J, _directions(sweep, known), rcond=1e-12)[0]
+    estimate = fit.uncertainty
+    for direction in (moved @ np.linalg.cholesky(covariance)).T:
+        estimate = _wider(estimate, direction)
+    return estimate
 
 
 def with_gap_error(fit: Fit, relative: float) -> Fit:
@@ -149,17 +199,53 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
     Storage and loss of the fit stay those that the instrument shows, and so do its residuals.
 
     Args:
-        fit: Prony modes of the moduli as they were measured.
+        fit: of the moduli as they were measured. Moduli of its own numbers are divided, too.
         sweep: these moduli.
         factors: what the compression makes of them.
     """
-    seen = fit.kind.maxwell
-    kind = fit.kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
-    spread = uncertainty.estimate(fit.solution, sweep.noise_given, kind.maxwell)
-    model = Maxwell(spread.values[0], spread.values[1 : fit.modes + 1], spread.values[fit.modes + 1 :])
-    old, new = (uncertainty.cautions(sweep, of, kind.name) for of in (fit.uncertainty, spread))
+    kind, own, details = _kind_at_rest(fit.kind, factors), fit.parameters, fit.details
+    if kind.moduli is not None:
+        kind, details = _of_own_moduli(kind, fit, sweep)
+    rows = (2 * len(fit.storage), kind.effective)
+    spread = uncertainty.estimate(fit.solution, sweep.noise_given, kind.maxwell, rows)
+    if kind.values is not None:
+        own = estimated(kind.names, kind.values, fit.solution, rows[0], sweep.noise_given, kind.effective)
+    modes = len(spread.values) // 2
+    model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
+    old, new = (
+        ([], [])
+        if own is not None
+        else (uncertainty.cautions(sweep, of, kind.name) for of in (fit.uncertainty, spread))
+    )
     warnings = (*(w for w in fit.warnings if w not in old), *new)
-    return fit._replace(model=model, kind=kind, uncertainty=spread, warnings=warnings)
+    return fit._replace(model=model, kind=kind, uncertainty=spread, parameters=own, warnings=warnings, details=details)
+
+
+def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
+    """The same u as numbers of the sample at rest: what relaxes and what stands are divided by a factor each."""
+    seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
+    if shown is None or moduli is None:
+        return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
+    each = [1 / (factors.equilibrium if n == "equilibrium_modulus" else factors.relaxing) for n in kind.names]
+    each = [f if unit.startswith("Pa") else 1.0 for f, unit in zip(each, kind.units, strict=True)]
+    solid = kind.names[0] == "equilibrium_modulus"
+
+    def at_rest(u, omega):
+        stands = shown(u)[0] if solid else 0.0
+        return (moduli(u, omega) - stands) / factors.relaxing + stands / factors.equilibrium
+
+    return kind._replace(values=lambda u: jnp.asarray(each) * shown(u), moduli=at_rest)
+
+
+def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
+    """Prony modes of a model at rest: those that were made for the measured moduli mix what relaxes and what stands."""
+    own, omega = kind.moduli, sweep.angular_frequency
+    assert own is not None
+    solid = kind.names[0] == "equilibrium_modulus"
+    made = as_prony_modes.convert(lambda w: np.asarray(own(fit.solution.u, w)), omega[0], omega[-1], solid)
+    told = {"modes": len(made.times), "largest_relative_error": made.error}
+    kind = kind._replace(maxwell=lambda u: as_prony_modes.modes(made, own(u, made.omega)))
+    return kind, fit.details | {"conversion": told}
 
 
 def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[str, object]:
@@ -169,6 +255,7 @@ def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[s
     factors = compression.shares(law, strain)
     force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
     G0, rest = float(fit.model.shear_modulus), float(fit.model.equilibrium_modulus)
+    unknown = glued and "force_of_law_mesh_bias_N" not in fit.details
     return {
         "strain": strain,
         "height_at_rest_m": simulation.height / (1 - strain),
@@ -179,7 +266,7 @@ def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[s
         "smooth_factor_of_equilibrium_modulus": factors.equilibrium,
         "axial_force_N": force * rest / G,
         "axial_force_standard_error_N": force * uncertainty.equilibrium_error(fit.uncertainty) / G,
-        "axial_force_mesh_bias_N": fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G,
+        "axial_force_mesh_bias_N": None if unknown else fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G,
         "axial_force_at_once_N": force * G0 / G,
     }
 

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.special
 
 from fitting.fits import time_tests, viscoelastic
+from fitting.fits.families import springpots_in_time
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit, Kind, Simulation
 from fitting.methods import generalised_maxwell, springpots
@@ -281,9 +282,12 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
-    """The density of a relaxation or creep test in closed form."""
-    one, data = time_tests.residuals_in_time(test, fit.kind)
-    residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))
+    """The density of a relaxation or creep test in closed form, of Prony modes or of a fractional model."""
+    if fit.kind.values is None:
+        one, data = time_tests.residuals_in_time(test, fit.kind)
+        residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))
+    else:
+        residuals = jax.jit(jax.vmap(springpots_in_time.residuals_of_springpot(fit.kind.name, test)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
     own = target(fit.kind, lambda u: np.asarray(residuals(u)), test.resolved, size, False)
     return sample(own, len(fit.solution.u), count, seed)

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.fits import models, viscoelastic
+from fitting.fits import viscoelastic
+from fitting.fits.families import choice, models
 from fitting.fits.honesty import edges
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
-from fitting.methods import as_prony_modes, generalised_maxwell, springpots, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.population import Population, population
 from fitting.readers.rheometer import Sweep
@@ -20,7 +21,7 @@ class Samples(NamedTuple):
 
     sweeps: list[Sweep]
     fits: list[Fit]
-    populations: dict[str, Population | None]  # by the names of `edges.values`
+    populations: dict[str, Population | None]  # by the names of `values_of_sample`
     typical: Maxwell  # Prony modes of the sample in the middle, for a simulation
     compared: list[dict]  # models and numbers of modes, best first
 
@@ -28,6 +29,11 @@ class Samples(NamedTuple):
     def kind(self) -> Kind:
         """Kind of the model that all share."""
         return self.fits[0].kind
+
+    def values(self, k: int) -> dict[str, tuple[float, float]]:
+        """Numbers of sample k by the names of the population, with their errors; 0 for a strength that it lacks."""
+        own = values_of_sample(self.fits[k])
+        return {name: own.get(name, (0.0, np.inf)) for name in self.populations}
 
 
 class _Candidate(NamedTuple):
@@ -47,7 +53,7 @@ def fit(
 
     Args:
         sweeps: two or more.
-        model: "prony", "fractional" or "auto".
+        model: one of `models.MODELS`.
         modes: N of "prony", or "auto".
         progress: told what is fitted.
     """
@@ -59,8 +65,13 @@ def fit(
         progress("springpots")
         for fits in zip(*(models.fractional(s) for s in sweeps), strict=True):
             tried.append(_candidate_for_all(sweeps, list(fits), {"model": fits[0].kind.name}))
+    if model in ("spectrum", "auto"):
+        progress("spectrum")
+        found = relaxation_spectrum.fit_all(sweeps)
+        fits = [models.spectrum_fit(s, f) for s, f in zip(sweeps, found, strict=True)]
+        tried.append(_candidate_for_all(sweeps, fits, {"model": "spectrum"}))
     able = [c for c in tried if c.able] or tried
-    best = min(able, key=lambda c: c.criterion)
+    best = able[choice.preferred([choice.label_of(c.fits[0]) for c in able], [c.criterion for c in able])]
     progress("ends of the band")
     fits = [edges.honest(f, s, d) for f, s, d in zip(best.fits, sweeps, dense, strict=True)]
     lowest = min(c.criterion for c in tried)
@@ -99,18 +110,32 @@ def _modes_for_all(
     return tried
 
 
+def values_of_sample(fit: Fit) -> dict[str, tuple[float, float]]:
+    """Numbers of a fit with their standard errors: those of `edges.values`, and the strengths of a spectrum."""
+    out = edges.values(fit)
+    if fit.kind.effective is not None and fit.parameters is not None:
+        rows = zip(fit.kind.names, fit.parameters.values, fit.parameters.standard_errors, strict=True)
+        out = {n: (float(v), float(e)) for n, v, e in rows}
+    return out
+
+
 def _populations(fits: list[Fit]) -> dict[str, Population | None]:
-    known = [edges.values(f) for f in fits]
-    out = {}
-    for name in known[0]:
-        pairs = np.array([row[name] for row in known])
+    known, out = [values_of_sample(f) for f in fits], {}
+    names = sorted({n for row in known for n in row if "[" in n}, key=lambda n: (n.split("[")[0], _place(n)))
+    for name in (*(n for n in known[0] if "[" not in n), *names):
+        pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
         out[name] = population(pairs[:, 0], pairs[:, 1])
     return out
 
 
+def _place(name: str) -> int:
+    return int(name[name.index("[") + 1 : -1])
+
+
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
     """Prony modes at the means of the population; where there is none, modes stay out and other numbers are medians."""
-    kind, middle = fits[0].kind, {n: float(np.median([edges.values(f)[n][0] for f in fits])) for n in populations}
+    kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
+    middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}
     if kind.values is None:
         if "shear_modulus" not in mean:
@@ -119,8 +144,21 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
         ratios, times = (np.array([mean[f"{n}[{k}]"] for k in known]) for n in ("ratios", "relaxation_times"))
         ratios = ratios * min(1.0, (1 - 1e-9) / max(ratios.sum(), 1e-300))
         return Maxwell(mean["shear_modulus"], ratios, times)  # type: ignore[arg-type]
-    (model,) = (m for m in springpots.FRACTIONAL if m.name == kind.name)
     low, high = min(s.angular_frequency[0] for s in sweeps), max(s.angular_frequency[-1] for s in sweeps)
+    if kind.effective is not None:
+        grid = relaxation_spectrum.grid_of_times(1 / high, 1 / low, fits[0].details["spectrum"]["times_per_decade"])
+        strengths = np.zeros(1 + len(grid))
+        for name in populations:
+            place = 0 if name == "equilibrium_modulus" else 1 + _place(name)
+            strengths[place] = mean.get(name, middle[name]) if middle[name] > 0 else 0.0
+
+        def smooth(omega):
+            storage, loss = np.split(relaxation_spectrum.mode_columns(omega, grid) @ strengths, 2)
+            return storage + 1j * loss
+
+        made = as_prony_modes.convert(smooth, low, high, bool(strengths[0] > 0))
+        return as_prony_modes.modes(made, smooth(made.omega))
+    (model,) = (m for m in springpots.FRACTIONAL if m.name == kind.name)
     values = [mean.get(name, middle[name]) for name in model.names]
 
     def formula(omega):

@@ -115,8 +115,8 @@ def _chosen_model(tried: list[TimeFit], test: TimeTest) -> TimeFit:
 
 def criterion(fit: TimeFit) -> float:
     """The information criterion of `viscoelastic.information_criterion`."""
-    m = len(fit.measured)
-    return float(m * np.log(max(2 * float(fit.solution.cost) / m, 1e-300)) + len(fit.solution.u) * np.log(m))
+    m, free = len(fit.measured), len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
+    return float(m * np.log(max(2 * float(fit.solution.cost) / m, 1e-300)) + free * np.log(m))
 
 
 def identifiable(fit: TimeFit, test: TimeTest) -> bool:

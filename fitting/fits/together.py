@@ -69,6 +69,7 @@ class Together(NamedTuple):
     run_time: float
     compile_time: float
     parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
+    details: Content | None = None  # of the model
 
     @property
     def modes(self) -> int:
@@ -119,7 +120,7 @@ def fit(
         progress: told what is fitted.
     """
     tests = list(tests)
-    band = ResolvedBand(_resolved(tests))
+    band = ResolvedBand(resolved_by(tests))
     largest = (sum(len(reported_numbers(t)[1]) for t in tests) - 2) // 2
     if modes != "auto" and not 1 <= int(modes) <= largest:
         raise InputError(f"--modes {modes} is out of range: give 1 to {largest} for these files, or auto")
@@ -138,7 +139,8 @@ def fit(
     return _told_of_all(chosen, tried, band)
 
 
-def _resolved(tests: list[Measured]) -> tuple[float, float]:
+def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
+    """Shortest and longest relaxation time [s] that one of the tests resolves."""
     ends = np.array([t.resolved for t in tests])
     return float(ends[:, 0].min()), float(ends[:, 1].max())
 
@@ -166,7 +168,8 @@ def _able(fit: Together, band: ResolvedBand) -> bool:
 def criterion_of_all(fit: Together) -> float:
     """Bayesian information criterion with the noise of each test estimated."""
     total = sum(s.points for s in fit.shares)
-    return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + len(fit.solution.u) * np.log(total))
+    free = len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
+    return float(sum(s.points * 2 * np.log(s.noise) for s in fit.shares) + free * np.log(total))
 
 
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
@@ -194,7 +197,8 @@ def misfits(
     tests: list[Measured], parts: list, data: list, residuals: np.ndarray, noise: np.ndarray
 ) -> tuple[list[Share], list[np.ndarray]]:
     """Residuals of each test, and the numbers that the fit predicts for it."""
-    left = np.split(residuals, np.cumsum([len(y) for _, y, _ in parts])[:-1])
+    ends = np.cumsum([len(y) for _, y, _ in parts])
+    left = np.split(residuals[: ends[-1]], ends[:-1])
     fitted = [r * scales + y for r, (_, y, scales) in zip(left, data, strict=True)]
     shares = [
         Share(name_of(t), t.source, len(y), float(s), np.nan, float(np.mean(np.abs(f - y) / scales)), np.array([]))
@@ -203,7 +207,7 @@ def misfits(
     return shares, fitted
 
 
-def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: int) -> np.ndarray:
+def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
     """Relative noise of each test: root mean square of its residuals, less its share of the degrees of freedom."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
@@ -308,7 +312,7 @@ def _shares(fit: Together) -> list[Share]:
     function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
     best = viscoelastic.best_of(levenberg_marquardt, function)
     u = np.asarray(fit.solution.u)
-    band = ResolvedBand(_resolved(fit.tests))
+    band = ResolvedBand(resolved_by(fit.tests))
     starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])
     vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
 
@@ -326,13 +330,15 @@ def shares_by_rows(
 
     Args:
         fit: the common fit.
-        jacobian: of the residuals of all tests by u.
+        jacobian: of the residuals of all tests by u; rows of a prior may stand below.
         slope: derivative of the reported numbers by u.
         values: of the reported numbers.
         alone: place of a test -> cost of a fit to it alone.
     """
-    counts, free = [s.points for s in fit.shares], jacobian.shape[1]
+    counts = [s.points for s in fit.shares]
+    free = jacobian.shape[1] if fit.kind.effective is None else fit.kind.effective
     place = np.repeat(np.arange(len(counts)), counts)
+    place = np.concatenate([place, np.full(len(jacobian) - len(place), -1)])
     out = []
     for k, share in enumerate(fit.shares):
         root, _ = spread(jacobian[place != k], 1.0, slope)

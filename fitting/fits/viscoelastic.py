@@ -36,6 +36,7 @@ class Kind(NamedTuple):
     values: Callable[[jax.Array], jax.Array] | None = None  # u -> its own parameters (P,)
     prior: Callable[[jax.Array], jax.Array] | None = None  # u -> rows that stand below the residuals of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
+    moduli: Callable[[Array, Array], Array] | None = None  # (u, omega) -> its own G* (n,) [Pa] at any frequency
 
 
 class Fit(NamedTuple):
@@ -378,12 +379,13 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
         cell = torsion.linear_cell_for(simulation.radius, height)
     if not simulation.precompression:
         return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
-    if simulation.part != "all" or simulation.density is not None:
+    if simulation.part != "all":
         raise InputError(
-            f"a precompression of {simulation.precompression:g} is of a sample without inertia whose whole stress "
-            f"relaxes: leave out density and part {simulation.part!r}"
+            f"a precompression of {simulation.precompression:g} is of a sample whose whole stress relaxes: leave out "
+            f"part {simulation.part!r}"
         )
-    rest = torsion.make_rig(simulation.radius, height / (1 - simulation.precompression), cell)
+    tall = height / (1 - simulation.precompression)
+    rest = torsion.make_rig(simulation.radius, tall, cell, density=simulation.density)
     return compression.compressed(rest, laws.typical(simulation.law), simulation.precompression)
 
 
@@ -405,7 +407,7 @@ OF_THE_DATA = (
     "Kramers-Kronig",
     "half decade",
     "structured misfit",
-    "poses as inertia",
+    "poses as",
 )
 #: Words of the warnings that come first, the most important of all at the beginning.
 MISSES = "the fit misses the data"

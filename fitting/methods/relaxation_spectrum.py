@@ -6,6 +6,7 @@ size of the data at omega = 1 / tau, and their second differences are held down 
 criterion chooses. Method: Honerkamp and Weese (1989), Macromolecules 22, with that criterion in place of theirs.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ class GridSpectrum(NamedTuple):
     effective: float  # number of parameters that the data determine
     criterion: float
     decades: float  # of relaxation times whose strengths the data carry
+    places: np.ndarray  # (K,) of these times in the whole grid
 
 
 def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -45,36 +47,75 @@ def fit(sweep: Sweep) -> GridSpectrum:
     return min((at(sweep, grid, w) for grid in GRIDS for w in WEIGHTS), key=lambda found: found.criterion)
 
 
-def at(sweep: Sweep, per_decade: int, smoothing: float) -> GridSpectrum:
-    """The spectrum of one grid and one weight; a convex problem, solved exactly."""
+def fit_all(sweeps: Sequence[Sweep]) -> list[GridSpectrum]:
+    """Spectra of several samples on one grid with one weight: those of the lowest sum of criteria."""
+    band = min(s.resolved[0] for s in sweeps), max(s.resolved[1] for s in sweeps)
+    every = ([at(s, grid, w, band) for s in sweeps] for grid in GRIDS for w in WEIGHTS)
+    return min(every, key=lambda found: sum(f.criterion for f in found))
+
+
+def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float] | None = None) -> GridSpectrum:
+    """The spectrum of one grid and one weight; a convex problem, solved exactly. `band`: of times [s], for the grid."""
     omega = sweep.angular_frequency
-    low, high = -np.log10(omega[-1]) - MARGIN, -np.log10(omega[0]) + MARGIN
-    times = np.logspace(high, low, int(np.ceil((high - low) * per_decade)) + 1)
+    times = grid_of_times(*(band or sweep.resolved), per_decade)
     size = np.exp(np.interp(-np.log(times), np.log(omega), np.log(np.hypot(sweep.storage, sweep.loss))))
     scales = np.concatenate(sweep.deviations)
     unit = np.concatenate([[sweep.storage.min()], size])
     A = mode_columns(omega, times) * unit / scales[:, None]
     b = np.concatenate([sweep.storage, sweep.loss]) / scales
-    L = np.sqrt(smoothing) * np.column_stack([np.zeros(len(times) - 2), np.diff(np.eye(len(times)), 2, axis=0)])
+    L = second_differences(len(times), smoothing)
     x, _ = non_negative(np.vstack([A, L]), np.concatenate([b, np.zeros(len(L))]))
-    m, free = len(b), x > 1e-10 * x.max()
-    r = A @ x - b
+    return described(x, A, A @ x - b, GridOfTimes(times, unit, per_decade, smoothing))
+
+
+class GridOfTimes(NamedTuple):
+    """Where the strengths of a spectrum stand, what they are measured in, and how they are held."""
+
+    times: np.ndarray  # (K,) [s], descending
+    unit: np.ndarray  # (1 + K,) [Pa]; the first is of the equilibrium modulus
+    per_decade: int
+    smoothing: float
+
+
+def grid_of_times(low: float, high: float, per_decade: int) -> np.ndarray:
+    """Times (K,) [s], descending, for data that resolve times from `low` to `high`."""
+    ends = np.log10(high) + MARGIN, np.log10(low) - MARGIN
+    return np.logspace(*ends, int(np.ceil((ends[0] - ends[1]) * per_decade)) + 1)
+
+
+def second_differences(count: int, smoothing: float) -> np.ndarray:
+    """The rows (K - 2, 1 + K) that hold the strengths."""
+    rows = np.column_stack([np.zeros(count - 2), np.diff(np.eye(count), 2, axis=0)])
+    return np.sqrt(smoothing) * rows
+
+
+def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) -> GridSpectrum:
+    """The spectrum at a minimum, with its number of parameters in effect.
+
+    Args:
+        x: equilibrium modulus and strengths (1 + K,) in `grid.unit`.
+        A: derivative (m, 1 + K) of the residuals of the data.
+        r: these residuals (m,).
+        grid: of the strengths.
+    """
+    L = second_differences(len(grid.times), grid.smoothing)
+    m, free = len(r), x > 1e-10 * x.max()
     covariance = np.linalg.pinv(A[:, free].T @ A[:, free] + L[:, free].T @ L[:, free])
     effective = float(np.trace(covariance @ A[:, free].T @ A[:, free]))
     mean_square = max(float(r @ r) / m, 1e-300)
     errors = np.full(len(x), np.inf)
     errors[free] = np.sqrt(np.diag(covariance) * float(r @ r) / max(1.0, m - effective))
-    carried = (errors[1:] < CARRIED * x[1:]).sum() / per_decade
+    carried = (errors[1:] < CARRIED * x[1:]).sum() / grid.per_decade
     kept = free[1:]
-    prior = (L / unit)[:, np.concatenate([[True], kept])]
     return GridSpectrum(
-        times=times[kept],
-        strengths=(x * unit)[1:][kept],
-        equilibrium=float(x[0] * unit[0]) if free[0] else 0.0,
-        per_decade=per_decade,
-        smoothing=float(smoothing),
-        prior=prior,
+        times=grid.times[kept],
+        strengths=(x * grid.unit)[1:][kept],
+        equilibrium=float(x[0] * grid.unit[0]) if free[0] else 0.0,
+        per_decade=grid.per_decade,
+        smoothing=float(grid.smoothing),
+        prior=(L / grid.unit)[:, np.concatenate([[True], kept])],
         effective=effective,
         criterion=float(m * np.log(mean_square) + effective * np.log(m)),
         decades=float(carried),
+        places=np.flatnonzero(kept),
     )

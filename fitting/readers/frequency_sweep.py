@@ -30,6 +30,8 @@ class Sweep(NamedTuple):
     inertia: np.ndarray | None = (
         None  # (n,) [Pa] what the instrument subtracted for its inertia, where raw columns tell
     )
+    friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
+    friction_error: float = 0.0  # this deviation [N m s]
     grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out for the instrument's sake
 
     @property
@@ -121,10 +123,16 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
 
 def some(sweep: Sweep, kept: np.ndarray) -> Sweep:
     """The points where `kept` (n,) is true."""
-    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia")
+    names = ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd", "inertia", "friction")
     columns: Content = {q: None if getattr(sweep, q) is None else getattr(sweep, q)[kept] for q in names}
     raw = None if sweep.raw is None else {q: v[kept] for q, v in sweep.raw.items()}
     return sweep._replace(**columns, raw=raw)
+
+
+def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> Sweep:
+    """The sweep with the standard deviation `error` [N m s] of the friction of the instrument's bearing; size in m."""
+    geometry = np.pi * radius**4 / (2 * height)
+    return sweep._replace(friction=error * sweep.angular_frequency / geometry, friction_error=error)
 
 
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.text_tables import find_delimiter, split_cells, text_of, to_number
+from fitting.readers.tables.text_tables import find_delimiter, split_cells, text_of, to_number
 from fitting.readers.units import INDENTATION_UNITS
 from liverjax.core.errors import InputError
 

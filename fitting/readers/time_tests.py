@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.text_tables import split_line, text_of, to_number
+from fitting.readers.tables.text_tables import EMPTY, decimal_sign, means_nothing, split_line, text_of, to_number
 from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
 
@@ -228,24 +228,29 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
-    """Numbers below the header, and the units that a line of their own gives."""
-    rows, units = [], {}
+    """Numbers below the header, and the units that a line of their own gives. An empty cell is NaN."""
+    kept, numbers, units = [], [], {}
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
         line = lines[k]
         k += 1
         _, cells = split_line(line, delimiter)
-        values = [to_number(cells[p], delimiter) if p < len(cells) else None for p in needed.values()]
-        if all(v is not None for v in values):
-            rows.append(values)
+        own = [cells[p] if p < len(cells) else "" for p in needed.values()]
+        if not means_nothing(own):
+            kept.append(own)
+            numbers.append(k)
             continue
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
-        if not rows and named:
+        if not kept and named:
             units = named
-        elif rows and any(v is not None for v in values) and line.strip():
-            raise InputError(f"{path}: line {k}: {line.strip()[:40]!r} has a cell that is no number; mend or remove it")
-        elif rows and line.strip() and not line.lstrip().startswith("#"):
+        elif kept and any(c.strip().lower() not in EMPTY for c in own) and not line.lstrip().startswith("#"):
             break
+    sign = decimal_sign(cell for own in kept for cell in own)
+    rows = [[to_number(cell, delimiter, sign) for cell in own] for own in kept]
+    for number, row in zip(numbers, rows, strict=True):
+        if any(v is None for v in row):
+            shown = lines[number - 1].strip()[:40]
+            raise InputError(f"{path}: line {number}: {shown!r} has a cell that is no number; mend or remove it")
     if len(rows) < 4:
         raise InputError(f"{path}: {len(rows)} rows of numbers are below the header; give four or more")
     return rows, units
@@ -265,7 +270,7 @@ def _in_si(path, found, rows, units):
         columns[quantity] = rows[:, j] * TIME_TEST_UNITS[quantity][_plain_heading(unit)]
     good = np.all(np.isfinite(rows), axis=1)
     if not good.all():
-        notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a number in them is not finite")
+        notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a cell in them is empty or not finite")
     return {q: v[good] for q, v in columns.items()}, notes
 
 

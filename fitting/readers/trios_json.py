@@ -21,15 +21,20 @@ def tables(text: str) -> str | None:
         lines = []
         for step in dict.fromkeys(row.get(STEP) for row in rows):
             own = [row for row in rows if row.get(STEP) == step]
-            keys = [k for k in headers if all(_is_number(row.get(k)) for row in own)]
+            keys = [k for k in headers if _is_column([row.get(k) for row in own])]
             lines += ["[step]", steps.get(step, "") or "step"]
             lines.append("\t".join(_cell(headers[k].get("DisplayName", k)) for k in keys))
             lines.append("\t".join(_cell((headers[k].get("Unit") or {}).get("Name", "")) for k in keys))
-            lines += ["\t".join(repr(float(row[k])) for k in keys) for row in own]
+            lines += ["\t".join("" if row.get(k) is None else repr(float(row[k])) for k in keys) for row in own]
             lines.append("")
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
     return "\n".join(lines)
+
+
+def _is_column(values: list) -> bool:
+    """Whether all are numbers, or empty where a point was aborted."""
+    return all(v is None or _is_number(v) for v in values) and any(map(_is_number, values))
 
 
 def _is_number(value: object) -> bool:

@@ -4,7 +4,14 @@ import numpy as np
 
 #: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
 MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
-FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad_s", "rad s-1", "rad_s-1", "1/s", "s-1"), 1.0)
+MODULUS_UNITS |= dict.fromkeys(("N/m2", "N/m²", "N/m^2"), 1.0) | {"N/mm2": 1e6, "N/mm²": 1e6, "N/mm^2": 1e6}
+MODULUS_UNITS |= dict.fromkeys(("dyn/cm2", "dyn/cm²", "dyn/cm^2", "dyne/cm2", "dyne/cm²", "dyne/cm^2"), 0.1)
+#: Those of `PER_SECOND` say nothing of a factor of 2 pi, so they are of columns that are called angular.
+PER_SECOND = ("1/s", "s-1", "s^-1")
+FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad/sec", "rad_s", *PER_SECOND), 1.0)
+FREQUENCY_UNITS |= dict.fromkeys(("rad s-1", "rad_s-1", "rad s^-1", "rad·s-1", "rad.s-1", "rad*s-1"), 1.0)
+ANGLE_UNITS = dict.fromkeys(("°", "º", "deg", "degree", "degrees", "grad"), np.pi / 180) | {"rad": 1.0, "mrad": 1e-3}
+TANGENT_UNITS = dict.fromkeys(("", "-", "1", "none"), 1.0)
 #: Of the stress in curves.
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 _TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}

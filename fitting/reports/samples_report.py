@@ -47,6 +47,7 @@ def _json_content(found: Samples) -> Content:
         "relaxation_times": np.asarray(typical.relaxation_times).tolist(),
         **own,
         "population": {name: _population(p) for name, p in found.populations.items()},
+        "details": {"spectrum": _times_of_strengths(found)} if found.kind.effective is not None else {},
         "samples": [_sample_entry(found, k) for k in range(len(found.fits))],
         "models_compared": found.compared,
         "mean_relative_error": float(errors.mean()),
@@ -56,6 +57,15 @@ def _json_content(found: Samples) -> Content:
         "compile_time_s": sum(f.compile_time for f in found.fits),
         "versions": versions(),
     }
+
+
+def _times_of_strengths(found: Samples) -> Content:
+    """Times [s] of the strengths of a spectrum, by their names."""
+    out: Content = {}
+    for fit in found.fits:
+        names = (n for n in fit.kind.names if n.startswith("strengths["))
+        out |= dict(zip(names, fit.details["spectrum"]["relaxation_times"], strict=True))
+    return {"relaxation_times": out, "times_per_decade": found.fits[0].details["spectrum"]["times_per_decade"]}
 
 
 def _pairs(found: Samples) -> zip:
@@ -92,7 +102,9 @@ def warnings(found: Samples) -> list[str]:
     """Warnings of the population, and how often each warning of a single sample occurs."""
     out = []
     for name, p in found.populations.items():
-        own = np.array([edges.values(f)[name][0] for f in found.fits])
+        own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
+        if name.startswith("strengths["):
+            continue  # where the data are silent, or it is zero: many
         if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
             out.append(f"{name}: it is {np.round(own[0]):g} in all samples, the springpot is a pure spring or dashpot")
         elif p is None:
@@ -121,18 +133,24 @@ def table(found: Samples) -> str:
         f"{len(found.fits)} samples, {found.kind.name}",
         f"{'':22s} {'mean':>10s} {'spread':>7s}   {'95 % of the mean':22s}   95 % of a new sample",
     ]
+    times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
     for name, p in found.populations.items():
-        unit = units.get(name, {"shear_modulus": "Pa", "equilibrium_modulus": "Pa"}.get(name, ""))
+        label = f"strength at {times[name]:.3g} s" if name in times else name
+        unit = units.get(
+            name, {"shear_modulus": "Pa", "equilibrium_modulus": "Pa"}.get(name, "Pa" if name.startswith("str") else "")
+        )
         unit = "s" if name.startswith("relaxation_time") else "" if unit == "1" else unit
         if p is None:
-            rows.append(f"{name:22s} {'?':>10s}")
+            rows += [f"{name:22s} {'?':>10s}"] if not name.startswith("strengths[") else []
             continue
         ends = (f"{low:.4g} to {high:.4g}" for low, high in (p.mean_interval, p.new_interval))
         middle, new = ends
-        rows.append(f"{name:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
-    rows.append(f"{'sample':32s} {'mean error':>10s}   {next(iter(found.populations))}")
-    for fit, sweep in _pairs(found):
-        name, (value, error) = next(iter(edges.values(fit).items()))
+        rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
+    every = [found.values(k) for k in range(len(found.fits))]
+    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # the first that most have
+    rows.append(f"{'sample':32s} {'mean error':>10s}   {name}")
+    for (fit, sweep), own in zip(_pairs(found), every, strict=True):
+        value, error = own[name]
         mark = " *" if name in edges.moved(fit) else ""
         mean = f"{100 * fit.relative_errors(sweep).mean():.2g} %"
         rows.append(f"{Path(sweep.source).name[-32:]:32s} {mean:>10s}   {value:.4g} ± {error:.2g}{mark}")
@@ -160,7 +178,8 @@ def figure(found: Samples) -> "Figure":
     left.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.3)
     known = _known_errors(found)
     for row, (name, p) in enumerate(known.items()):
-        own = np.array([edges.values(f)[name][0] for f in found.fits]) / p.mean
+        own = np.array([found.values(k)[name][0] for k in range(len(found.fits))]) / p.mean
+        own = own[own > 0]
         right.plot(own, np.full(len(own), row), "|", color=GREY, ms=9)
         right.plot(np.array(p.new_interval) / p.mean, [row - 0.2] * 2, "-", color=ORANGE, lw=1.2)
         right.plot(np.array(p.mean_interval) / p.mean, [row + 0.2] * 2, "-", color=BLUE, lw=2.5)

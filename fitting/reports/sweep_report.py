@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitting.fits import models
+from fitting.fits.families import models
 from fitting.fits.honesty import edges, total_error
 from fitting.fits.posterior import Posterior
 from fitting.fits.viscoelastic import Fit, Kind, largest_shift
 from fitting.methods.estimate import Estimate
-from fitting.methods.generalised_maxwell import Maxwell, moduli, weighed
+from fitting.methods.generalised_maxwell import moduli, weighed
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.rheometer import Sweep
 from fitting.reports import posterior_report
@@ -123,6 +123,20 @@ def own_numbers(p: Estimate | None, kind: Kind) -> Content:
     return {"parameters": {n: {"value": v, "standard_error": e, "unit": unit} for n, v, e, unit in rows}}
 
 
+def spectrum_rows(details: Content) -> list[str]:
+    """What is told of a spectrum; nothing of other models."""
+    found = details.get("spectrum")
+    if not found:
+        return []
+    times = found["relaxation_times"]
+    return [
+        f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,",
+        f"on a grid of {found['times_per_decade']} times a decade;",
+        f"the data carry {found['decades_carried']:.2g} decades of them,",
+        f"{found['effective_parameters']:.2g} parameters in effect",
+    ]
+
+
 def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
     """The same for a terminal, and how near the Prony modes come; those in `marked` have a star."""
     rows = []
@@ -130,13 +144,7 @@ def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = 
         if not name.startswith("strengths["):
             star = " *" if name in marked else ""
             rows.append(f"{name:20s} {value:9.4g} ± {error:.2g} {'' if unit == '1' else unit}{star}".rstrip())
-    found = details.get("spectrum")
-    if found:
-        times = found["relaxation_times"]
-        rows.append(f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,")
-        rows.append(f"on a grid of {found['times_per_decade']} times a decade;")
-        rows.append(f"the data carry {found['decades_carried']:.2g} decades of them,")
-        rows.append(f"{found['effective_parameters']:.2g} parameters in effect")
+    rows += spectrum_rows(details)
     made = details["conversion"]
     apart = 100 * made["largest_relative_error"]
     return [*rows, f"as {made['modes']} Prony modes (largest", f"difference {apart:.2g} %): see fit.json"]
@@ -213,8 +221,17 @@ def figure(sweep: Sweep, fits: list[Fit]) -> "Figure":
     plural = "s" if fit.modes > 1 else ""
     mean = 100 * fit.relative_errors(sweep).mean()
     model = "" if fit.parameters is None else f"{fit.kind.name}, "
-    fig.suptitle(f"{fit.method}, {model}{fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}", fontsize=10)
+    title = f"{fit.method}, {model}{fit.modes} mode{plural}: mean error {mean:.2g} %, {seconds}"
+    fig.suptitle(title + _nearest_of_all(fits), fontsize=10)
     return fig
+
+
+def _nearest_of_all(fits: list[Fit]) -> str:
+    """A second line of the title: how near the best linear material of any spectrum comes to the data."""
+    misfit = fits[0].details.get("consistency", {}).get("kramers_kronig_misfit")
+    if misfit is None:
+        return ""
+    return f"\nno spectrum of any shape comes closer than {100 * misfit:.2g} % (root mean square of |G*|)"
 
 
 def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
@@ -222,7 +239,7 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     fit, closed = fits[-1], fits[0]
     f = sweep.angular_frequency / (2 * np.pi)
     fine = np.geomspace(f[0], f[-1], 400)
-    lines = [np.asarray(v) for v in moduli(_as_measured(closed), 2 * np.pi * fine)]
+    lines = _moduli_as_measured(closed, 2 * np.pi * fine)
     rows = (
         ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
         ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
@@ -253,13 +270,19 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
 
 
-def _as_measured(closed: Fit) -> Maxwell:
-    """Modes as the instrument shows them: a compression makes them differ from those of the sample."""
+def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """G' and G'' as the instrument shows them: a compression makes them differ from those of the sample."""
     found = closed.details.get("precompression")
-    if found is None:
-        return closed.model
-    factors = found["smooth_factor_of_relaxing_moduli"], found["smooth_factor_of_equilibrium_modulus"]
-    return weighed(closed.model, *factors)
+    factors = (1.0, 1.0)
+    if found is not None:
+        factors = found["smooth_factor_of_relaxing_moduli"], found["smooth_factor_of_equilibrium_modulus"]
+    if found is None or closed.kind.moduli is None or closed.parameters is None:
+        storage, loss = moduli(weighed(closed.model, *factors), omega)
+        return np.asarray(storage), np.asarray(loss)
+    solid = closed.kind.names[0] == "equilibrium_modulus"
+    stands = closed.parameters.values[0] if solid else 0.0
+    G = (np.asarray(closed.kind.moduli(closed.solution.u, omega)) - stands) * factors[0] + stands * factors[1]
+    return G.real, G.imag
 
 
 def _legend_above(axes: Any, columns: int) -> None:

@@ -11,7 +11,7 @@ from fitting.fits.together import Share, Together
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
-from fitting.reports.sweep_report import numbers, own_numbers
+from fitting.reports.sweep_report import numbers, own_numbers, spectrum_rows
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
@@ -59,7 +59,7 @@ def write(out: Path, found: Together) -> Content:
             "warnings": list(found.warnings),
             "run_time_s": found.run_time,
             "compile_time_s": found.compile_time,
-            "details": {"tried": found.tried},
+            "details": {"tried": found.tried, **(found.details or {})},
             **own_numbers(found.parameters, found.kind),
             "versions": versions(),
         }
@@ -124,10 +124,6 @@ def table(found: Together) -> str:
     u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
-    rows.append(
-        f"{'':{32 if own is None else 26 + max(len(name) + 1 for name in own.names)}s}"
-        + "".join(f"{h:>12s}" for h in heads)
-    )
     units = ["Pa", *[""] * n, *["s"] * n]
     labels = ["G0", *(f"g{k + 1}" for k in range(n)), *(f"tau{k + 1}" for k in range(n))]
     if own is not None:
@@ -135,11 +131,16 @@ def table(found: Together) -> str:
     wide = max(6, *(len(label) + 1 for label in labels))
     rows.append(" " * (wide + 26) + "".join(f"{h:>12s}" for h in heads))
     for j, (label, unit) in enumerate(zip(labels, units, strict=True)):
+        if label.startswith("strengths["):
+            continue
         without = "".join(f"{_error(s.errors_without[j]):>12s}" for s in found.shares)
         value = f"{u.values[j]:11.5g} ± {_error(u.standard_errors[j]):8s} {unit}"
         rows.append(f"{label:{wide}s}{value:26s}{without}".rstrip())
     if found.kind.name == "prony":
         rows.append(f"G_inf {_equilibrium(found):11.5g} ± {_error(equilibrium_error(u))} Pa")
+    if found.kind.effective is not None:
+        rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that stand for it")
+    rows += spectrum_rows(found.details or {})
     for k, s in enumerate(found.shares, 1):
         rows.append(f"{k}: misfit {100 * s.noise:.2g} %, by itself {100 * s.alone:.2g} %")
     for row in found.tried if len(found.tried) > 1 else []:

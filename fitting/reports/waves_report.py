@@ -105,7 +105,7 @@ def _springpots(sweeps: dict[str, Path]) -> Content | None:
     """The springpot model of lowest criterion of each sweep, with its numbers; None where there are none."""
     if not sweeps:
         return None
-    from fitting.fits import models
+    from fitting.fits.families import models
     from fitting.readers import rheometer
 
     found = {}

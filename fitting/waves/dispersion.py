@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.text_tables import split_line, text_of, to_number
+from fitting.readers.tables.text_tables import split_line, text_of, to_number
 from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
 from liverjax.core.errors import InputError
@@ -130,7 +130,7 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
             continue
         _, cells = split_line(line, delimiter)
         values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
-        if any(v is None for v in values):
+        if not all(v is not None and np.isfinite(v) for v in values):
             raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is no number; mend it")
         rows.append(values)
     table = np.array(rows, float).reshape(-1, len(found))

@@ -4,12 +4,14 @@ All are judged by the information criterion that chooses the number of modes. Ea
 simulation, with the error of that conversion over the band.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import viscoelastic
+from fitting.fits.families.choice import contains, label_of, preferred
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.estimate import Estimate
@@ -48,13 +50,20 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
         return model.values(springpots.full(model, u), reference)
 
     made = _conversion(sweep, lambda omega: at(found.u, omega), model.solid)
-    kind = Kind(model.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), model.names, model.units, values)
+    kind = Kind(
+        name=model.name,
+        maxwell=lambda u: as_prony_modes.modes(made, at(u, made.omega)),
+        names=model.names,
+        units=model.units,
+        values=values,
+        moduli=at,
+    )
     return _finished(viscoelastic.fitted(sweep, found, kind, *seconds, {}), made)
 
 
-def spectrum_fit(sweep: Sweep) -> Fit:
-    """A smooth spectrum that is not negative, at 2 or 3 times a decade."""
-    found = relaxation_spectrum.fit(sweep)
+def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = None) -> Fit:
+    """A smooth spectrum that is not negative, at 2 or 3 times a decade; `found` where it is there already."""
+    found = found or relaxation_spectrum.fit(sweep)
     solid = int(found.equilibrium > 0)
     strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]
     prior = found.prior[:, 1 - solid :]
@@ -76,7 +85,7 @@ def spectrum_fit(sweep: Sweep) -> Fit:
     u = jnp.log(jnp.asarray(strengths))
     made = _conversion(sweep, lambda omega: complex_moduli(columns(omega), u), bool(solid))
     matched = columns(made.omega)
-    names = ("equilibrium_modulus",) * solid + tuple(f"strengths[{k}]" for k in range(len(found.times)))
+    names = ("equilibrium_modulus",) * solid + tuple(f"strengths[{k}]" for k in found.places)
     kind = Kind(
         name="spectrum",
         maxwell=lambda u: as_prony_modes.modes(made, complex_moduli(matched, u)),
@@ -85,6 +94,7 @@ def spectrum_fit(sweep: Sweep) -> Fit:
         values=jnp.exp,
         prior=held,
         effective=found.effective,
+        moduli=lambda u, omega: complex_moduli(columns(omega), u),
     )
     r, J = with_jacobian(residuals)(u)
     cosine = jnp.max(jnp.abs(J.T @ r) / jnp.maximum(jnp.linalg.norm(J, axis=0) * jnp.linalg.norm(r), 1e-300))
@@ -166,15 +176,8 @@ def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
     return chosen
 
 
-def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
-    """The model of lowest criterion among those whose numbers the data determine.
-
-    Args:
-        sweep: data.
-        model: one of `MODELS`, but "prony".
-        prony: the modes chosen, which "auto" compares with.
-        dense: as of `viscoelastic.closed_form`.
-    """
+def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> list[Fit]:
+    """The fits that a choice is made from; arguments as of `choose`."""
     tried: list[Fit] = []
     if model in ("fractional", "auto"):
         tried += fractional(sweep)
@@ -184,8 +187,26 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
         tried.append(prony)
         if any("(a fluid)" in w for w in prony.warnings):
             tried.append(fluid(sweep, dense))
-    able = [fit for fit in tried if identifiable(fit, sweep)] or tried
-    chosen = min(able, key=information_criterion)
+    return tried
+
+
+def best_of_models(tried: Sequence[Fit], sweep: Sweep) -> tuple[Fit, list[Fit]]:
+    """The model to choose, and those whose numbers the data determine (all, if none)."""
+    able = [fit for fit in tried if identifiable(fit, sweep)] or list(tried)
+    return able[preferred([label_of(f) for f in able], [information_criterion(f) for f in able])], able
+
+
+def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
+    """The model of lowest criterion (`preferred`) among those whose numbers the data determine.
+
+    Args:
+        sweep: data.
+        model: one of `MODELS`, but "prony".
+        prony: the modes chosen, which "auto" compares with.
+        dense: as of `viscoelastic.closed_form`.
+    """
+    tried = every_model(sweep, model, prony, dense)
+    chosen, able = best_of_models(tried, sweep)
     return chosen._replace(
         warnings=(*chosen.warnings, *_rival_models(chosen, tried, able)),
         run_time=sum(fit.run_time for fit in tried),
@@ -221,7 +242,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
             f"{best.kind.name} would follow the data more closely (criterion {apart:.2g} lower), but the data leave "
             "some of its numbers free"
         )
-    others = [f for f in able if f is not chosen]
+    others = [f for f in able if f is not chosen and not contains(label_of(f), label_of(chosen))]
     if not others:
         return out
     second = min(others, key=information_criterion)

@@ -6,10 +6,20 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers import raw_torque
-from fitting.readers.sweep_columns import NEEDED, Column, condition_columns, header_columns
-from fitting.readers.text_tables import find_delimiter, split_cells, to_number
+from fitting.readers.tables.sweep_columns import (
+    NEEDED,
+    Column,
+    condition_columns,
+    first_missing,
+    header_columns,
+    is_complete,
+)
+from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, means_nothing, split_cells, to_number
 from fitting.readers.units import MODULUS_UNITS
 from liverjax.core.errors import InputError
+
+#: What begins a line that is no data.
+COMMENTS = ("#", "%")
 
 
 class Table(NamedTuple):
@@ -60,7 +70,7 @@ def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int
 def tables_of(path: str, lines: list[str]) -> list[Table]:
     """Every table that holds numbers; `InputError` saying what is missing where there is none."""
     for uncomment in (False, True):  # np.savetxt writes its header as a comment
-        tables, headers = _search(path, [line.lstrip("# ") for line in lines] if uncomment else lines)
+        tables, headers = _search(path, [line.lstrip("#% ") for line in lines] if uncomment else lines)
         if tables:
             return tables
         if headers:
@@ -69,10 +79,8 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
         raise InputError(
             f"{path}: line {headers[0]}: there are no numbers below the header; give two frequencies or more"
         )
-    named = [
-        {c.quantity for c in header_columns(split_cells(line, find_delimiter(line)))} & set(NEEDED) for line in lines
-    ]
-    best = max(range(len(lines)), key=lambda k: len(named[k]))
+    named = [header_columns(split_cells(line, find_delimiter(line))) for line in lines]
+    best = max(range(len(lines)), key=lambda k: len({c.quantity for c in named[k]}))
     shown = lines[best].strip()[:80]
     if not named[best]:
         shown = next((s.strip() for s in lines if s.strip() and not s.lstrip().startswith("#")), "only comments")[:80]
@@ -80,8 +88,8 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
             f"{path}: no header names frequency_Hz, storage_modulus_Pa and loss_modulus_Pa (the first line is "
             f"{shown!r}); add that header, separated by commas, or export the sweep as CSV"
         )
-    missing = next(q for q in NEEDED if q not in named[best])
-    raise InputError(f"{path}: no column for {missing} in the header {shown!r}; add {NEEDED[missing]}")
+    lacks = first_missing(named[best])
+    raise InputError(f"{path}: no column for {lacks} in the header {shown!r}; add {NEEDED[lacks]}")
 
 
 def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
@@ -90,12 +98,12 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
     while k < len(lines):
         line = lines[k]
         k += 1
-        if not line.strip() or line.lstrip().startswith("#"):
+        if not line.strip() or line.lstrip().startswith(COMMENTS):
             continue
         delimiter = find_delimiter(line)
         cells = split_cells(line, delimiter)
         columns = header_columns(cells)
-        if not set(NEEDED) <= {c.quantity for c in columns}:
+        if not is_complete(columns):
             continue
         headers.append(k)
         name = _title(lines[free : k - 1])
@@ -138,7 +146,7 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
     for ahead in range(k, min(k + 2, len(lines))):
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
-        moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss")]
+        moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss", "complex")]
         if any(moduli):
             return [c._replace(unit=units.get(c.place) or c.unit) for c in columns], ahead + 1
         if any(re.match(r"[-+]?\d", cell) for cell in cells):
@@ -147,37 +155,59 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
 
 
 def _rows_below(path, columns, lines, k, delimiter, width):
-    """Rows of numbers below a header, their line numbers, and where to go on."""
-    needed = [c for c in columns if c.quantity in NEEDED]
-    rows, numbers = [], []
+    """Rows of numbers below a header, their line numbers, and where to go on. An empty cell is NaN."""
+    needed = [c for c in columns if not c.quantity.endswith("_sd")]
+    kept, numbers = [], []
     while k < len(lines):
         line = lines[k]
-        if line.lstrip().startswith("#") or not line.strip(f"{delimiter} \t"):
+        if line.lstrip().startswith(COMMENTS) or not line.strip(f"{delimiter} \t-=+:"):
             k += 1
-            if rows and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
+            if kept and not line.strip() and any(later.startswith("[") or _complete(later) for later in lines[k:]):
                 break  # the next table of an instrument's export
             continue
         cells = split_cells(line, delimiter)
-        values = [to_number(cells[c.place], delimiter) if c.place < len(cells) else None for c in columns]
-        here = [cells[c.place] for c in columns if c in needed and c.place < len(cells)]
-        blank = not any(re.match(r"[-+]?\.?\d|nan|inf", cell.lower()) for cell in here)
-        if blank and (not rows or line.startswith("[") or delimiter == "\t"):
+        words = _is_words(cells, needed)
+        if words and (
+            not kept or line.startswith("[") or delimiter == "\t" or not _goes_on(lines, k, delimiter, needed)
+        ):
             break  # a title taken for a header, or the end of this table
         k += 1
-        for column, value in zip(columns, values, strict=True):
-            if value is None:
-                shown = repr(cells[column.place]) if column.place < len(cells) else "missing"
-                raise InputError(
-                    f"{path}: line {k}: {column.name} = {shown} is not a number; correct or remove the line"
-                )
         if len([c for c in cells if c]) > width:
             raise InputError(
                 f"{path}: line {k}: {len(cells)} cells under {width} headings; write decimals with a point"
             )
-        rows.append(values)
+        kept.append([cells[c.place] if c.place < len(cells) else "" for c in columns])
         numbers.append(k)
-    return rows, numbers, k
+    return _numbers_of_cells(path, columns, kept, numbers, delimiter), numbers, k
+
+
+def _is_words(cells: list[str], needed: list[Column]) -> bool:
+    return means_nothing(cells[c.place] for c in needed if c.place < len(cells))
+
+
+def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> bool:
+    """Whether numbers of the same table follow line k, which is words."""
+    for line in lines[k:]:
+        if _complete(line):
+            return False
+        if not _is_words(split_cells(line, delimiter), needed):
+            return True
+    return False
+
+
+def _numbers_of_cells(path, columns, kept, numbers, delimiter):
+    """The cells of all rows as numbers."""
+    sign = decimal_sign(cell for row in kept for cell in row)
+    rows = []
+    for row, number in zip(kept, numbers, strict=True):
+        rows.append([to_number(cell, delimiter, sign) for cell in row])
+        for column, cell, value in zip(columns, row, rows[-1], strict=True):
+            if value is None:
+                raise InputError(
+                    f"{path}: line {number}: {column.name} = {cell!r} is not a number; correct or remove the line"
+                )
+    return rows
 
 
 def _complete(line: str) -> bool:
-    return set(NEEDED) <= {c.quantity for c in header_columns(split_cells(line, find_delimiter(line)))}
+    return is_complete(header_columns(split_cells(line, find_delimiter(line))))

@@ -2,7 +2,9 @@
 
 import codecs
 import csv
+import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from fitting.readers import trios_json, workbook
@@ -49,8 +51,9 @@ def _decoded(path: Path, data: bytes) -> str:
 
 def find_delimiter(line: str) -> str:
     """Delimiter of the cells of a line: the most frequent of tab, semicolon, comma and bar, else spaces."""
-    best = max("\t;,|", key=line.count)
-    return best if best in line else ("  " if "  " in line.strip() else " ")
+    plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| part no cells
+    best = max("\t;,|", key=plain.count)
+    return best if best in plain else ("  " if "  " in line.strip() else " ")
 
 
 def split_line(line: str, delimiter: str | None = None) -> tuple[str, list[str]]:
@@ -66,12 +69,51 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-def to_number(text: str, delimiter: str) -> float | None:
-    """A number, with a decimal comma where commas do not separate cells; None for any other text."""
-    text = text.strip().strip('"')
-    if delimiter != "," and "," in text and "." not in text:
+#: What stands in a cell without a measurement.
+EMPTY = {"", "-", "--", "---", "–", "—", "*", "n/a", "#n/a", "na", "n.a.", "none", "null", "nan", "?"}
+#: Spaces and apostrophes that part the thousands of a number, and numbers by what parts their thousands.
+_GROUPED = re.compile(r"(?<=\d)['’ \u00a0\u2009\u202f](?=\d{3}(\D|$))")
+_THOUSANDS = {sign: re.compile(rf"[-+]?[1-9]\d{{0,2}}(\{sign}\d{{3}})+(\{other}\d*)?") for sign, other in (",.", ".,")}
+
+
+def decimal_sign(cells: Iterable[str]) -> str | None:
+    """The decimal sign of a table, "." or ",", as far as its cells tell; the other sign then parts thousands."""
+    found = set()
+    for cell in cells:
+        text = _GROUPED.sub("", cell.strip().strip('"').lower())
+        for sign, other in (",.", ".,"):
+            whole, *rest = re.split(r"e[-+]?\d", text)[:1][0].split(sign)
+            if len(rest) != 1 or not re.fullmatch(r"\d*", rest[0]) or not re.fullmatch(r"[-+]?[\d,.]*", whole):
+                continue
+            if "e" in text or other in whole or len(rest[0]) != 3 or not re.fullmatch(r"[-+]?[1-9]\d{0,2}", whole):
+                found.add(sign)
+    return found.pop() if len(found) == 1 else None
+
+
+def to_number(text: str, delimiter: str, sign: str | None = None) -> float | None:
+    """A number, with a decimal comma or with thousands apart; NaN for an empty cell; None for any other text.
+
+    Args:
+        text: a cell.
+        delimiter: of the cells.
+        sign: `decimal_sign` of the table; where it is not known, one comma or point is that of decimals.
+    """
+    text = text.strip().strip('"').strip()
+    if text.lower() in EMPTY:
+        return math.nan
+    text = _GROUPED.sub("", text)
+    for thousands, decimals in (",.", ".,"):
+        certain = decimals in text or text.count(thousands) > 1
+        if sign != thousands and (sign == decimals or certain) and _THOUSANDS[thousands].fullmatch(text):
+            text = text.replace(thousands, "").replace(decimals, ".")
+    if "," in text and "." not in text and text.count(",") == 1:
         text = text.replace(",", ".")
     try:
         return float(text)
     except ValueError:
         return None
+
+
+def means_nothing(cells: Iterable[str]) -> bool:
+    """Whether no cell is a number or empty: a line of words."""
+    return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)

@@ -1,4 +1,4 @@
-"""Springpot models of tests in time, and of several tests together; the choice between them and Prony modes.
+"""Springpot models of tests in time, and of several tests together; the choice between all models.
 
 A springpot model answers through the modes of its own relaxation spectrum (`springpots.as_modes`), so drive, ramp and
 creep are computed as for Prony modes. Its own few numbers are what is fitted and reported.
@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.fits import models, time_tests, together, viscoelastic
+from fitting.fits import time_tests, together, viscoelastic
+from fitting.fits.families import choice, models, spectrum_of_tests
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
@@ -41,8 +42,7 @@ class Spans(NamedTuple):
 
 def spans_of(tests: Sequence[Measured]) -> Spans:
     """The spans of all times that the tests resolve."""
-    ends = np.array([t.resolved for t in tests])
-    low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
+    low, high = together.resolved_by(tests)
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
 
@@ -57,6 +57,18 @@ def _residuals_of_tests(kinds: tuple[str, ...]) -> Callable[..., jax.Array]:
         return jnp.concatenate(rows)
 
     return residuals
+
+
+def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
+    """The model's own numbers u -> residuals (m,) of a relaxation or creep test."""
+    (case,) = (c for c in FRACTIONAL if c.name == name)
+    spans, residuals = spans_of([test]), _residuals_of_tests((test.kind,))
+    data = [together.reported_numbers(test)]
+
+    def of(u):
+        return residuals(springpots.full(case, u), case.switches, spans.times, spans.reference, data)
+
+    return of
 
 
 @lru_cache(maxsize=16)
@@ -137,7 +149,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans) -> _Springpot
 def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
     """Whether the fit converged and the data determine every number."""
     if fit.parameters is not None:
-        return fit.converged and bool(np.all(models.determined(fit.parameters)))
+        return fit.converged and (fit.kind.effective is not None or bool(np.all(models.determined(fit.parameters))))
     return fit.converged and not uncertainty.superfluous(data, fit.uncertainty)
 
 
@@ -166,19 +178,26 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
 
     Args:
         test: data.
-        model: "prony", "fractional" or "auto".
+        model: one of `models.MODELS`.
         modes: of Prony modes.
     """
     prony = time_tests.fit(test, modes)
     if model == "prony":
         return prony
-    tried = fractional_in_time(test, prony.model) + ([prony] if model == "auto" else [])
+    tried = [prony] if model == "auto" else []
+    tried += fractional_in_time(test, prony.model) if model in ("fractional", "auto") else []
+    tried += [spectrum_of_tests.spectrum_in_time(test, prony.model)] if model in ("spectrum", "auto") else []
     fits = [f for f in tried if able(f, test)] or tried
-    best = min(fits, key=time_tests.criterion)
+    best = _preferred_of(fits, time_tests.criterion)
     rows = _compared_models(tried, time_tests.criterion, test)
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     return best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds)
+
+
+def _preferred_of(fits: Sequence, criterion: Callable) -> TimeFit | Together:
+    """The fit to choose, by `models.preferred`."""
+    return fits[choice.preferred([choice.label_of(f) for f in fits], list(map(criterion, fits)))]
 
 
 def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Band) -> list[Content]:
@@ -206,10 +225,18 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
     mean = float(fit.relative_errors.mean())
     if mean > 0.05:
         out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try another --model")
-    free = [n for n, ok in zip(fit.kind.names, models.determined(fit.parameters), strict=True) if not ok]
-    if free:
-        out.append(f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model")
+    out += _left_free(fit)
     return out + time_tests.structured_misfit(fit)
+
+
+def _left_free(fit: TimeFit | Together) -> list[str]:
+    """A sentence on numbers that the data leave free. Those of a spectrum are held by its prior."""
+    if fit.parameters is None or fit.kind.effective is not None:
+        return []
+    free = [n for n, ok in zip(fit.kind.names, models.determined(fit.parameters), strict=True) if not ok]
+    if not free:
+        return []
+    return [f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model"]
 
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
@@ -244,23 +271,27 @@ def choose_together(
     prony = together.fit(tests, modes, progress)
     if model == "prony":
         return prony
-    progress("springpots")
     band = together.ResolvedBand(spans_of(tests)[:2])
-    tried = fractional_together(tests, prony.model) + ([prony] if model == "auto" else [])
+    tried = [prony] if model == "auto" else []
+    if model in ("fractional", "auto"):
+        progress("springpots")
+        tried += fractional_together(tests, prony.model)
+    if model in ("spectrum", "auto"):
+        progress("spectrum")
+        noise = np.array([s.noise for s in prony.shares])
+        tried.append(spectrum_of_tests.spectrum_together(tests, prony.model, noise))
     fits = [f for f in tried if able(f, band)] or tried
-    best = min(fits, key=together.criterion_of_all)
+    best = _preferred_of(fits, together.criterion_of_all)
     rows = _compared_models(tried, together.criterion_of_all, band)
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     if best is prony:
         return best._replace(tried=rows, **seconds)
-    progress("what each test adds")
-    best = best._replace(shares=_shares_of_springpots(best))
+    if best.kind.effective is None:
+        progress("what each test adds")
+        best = best._replace(shares=_shares_of_springpots(best))
     out = [*best.warnings] if best.converged else ["the fit did not converge: take another --model", *best.warnings]
     out += together.disagreements(best.shares)
-    assert best.parameters is not None
-    free = [n for n, ok in zip(best.kind.names, models.determined(best.parameters), strict=True) if not ok]
-    if free:
-        out.append(f"the data leave {' and '.join(free)} of the model {best.kind.name} free: take a simpler model")
+    out += _left_free(best)
     return best._replace(tried=rows, warnings=tuple(out), **seconds)
 
 

@@ -1,0 +1,1 @@
+"""Families of models beside free Prony modes, and the choice between them."""

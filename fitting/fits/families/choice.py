@@ -1,0 +1,69 @@
+"""The choice between models of several families by their information criteria.
+
+Where one model contains another, the general one is at least as close to the data whatever they are. It is chosen only
+where the criterion is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90): beyond the band of the
+data general models predict worse where nothing asks for them.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from fitting.fits.viscoelastic import FLUID, Kind
+
+#: What a model becomes for some values of its numbers. A spectrum can be any other model, `prony` with as many modes
+#: a fluid, and a Zener model with the exponent 1 a single mode.
+SPECIAL_CASES = {
+    "fractional_kelvin_voigt": ("springpot",),
+    "fractional_maxwell": ("springpot",),
+    "fractional_parallel": ("springpot", "fractional_kelvin_voigt"),
+    "fractional_zener": ("springpot", "fractional_kelvin_voigt"),
+}
+#: Difference of the criterion that is asked of a model against its special case: strong evidence.
+GENERAL = 6.0
+
+
+class Label(NamedTuple):
+    """A model with its number of modes, where it is made of modes."""
+
+    name: str
+    modes: int = 0
+
+
+def contains(general: Label, special: Label) -> bool:
+    """Whether the first model becomes the second for some of its numbers."""
+    if general.name == special.name:
+        return False
+    if general.name == "spectrum" or special.name in SPECIAL_CASES.get(general.name, ()):
+        return True
+    if general.name == "prony":
+        return special.name == FLUID.name and special.modes <= general.modes
+    return general.name == "fractional_zener" and special == Label("prony", 1)
+
+
+def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
+    """Place of the model to choose: the lowest criterion of those that no special case of theirs comes near."""
+    beaten = {
+        j
+        for j, general in enumerate(labels)
+        for k, special in enumerate(labels)
+        if contains(general, special) and criteria[j] > criteria[k] - GENERAL
+    }
+    left = [k for k in range(len(labels)) if k not in beaten] or list(range(len(labels)))
+    return min(left, key=lambda k: criteria[k])
+
+
+class OfAKind(Protocol):
+    """A fit of any data."""
+
+    @property
+    def kind(self) -> Kind:
+        """What its numbers mean."""
+
+    @property
+    def modes(self) -> int:
+        """Number of Prony modes."""
+
+
+def label_of(fit: OfAKind) -> Label:
+    """The label of a fit; the number of modes is told of Prony modes alone."""
+    return Label(fit.kind.name, fit.modes if fit.kind.values is None else 0)

@@ -1,0 +1,213 @@
+"""A smooth spectrum on a fixed grid of relaxation times, from a test in time or from several tests together.
+
+Stress is linear in the strengths, so sweeps and relaxation are solved at once (`relaxation_spectrum`). Strain of a
+driven stress and shear waves are not linear: there the same problem is solved for the tangent, again and again.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits import time_tests, together
+from fitting.fits.time_tests import TimeFit
+from fitting.fits.together import Measured, Together
+from fitting.fits.viscoelastic import Kind
+from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, uncertainty
+from fitting.methods.estimate import Estimate, estimated
+from fitting.methods.generalised_maxwell import Maxwell, non_negative
+from fitting.methods.least_squares import Solution
+from fitting.methods.relaxation_spectrum import GridOfTimes, GridSpectrum
+from fitting.readers.time_tests import TimeTest
+from liverjax.core.struct import Content
+
+#: Weights of the second differences that are tried, heavy ones first, and iterations of one.
+WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
+#: Gain of the cost, relative, below which a minimum is found; strength that stands for none, in the unit of the grid.
+STILL, NONE = 1e-9, 1e-12
+
+
+class SpectrumFit(NamedTuple):
+    """A spectrum with what the reports of tests ask for."""
+
+    kind: Kind
+    model: Maxwell  # few Prony modes that stand for it
+    solution: Solution
+    spread: Estimate  # of these modes
+    own: Estimate  # equilibrium modulus and strengths
+    details: Content
+    sentences: tuple[str, ...]
+
+
+@lru_cache(maxsize=8)
+def _rows_and_slopes(kinds: tuple[str, ...]) -> Callable:
+    """A compiled (x, times, unit, data of every test) -> residuals (m,) and their derivative by x."""
+
+    def residuals(x, times, unit, data):
+        strengths = unit * (x + NONE)
+        total = jnp.sum(strengths)
+        model, rows = Maxwell(total, strengths[1:] / total, times), []
+        for kind, (at, measured, scales) in zip(kinds, data, strict=True):
+            rows.append((time_tests.response_in_time(kind, model, *at) - measured) / scales)
+        out = jnp.concatenate(rows)
+        return out, out
+
+    @jax.jit
+    def both(x, times, unit, data):
+        J, r = jax.jacfwd(residuals, has_aux=True)(x, times, unit, data)
+        return r, J
+
+    return both
+
+
+class _Minimum(NamedTuple):
+    x: np.ndarray
+    r: np.ndarray  # of the data
+    J: np.ndarray
+    converged: bool
+
+
+def _minimum(function: Callable, data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
+    """Least squares with x >= 0 and the smoothness of the grid: tangents from x on, each step halved while it fails."""
+    L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
+
+    def at(x):
+        r, J = (np.asarray(v) for v in function(x, grid.times, grid.unit, data))
+        cost = r @ r + np.sum((L @ x) ** 2)
+        return r, J, cost if np.isfinite(cost) and np.all(np.isfinite(J)) else np.inf
+
+    r, J, cost = at(x)
+    for _ in range(MOST_TANGENTS):
+        target, _ = non_negative(np.vstack([J, L]), np.concatenate([J @ x - r, np.zeros(len(L))]))
+        expected = np.sum((r + J @ (target - x)) ** 2) + np.sum((L @ target) ** 2)
+        if cost - expected <= STILL * cost:
+            return _Minimum(x, r, J, True)
+        length, new = 1.0, None
+        while length > 1e-4 and not (new and new[2] < cost):
+            trial = x + length * (target - x)
+            new, length = at(trial), 0.5 * length
+        if new is None or not new[2] < cost:
+            return _Minimum(x, r, J, True)  # no step gains: at the minimum, to roundoff
+        still = cost - new[2] <= STILL * cost
+        x, (r, J, cost) = trial, new
+        if still:
+            return _Minimum(x, r, J, True)
+    return _Minimum(x, r, J, False)
+
+
+def spectrum_of(
+    tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
+) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
+    """The spectrum of lowest criterion over grids and weights.
+
+    Args:
+        tests: one or more.
+        near: Prony modes of about these moduli; strengths are measured in them.
+        noise: relative noise of each test.
+    """
+    low, high = together.resolved_by(tests)
+    function, data = _rows_and_slopes(tuple(map(together.name_of, tests))), _weighed_parts(tests, noise)
+    best = None
+    for per_decade in relaxation_spectrum.GRIDS:
+        times = relaxation_spectrum.grid_of_times(low, high, per_decade)
+        size = np.hypot(*generalised_maxwell.moduli(near, 1 / times))
+        unit = np.concatenate([size[:1], np.maximum(size, 1e-6 * size.max())])
+        x = np.concatenate([[0.5], np.full(len(times), 1 / per_decade)])
+        for weight in WEIGHTS / np.exp(np.mean(np.log(noise))) ** 2:
+            grid = GridOfTimes(times, unit, per_decade, float(weight))
+            found = _minimum(function, data, grid, x)
+            x, told = found.x, relaxation_spectrum.described(found.x, found.J, found.r, grid)
+            if best is None or told.criterion < best[0].criterion:
+                best = told, grid, found
+    assert best is not None
+    return best
+
+
+def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
+    parts = map(together.reported_numbers, tests)
+    return [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
+
+
+def _as_a_fit(tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum) -> SpectrumFit:
+    low, high = together.resolved_by(tests)
+    kept = found.x[1:] > 1e-10 * found.x.max()
+    solid = told.equilibrium > 0
+    free = np.concatenate([[solid], kept])
+    strengths = np.concatenate([[told.equilibrium], told.strengths])[1 - int(solid) :]
+    slopes = (found.J / grid.unit)[:, free] * strengths  # by the logarithms
+    prior = told.prior[:, 1 - int(solid) :] * strengths
+
+    def moduli(omega, u):
+        storage, loss = jnp.split(
+            jnp.asarray(relaxation_spectrum.mode_columns(omega, told.times)[:, 1 - int(solid) :]) @ jnp.exp(u), 2
+        )
+        return storage + 1j * loss
+
+    u = jnp.log(jnp.asarray(strengths))
+    made = as_prony_modes.convert(lambda omega: np.asarray(moduli(omega, u)), 1 / high, 1 / low, bool(solid))
+    names = ("equilibrium_modulus",) * int(solid) + tuple(f"strengths[{k}]" for k in told.places)
+    kind = Kind(
+        name="spectrum",
+        maxwell=lambda u: as_prony_modes.modes(made, moduli(made.omega, u)),
+        names=names,
+        units=("Pa",) * len(names),
+        values=jnp.exp,
+        effective=told.effective,
+    )
+    r = np.concatenate([found.r, prior @ np.ones(len(strengths))])
+    J = np.concatenate([slopes, prior])
+    solution = Solution(u, r, J, 0.5 * found.r @ found.r, jnp.array(1), jnp.array(0.0), jnp.array(found.converged))
+    spread = uncertainty.estimate(solution, False, kind.maxwell, (len(found.r), told.effective))
+    own = estimated(names, jnp.exp, solution, len(found.r), False, told.effective)
+    sentences = []
+    if made.error > as_prony_modes.ALLOWED:
+        sentences.append(f"{len(made.times)} Prony modes follow the spectrum to {100 * made.error:.2g} % only")
+    details: Content = {
+        "conversion": {"modes": len(spread.values) // 2, "largest_relative_error": made.error},
+        "spectrum": {
+            "relaxation_times": told.times.tolist(),
+            "times_per_decade": told.per_decade,
+            "smoothing": told.smoothing,
+            "effective_parameters": told.effective,
+            "decades_carried": told.decades,
+        },
+    }
+    model = Maxwell(*(np.asarray(v) for v in kind.maxwell(u)))
+    return SpectrumFit(kind, model, solution, spread, own, details, tuple(sentences))
+
+
+def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
+    """The spectrum of a relaxation or creep test; `near`: Prony modes of about the same moduli."""
+    told, grid, found = spectrum_of([test], near, np.ones(1))
+    fit = _as_a_fit([test], grid, found, told)
+    _, answer, scales = together.reported_numbers(test)
+    where = (test.time[time_tests.thinned(test)], answer, found.r * scales + answer, scales)
+    own = (fit.kind, fit.model, fit.solution, fit.spread, found.converged)
+    return TimeFit(*own, *where, fit.sentences, 0.0, 0.0, fit.details, fit.own)
+
+
+def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
+    """The spectrum of several tests, each with noise of its own; `near`, `noise` as of `spectrum_of`."""
+    parts = [together.reported_numbers(t) for t in tests]
+    for _ in range(2):
+        told, grid, found = spectrum_of(tests, near, noise)
+        used, noise = noise, together.noises(tests, parts, found.r, noise, told.effective)
+    fit = _as_a_fit(tests, grid, found, told)
+    data = _weighed_parts(tests, used)
+    shares, fitted = together.misfits(tests, parts, data, found.r, noise)
+    own = (tests, fit.kind, fit.model, fit.solution, fit.spread, found.converged)
+    first = Together(*own, shares, fitted, [], fit.sentences, 0.0, 0.0, fit.own, fit.details)
+    function = _rows_and_slopes(tuple(map(together.name_of, tests)))
+
+    def alone(k: int) -> float:
+        without = [(at, y, s if j == k else np.full(len(y), np.inf)) for j, (at, y, s) in enumerate(parts)]
+        quiet = [(at, y, s * noise[k]) for at, y, s in without]
+        return float(0.5 * noise[k] ** 2 * np.sum(_minimum(function, quiet, grid, found.x).r ** 2))
+
+    slope = np.diag(fit.own.values)
+    return first._replace(
+        shares=together.shares_by_rows(first, np.asarray(fit.solution.jacobian), slope, fit.own.values, alone)
+    )

@@ -1,0 +1,114 @@
+"""Storage and loss moduli from the columns that a file has: the moduli themselves, |G*|, the phase, tan(delta)."""
+
+import numpy as np
+
+from fitting.readers.tables.sweep_columns import Column, is_angular, is_tensile, pair_of
+from fitting.readers.tables.sweep_headings import known_unit
+from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, PER_SECOND, TANGENT_UNITS
+from liverjax.core.errors import InputError
+
+#: Units that a column may name, for a sentence.
+OFFERED = {"frequency": "Hz or rad_s", "phase": "deg or rad", "tangent": "1, or none"}
+NAMES = {"storage": "G'", "loss": "G''", "complex": "|G*|", "phase": "the phase", "tangent": "tan(delta)"}
+
+
+def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str]) -> np.ndarray:
+    """A column (n,) in rad/s, Pa, rad or 1; moduli of tension as they are.
+
+    Raises:
+        InputError: a unit that is not known, or that leaves the meaning open.
+    """
+    quantity, unit = column.quantity.removesuffix("_sd"), column.unit
+    if quantity == "tangent":
+        unit = unit or "1"
+    if unit is None:
+        unit = "Pa" if quantity not in ("frequency", "phase") else "rad/s" if is_angular(column) else "Hz"
+        if quantity == "phase":
+            if np.nanmax(written) <= 0.5 * np.pi:
+                raise InputError(
+                    f"{path}: column {column.name} may be in degrees or radians; name it phase_deg or phase_rad"
+                )
+            unit = "deg"
+        notes.append(f"column {column.name!r} states no unit; {unit} is taken")
+    if not known_unit(quantity, unit):
+        known = OFFERED.get(quantity, "Pa, kPa or MPa")
+        raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known; use {known}")
+    if quantity == "frequency":
+        return written * _of_frequency(path, column, unit)
+    return written * {"phase": ANGLE_UNITS, "tangent": TANGENT_UNITS}.get(quantity, MODULUS_UNITS)[unit]
+
+
+def _of_frequency(path: str, column: Column, unit: str) -> float:
+    if is_angular(column) and unit.lower() == "hz":
+        raise InputError(
+            f"{path}: column {column.name} is an angular frequency in Hz; "
+            "name it frequency_Hz or angular_frequency_rad_s"
+        )
+    if not is_angular(column) and unit.lower() in PER_SECOND:
+        raise InputError(
+            f"{path}: column {column.name} in {unit} may be in Hz or rad/s; "
+            "name it frequency_Hz or angular_frequency_rad_s"
+        )
+    return FREQUENCY_UNITS[unit.lower()]
+
+
+def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
+    """The fault of a value in SI, in the file's own words, and the remedy; None where there is none."""
+    if not np.isfinite(value):
+        if np.isnan(written):
+            return f"{column.name} is empty", "fill it in or remove the line"
+        problem, remedy = "is not finite", "remove the line"
+    elif value <= 0:
+        problem, remedy = "is not positive", "correct the sign or remove the line"
+    elif column.quantity == "phase" and value >= 0.5 * np.pi:
+        problem, remedy = "is no phase below 90 degrees", "check the unit, or remove the line"
+    elif not smallest < value < largest:
+        problem, remedy = "is beyond any measurement", "check the unit"
+    else:
+        return None
+    return f"{column.name} = {written:g} {problem}", remedy
+
+
+def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
+    """Divide moduli of tension or bending by 3, in place; a note says so."""
+    tensile = [q for q, (c, _) in columns.items() if q.split("_")[0] in MODULI and is_tensile(c)]
+    for q in tensile:
+        columns[q] = columns[q][0], columns[q][1] / 3
+    if not tensile:
+        return []
+    names = " and ".join(columns[q][0].name for q in tensile)
+    return [f"{names} are of tension or bending: G = E / 3 is taken, as of an incompressible material"]
+
+
+#: Quantities in pascals.
+MODULI = ("storage", "loss", "complex")
+
+
+def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
+    """Storage and loss moduli [Pa] (n,), and their deviations where the file has them, of SI columns.
+
+    Deviations of |G*|, phase or tan(delta) are carried over to first order, taken as independent.
+    """
+    pair = pair_of(values)
+    assert pair is not None
+    if pair == ("storage", "loss"):
+        return {q: v for q, v in values.items() if q.removesuffix("_sd") in pair}
+    size, angle = (values[q] for q in pair)
+    delta = np.arctan(angle) if pair[1] == "tangent" else angle
+    s, c = np.sin(delta), np.cos(delta)
+    notes.append(f"G' and G'' are computed from {NAMES[pair[0]]} and {NAMES[pair[1]]}")
+    # Each modulus is the measured one times a function of the angle; then its derivative by the angle.
+    by_angle = {
+        "complex": ((c, -s), (s, c)),
+        "storage": ((1 + 0 * c, 0 * c), (s / c, 1 / c**2)),
+        "loss": ((c / s, -1 / s**2), (1 + 0 * c, 0 * c)),
+    }[pair[0]]
+    out = {name: size * factor for name, (factor, _) in zip(("storage", "loss"), by_angle, strict=True)}
+    if all(f"{q}_sd" in values for q in pair):
+        of_size, of_angle = (values[f"{q}_sd"] for q in pair)
+        of_angle = of_angle * c**2 if pair[1] == "tangent" else of_angle
+        for name, (factor, slope) in zip(("storage", "loss"), by_angle, strict=True):
+            out[f"{name}_sd"] = np.hypot(factor * of_size, size * slope * of_angle)
+    elif any(f"{q}_sd" in values for q in pair):
+        notes.append("only one of the two has deviations: they are not used")
+    return out

@@ -1,0 +1,102 @@
+"""Columns of a frequency sweep: which of a file's headings are needed, and in which order."""
+
+import re
+from collections.abc import Collection
+from typing import NamedTuple
+
+from fitting.readers.tables.sweep_headings import known_unit, quantity_of
+
+#: The pairs of columns that give storage and loss moduli, the best one first.
+PAIRS = (
+    ("storage", "loss"),
+    ("complex", "phase"),
+    ("complex", "tangent"),
+    ("storage", "tangent"),
+    ("storage", "phase"),
+    ("loss", "tangent"),
+    ("loss", "phase"),
+)
+NEEDED = {
+    "frequency": "frequency_Hz or angular_frequency_rad_s",
+    "storage": "storage_modulus_Pa",
+    "loss": "loss_modulus_Pa (or phase_angle_deg or tan_delta beside the other modulus)",
+}
+
+
+class Column(NamedTuple):
+    """A column that is one of a sweep's."""
+
+    place: int  # in the line, from 0
+    name: str
+    quantity: str  # frequency, storage, loss, complex, phase, tangent; the moduli and angles also with "_sd"
+    unit: str | None
+
+
+def pair_of(quantities: Collection[str]) -> tuple[str, str] | None:
+    """The pair that tells the moduli; None where there is none."""
+    return next((pair for pair in PAIRS if set(pair) <= set(quantities)), None)
+
+
+def is_complete(columns: list[Column]) -> bool:
+    """Whether the columns are a sweep."""
+    quantities = {c.quantity for c in columns}
+    return "frequency" in quantities and pair_of(quantities) is not None
+
+
+def first_missing(columns: list[Column]) -> str:
+    """The first of `NEEDED` that is not there."""
+    quantities = {c.quantity for c in columns}
+    if "frequency" not in quantities:
+        return "frequency"
+    return "loss" if quantities & {"storage", "complex"} else "storage"
+
+
+def is_angular(column: Column) -> bool:
+    """Whether the heading names an angular frequency."""
+    return bool(re.match(r"\s*(ang|omega|ω|kreisf|circular|radian|pulsation|w\b)", column.name.lower()))
+
+
+def header_columns(cells: list[str]) -> list[Column]:
+    """Columns by quantity. The first column with a known unit comes first, rad/s before Hz; the others follow, for
+    comparison. Where they are a sweep, columns that it does not need are left out."""
+    found = [(k, cell, quantity_of(cell)) for k, cell in enumerate(cells)]
+    columns = [Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
+    shear = {c.quantity for c in columns if not is_tensile(c)}
+    if "frequency" in shear and pair_of(shear):  # G before E where a file has both
+        columns = [c for c in columns if not is_tensile(c)]
+    pair = pair_of({c.quantity for c in columns})
+    if pair:
+        columns = [c for c in columns if c.quantity.removesuffix("_sd") in ("frequency", *pair)]
+    columns.sort(key=lambda c: (not known_unit(c.quantity.removesuffix("_sd"), c.unit), not is_angular(c), c.place))
+    return columns
+
+
+def is_tensile(column: Column) -> bool:
+    """Whether the heading names a modulus of tension or bending, E."""
+    return bool(re.match(r"\s*e['′’_ ]|\s*epp?\b|\s*[(|]?e\b|\s*tensile", column.name.lower().replace('"', "'")))
+
+
+#: Units of temperature: factor and offset to kelvin.
+_TEMPERATURE = {"c": (1.0, 273.15), "k": (1.0, 0.0), "f": (5 / 9, 459.67 * 5 / 9)}
+
+
+def condition_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float, float]]:
+    """Place, factor and offset to SI of `temperature` [K] and `shift_factor`, of the headings that name them.
+
+    Args:
+        cells: headings.
+        units: of a line of their own, or nothing.
+    """
+    found: dict[str, tuple[int, float, float]] = {}
+    for k, cell in enumerate(cells):
+        name = cell.strip().strip('"').lower()
+        heat = re.match(r"(?:temperature|temp|t)\b[\s._]*(.*)|(?:temperature|temp|t)_(.*)", name)
+        if heat and "temperature" not in found:
+            rest = next((part for part in heat.groups() if part), "") or (units[k] if k < len(units) else "")
+            plain = re.sub(r"deg(rees?)?|[^a-z]", "", rest.lower())
+            unit = _TEMPERATURE.get(plain[:1] if plain in ("celsius", "kelvin", "fahrenheit") else plain)
+            if unit:
+                found["temperature"] = (k, *unit)
+        if re.fullmatch(r"(shift[\s_]*factor|a[\s_]?t)s?[\s_]*([(\[]?1?[)\]]?)", name) and "shift_factor" not in found:
+            found["shift_factor"] = (k, 1.0, 0.0)
+    return found

@@ -1,0 +1,94 @@
+"""What the heading of a column says in a frequency sweep: a quantity and its unit, in the words of instruments."""
+
+import re
+
+from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, TANGENT_UNITS
+
+DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
+#: Words that say nothing more: kinds of the same quantity, and symbols that stand beside a name.
+IDLE_WORDS = {"standard", "mean", "value", "g'", "g''", "g*", "e'", "e''", "e*", "delta", "omega", "f", "w"}
+#: First words of a heading, and the quantity. Those of `UNCERTAIN` count only with a unit that is known, or with none.
+WORDS = {
+    "frequency": (
+        *("angular frequency", "ang frequency", "angular freq", "ang freq", "angular velocity", "angular", "omega"),
+        *("circular frequency", "radian frequency", "frequency", "freq", "f", "w"),
+        *("kreisfrequenz", "frequenz", "pulsation", "fréquence"),
+    ),
+    "storage": (
+        *("g'", "gp", "gprime", "g prime", "e'", "ep", "e stor", "e storage", "storage modulus", "storage mod"),
+        *("stor modulus", "elastic modulus", "modulus elastic component", "speichermodul", "storage"),
+        *("module de conservation", "module élastique"),
+    ),
+    "loss": (
+        *("g''", "gpp", "g double prime", "gdoubleprime", "e''", "epp", "e loss", "loss modulus", "loss mod"),
+        *("viscous modulus", "modulus viscous component", "verlustmodul", "loss", "module de perte", "module visqueux"),
+    ),
+    "complex": (
+        *("g*", "e*", "complex modulus", "complex shear modulus", "modulus complex component"),
+        *("komplexer modul", "komplexer schubmodul", "module complexe"),
+    ),
+    "phase": (
+        *("phase angle", "phase shift angle", "phase shift", "phase lag", "phase", "loss angle", "delta"),
+        *("phasenwinkel", "phasenverschiebung", "phasenverschiebungswinkel", "angle de perte"),
+    ),
+    "tangent": (
+        *("tan delta", "tandelta", "tan d", "tand", "loss factor", "loss tangent", "damping factor"),
+        *("verlustfaktor", "facteur de perte"),
+    ),
+}
+UNCERTAIN = {"storage", "loss", "f", "w", "phase", "delta", "angular"}
+_LONGEST_FIRST = sorted(
+    ((words.split(), quantity) for quantity, names in WORDS.items() for words in names),
+    key=lambda row: -len(row[0]),
+)
+#: Characters that stand for others.
+_PLAIN = {"′": "'", "’": "'", "`": "'", "´": "'", "″": "''", "”": "''", '"': "''", "δ": "delta", "ω": "omega"}
+
+
+def known_unit(quantity: str, unit: str | None) -> bool:
+    """Whether the unit can be converted; a column without one takes the default, if it has one."""
+    if unit is None:
+        return True
+    if quantity == "frequency":
+        return unit.lower() in FREQUENCY_UNITS
+    return unit in {"phase": ANGLE_UNITS, "tangent": TANGENT_UNITS}.get(quantity, MODULUS_UNITS)
+
+
+def quantity_of(cell: str) -> tuple[str, str | None] | None:
+    """(quantity, unit) that a header cell names, or None. Deviations end in "_sd"."""
+    name = cell
+    for sign, plain in _PLAIN.items():
+        name = name.replace(sign, plain)
+    name = re.sub(r"\btan[\s_]*[(\[]\s*(delta|d)\s*[)\]]", "tan delta", name, flags=re.IGNORECASE)
+    name, unit = _name_and_unit(re.sub(r"\|\s*([ge])\s*\*?\s*\|", r"\1*", name, flags=re.IGNORECASE))
+    words = [w for w in re.split(r"[\s_.,:()\[\]]+", name) if w]
+    spread = any(w.lower() in DEVIATION_WORDS for w in words)
+    words = [w for w in words if w.lower() not in DEVIATION_WORDS | {"standard", "mean"}]
+    while len(words) > 1 and words[0].lower() in ("shear", "dynamic", "tensile"):
+        words = words[1:]
+    lower = [w.lower() for w in words]
+    found = next(((first, q) for first, q in _LONGEST_FIRST if lower[: len(first)] == first), None)
+    if found is None:
+        return None
+    first, quantity = found
+    rest = "_".join(w for w in words[len(first) :] if w.lower() not in IDLE_WORDS)
+    if unit is not None and rest:
+        return None  # "Storage compliance (1/Pa)", "Frequency point (1)"
+    unit = unit if unit is not None else (rest or None)
+    if " ".join(first) in UNCERTAIN and not known_unit(quantity, unit):
+        return None
+    return quantity + ("_sd" if spread and quantity != "frequency" else ""), unit
+
+
+def _name_and_unit(name: str) -> tuple[str, str | None]:
+    """Name and unit of "G' [Pa]", "G' in Pa", "G' / Pa" and "G', Pa"."""
+    bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", name)
+    if bracket and not re.fullmatch(r"[ge]'*\*?|delta|omega|f|w", bracket.group(1), re.IGNORECASE):
+        return name[: bracket.start()], bracket.group(1)
+    if said := re.fullmatch(r"(.+?)\s+in\s+(\S+(?: s-1)?)\s*", name):
+        return said.group(1), said.group(2)
+    for split in re.finditer(r"\s*[/,]\s*", name):
+        rest = name[split.end() :].strip()
+        if any(known_unit(quantity, rest) for quantity in ("frequency", "storage", "phase")) and rest:
+            return name[: split.start()], rest
+    return name, None

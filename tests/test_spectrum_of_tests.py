@@ -1,0 +1,145 @@
+"""A smooth spectrum of tests in time, of several tests and of several samples, against models in closed form."""
+
+import json
+
+import numpy as np
+import pytest
+import scipy.optimize
+from test_models import FORMULAS, TRUTHS
+from test_springpots_in_time import TIMES, inverse_laplace
+
+from fitting.__main__ import main
+from fitting.fits import samples, time_tests, together
+from fitting.fits.families import choice, spectrum_of_tests
+from fitting.fits.families.choice import Label
+from fitting.methods import generalised_maxwell, relaxation_spectrum
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers import time_tests as reader
+from fitting.readers.frequency_sweep import Sweep
+
+pytestmark = pytest.mark.quick_to_compile
+
+NAME = "fractional_zener"
+NEAR = Maxwell(np.float64(800.0), np.array([0.3, 0.2]), np.array([30.0, 0.5]))
+
+
+def in_time(kind: str, name: str = NAME, noise: float = 0.003, seed: int = 0) -> reader.TimeTest:
+    """A step at 0, answered as Mittag-Leffler functions do."""
+    answer = inverse_laplace(name, kind == "creep")
+    answer = answer * (1 + noise * np.random.default_rng(seed).standard_normal(len(TIMES)))
+    time, answer = np.concatenate([[0.0], TIMES]), np.concatenate([[np.nan], answer])
+    return reader.TimeTest(kind, time, np.ones(len(time)), answer, time > 0)
+
+
+def sweep_of(noise: float = 0.01, scale: float = 1.0, seed: int = 1) -> Sweep:
+    omega = np.geomspace(0.01, 300, 25)
+    G = scale * FORMULAS[NAME](1j * omega, *TRUTHS[NAME])
+    factor = 1 + noise * np.random.default_rng(seed).standard_normal((2, len(omega)))
+    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_the_spectrum_of_a_test_in_time_has_the_moduli_of_the_material(kind):
+    found = spectrum_of_tests.spectrum_in_time(in_time(kind), NEAR)
+    assert found.converged and found.relative_errors.mean() < 0.005
+    assert 2 < found.kind.effective < 10 and found.details["conversion"]["largest_relative_error"] < 0.01
+    omega = 1 / TIMES[4:-4]
+    storage, _ = generalised_maxwell.moduli(found.model, omega)
+    true = FORMULAS[NAME](1j * omega, *TRUTHS[NAME])
+    # Half a decade inside the band, noise of 0.3 % on 25 answers: |G*| to 1 %.
+    assert np.allclose(storage, true.real, rtol=0.01)
+
+
+def test_no_start_of_scipy_is_below_the_spectrum_of_creep():
+    """Creep is not linear in the strengths; the tangents must end where bounded least squares of SciPy do."""
+    test = in_time("creep", "fractional_kelvin_voigt")
+    told, grid, found = spectrum_of_tests.spectrum_of([test], NEAR, np.ones(1))
+    L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
+    function, data = spectrum_of_tests._rows_and_slopes(("creep",)), spectrum_of_tests._weighed_parts([test], [1.0])
+
+    def rows(x):
+        return np.concatenate([np.asarray(function(x, grid.times, grid.unit, data)[0]), L @ x])
+
+    def slopes(x):
+        return np.vstack([np.asarray(function(x, grid.times, grid.unit, data)[1]), L])
+
+    own, rng = np.sum(rows(found.x) ** 2), np.random.default_rng(0)
+    for _ in range(8):
+        start = np.exp(rng.uniform(-4, 1, len(found.x)))
+        best = scipy.optimize.least_squares(rows, start, slopes, bounds=(0, np.inf), max_nfev=300)
+        assert own <= 2 * best.cost * (1 + 1e-4)  # the iteration ends where a step gains 1e-9; SciPy at 1e-8
+    assert told.effective < 12
+
+
+def test_several_tests_have_one_spectrum():
+    tests = [sweep_of(), in_time("relaxation")]
+    found = spectrum_of_tests.spectrum_together(tests, NEAR, np.array([0.01, 0.003]))
+    sweep, relaxation = found.shares
+    assert 0.006 < sweep.noise < 0.015 and 0.0015 < relaxation.noise < 0.005
+    assert sweep.alone < 1.3 * sweep.noise and not together.disagreements(found.shares)
+    rest = found.kind.names.index("equilibrium_modulus")
+    own = found.parameters.standard_errors[rest]
+    assert abs(found.parameters.values[rest] - TRUTHS[NAME][0]) < 4 * own
+    assert relaxation.errors_without[rest] > own and found.details["spectrum"]["decades_carried"] > 2
+
+
+def test_a_population_of_spectra():
+    scales = np.exp(0.2 * np.random.default_rng(5).standard_normal(6))
+    sweeps = [sweep_of(scale=s, seed=10 + k) for k, s in enumerate(scales)]
+    found = samples.fit(sweeps, "spectrum")
+    rest = found.populations["equilibrium_modulus"]
+    assert rest.mean == pytest.approx(TRUTHS[NAME][0] * np.exp(np.log(scales).mean()), rel=0.03)
+    assert rest.spread == pytest.approx(np.log(scales).std(ddof=1), rel=0.2)
+    known = [p for n, p in found.populations.items() if n.startswith("strengths[") and p is not None]
+    assert len(known) > 4 and np.median([p.spread for p in known]) == pytest.approx(rest.spread, rel=0.5)
+    storage, loss = generalised_maxwell.moduli(found.typical, sweeps[0].angular_frequency)
+    true = np.exp(np.log(scales).mean()) * FORMULAS[NAME](1j * sweeps[0].angular_frequency, *TRUTHS[NAME])
+    assert np.allclose(storage + 1j * loss, true, rtol=0.05)
+
+
+def written(path, columns: str, *values) -> str:
+    rows = (",".join(f"{v:.12g}" for v in row) for row in zip(*values, strict=True))
+    path.write_text("\n".join([columns, *rows]) + "\n")
+    return str(path)
+
+
+def test_the_commands_write_spectra(tmp_path, capsys):
+    s, t = sweep_of(), in_time("relaxation")
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    a = written(tmp_path / "a.csv", head, s.angular_frequency, s.storage, s.loss)
+    b = written(tmp_path / "b.csv", head, s.angular_frequency, 1.2 * s.storage, 1.2 * s.loss)
+    c = written(tmp_path / "c.csv", "time_s,relaxation_modulus_Pa", t.time[1:], t.answer[1:])
+    for words in (["relaxation", c], [a, "--with", c], [a, b]):
+        out = tmp_path / f"out{len(words)}"
+        assert main([*words, "--model", "spectrum", "--out", str(out)]) == 0
+        content = json.loads((out / "fit.json").read_text())
+        assert content["model"] == "spectrum" and content["details"]["spectrum"]["times_per_decade"] in (2, 3)
+        assert (out / "fit.png").stat().st_size > 10_000
+        told = capsys.readouterr().out
+        assert "strengths[" not in told or len(words) == 2  # the population lists them
+        assert content["equilibrium_modulus"] == pytest.approx(TRUTHS[NAME][0], rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("labels", "criteria", "chosen"),
+    [
+        ((Label("spectrum"), Label("prony", 2)), (0, 5), 1),  # a spectrum can be modes: 5 is no strong evidence
+        ((Label("spectrum"), Label("prony", 2)), (0, 7), 0),
+        ((Label("fractional_parallel"), Label("fractional_kelvin_voigt")), (0, 3), 1),
+        ((Label("fractional_maxwell"), Label("fractional_kelvin_voigt")), (0, 3), 0),  # neither is a case of the other
+        ((Label("fractional_zener"), Label("prony", 1)), (0, 3), 1),
+        ((Label("fractional_zener"), Label("prony", 2)), (0, 3), 0),
+        ((Label("prony", 3), Label("prony_fluid", 3)), (0, 3), 1),
+        ((Label("prony", 3), Label("prony_fluid", 4)), (0, 3), 0),
+        ((Label("spectrum"), Label("fractional_zener"), Label("fractional_kelvin_voigt")), (0, 2, 4), 2),
+    ],
+)
+def test_a_general_model_needs_strong_evidence(labels, criteria, chosen):
+    assert choice.preferred(labels, criteria) == chosen
+
+
+def test_criteria_count_the_parameters_in_effect():
+    test = in_time("relaxation")
+    found = spectrum_of_tests.spectrum_in_time(test, NEAR)
+    m, square = len(found.measured), np.sum(found.relative_errors**2)
+    assert time_tests.criterion(found) == pytest.approx(m * np.log(square / m) + found.kind.effective * np.log(m))
