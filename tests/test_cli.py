@@ -106,7 +106,7 @@ HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"
 BAD = {
     "no file": (None, [], "no such file"),
     "column": ("frequency_Hz,storage_modulus_Pa\n1,2\n2,3\n", [], "no column for loss"),
-    "nan": (HEADER + "1,300,30\n2,nan,40\n", [], "not finite"),
+    "nan": (HEADER + "1,300,30\n2,nan,40\n", [], "is empty"),
     "negative loss": (HEADER + "1,300,30\n2,310,-40\n", [], "is not positive"),
     "too many modes": (HEADER + "1,300,30\n2,310,40\n3,320,50\n", ["--modes", "3"], "use at most --modes 2"),
     "zero modes": (HEADER + "1,300,30\n2,310,40\n", ["--modes", "0"], "at least 1"),

@@ -82,8 +82,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     part: tuple[Any, Any] = (None, None)
     if len(np.unique(sweep.angular_frequency[kept])) > len(fit.solution.u) // 2 + 1:
         shorter = some(sweep, kept)
-        found, spread, _ = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
-        part = found, np.sqrt(np.diag(spread))
+        found, of_part, _ = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
+        part = found, np.sqrt(np.diag(of_part))
     errors = InstrumentErrors(values, covariance, *part)
     details = fit.details | {"instrument": instrument_numbers(errors, known)}
     if not errors.steady.all():

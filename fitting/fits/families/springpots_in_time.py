@@ -6,7 +6,7 @@ creep are computed as for Prony modes. Its own few numbers are what is fitted an
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -195,8 +195,11 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     return best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds)
 
 
-def _preferred_of(fits: Sequence, criterion: Callable) -> TimeFit | Together:
-    """The fit to choose, by `models.preferred`."""
+AFit = TypeVar("AFit", TimeFit, Together)
+
+
+def _preferred_of(fits: Sequence[AFit], criterion: Callable[[AFit], float]) -> AFit:
+    """The fit to choose, by `choice.preferred`."""
     return fits[choice.preferred([choice.label_of(f) for f in fits], list(map(criterion, fits)))]
 
 

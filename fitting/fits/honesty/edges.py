@@ -96,12 +96,9 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     if fit.kind.effective is not None:
         found = fit.details["spectrum"]
         grid = relaxation_spectrum.at(part, found["times_per_decade"], found["smoothing"])
-        (known,) = (n for n in old) if old else (None,)
-        if known is None:
-            return {}
         # Numbers of a compressed sample are those of the data times a factor.
-        factor = old[known] / float(np.exp(fit.solution.u[0]))
-        return {known: factor * grid.equilibrium - old[known]}
+        factor = {name: value / float(np.exp(fit.solution.u[0])) for name, value in old.items()}
+        return {name: factor[name] * grid.equilibrium - value for name, value in old.items()}
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
         reference = springpots.reference_frequency(sweep)
@@ -112,8 +109,9 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         data = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, scales)
         u = viscoelastic.timed(best, starts, np.tile(model.switches, (len(starts), 1)), *data)[0].u
-        new = fit.kind.values(u[np.array(model.free)])
-        return {n: float(v) - old[n] for n, v in zip(model.names, new, strict=True)}
+        assert fit.kind.values is not None
+        again = fit.kind.values(u[np.array(model.free)])
+        return {n: float(v) - old[n] for n, v in zip(model.names, again, strict=True)}
     starts = generalised_maxwell.starts(part, fit.modes, generalised_maxwell.spectrum(part))
     fluid = fit.kind.name == FLUID.name
     starts = np.stack([generalised_maxwell.fluid_of(u) for u in starts]) if fluid else starts
