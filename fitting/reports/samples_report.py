@@ -68,6 +68,12 @@ def _times_of_strengths(found: Samples) -> Content:
     return {"relaxation_times": out, "times_per_decade": found.fits[0].details["spectrum"]["times_per_decade"]}
 
 
+def _labels(found: Samples) -> dict[str, str]:
+    """Names of the numbers for a reader: a strength is told by its time."""
+    times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
+    return {n: f"strength at {times[n]:.3g} s" if n in times else n for n in found.populations}
+
+
 def _pairs(found: Samples) -> zip:
     return zip(found.fits, found.sweeps, strict=True)
 
@@ -133,9 +139,9 @@ def table(found: Samples) -> str:
         f"{len(found.fits)} samples, {found.kind.name}",
         f"{'':22s} {'mean':>10s} {'spread':>7s}   {'95 % of the mean':22s}   95 % of a new sample",
     ]
-    times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
+    labels = _labels(found)
     for name, p in found.populations.items():
-        label = f"strength at {times[name]:.3g} s" if name in times else name
+        label = labels[name]
         unit = units.get(
             name, {"shear_modulus": "Pa", "equilibrium_modulus": "Pa"}.get(name, "Pa" if name.startswith("str") else "")
         )
@@ -176,7 +182,7 @@ def figure(found: Samples) -> "Figure":
     left.plot([], [], "o-", color=ORANGE, ms=3, label="G'' measured and fitted")
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="modulus [Pa]")
     left.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0.3)
-    known = _known_errors(found)
+    known, labels = _known_errors(found), _labels(found)
     for row, (name, p) in enumerate(known.items()):
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))]) / p.mean
         own = own[own > 0]
@@ -189,7 +195,7 @@ def figure(found: Samples) -> "Figure":
         ("-", ORANGE, "of a new sample"),
     ):
         right.plot([], [], marker, color=colour, label=label)
-    right.set(xscale="log", xlabel="value / mean [1]", yticks=range(len(known)), yticklabels=list(known))
+    right.set(xscale="log", xlabel="value / mean [1]", yticks=range(len(known)), yticklabels=[labels[n] for n in known])
     shown = [t for t in (0.01, 0.03, 0.1, 0.2, 0.5, 0.8, 1, 1.25, 2, 5, 10, 30, 100) if _inside(t, right.get_xlim())]
     right.minorticks_off()
     right.set_xticks(shown, labels=[f"{t:g}" for t in shown])
