@@ -17,7 +17,6 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.physics.registry import law_at_rest
 from liverjax.scenes.scene import Scene
-from liverjax.simulation import automatic
 from liverjax.simulation.equations import Equations, State, advanced, equations, force_sizes, initial_state
 from liverjax.simulation.run import Result, prepared
 from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, pack
@@ -44,11 +43,6 @@ def check(names: list[str], scene: Scene) -> None:
             raise InputError(f"[output] fields: {name!r} is not known: {hint(name, FIELDS)}")
     if "fluid_velocity" in names and scene.porosity is None:
         raise InputError("[output] fields: fluid_velocity needs [porosity]: leave it out")
-    if automatic.form_of_volumes(scene) == "mixed" and "cauchy_stress" in names:
-        raise InputError(
-            "[output] fields: cauchy_stress lacks the pressures of volumetric = 'mixed', which no result keeps: take "
-            "'element' or 'nodal', or leave it out"
-        )
 
 
 def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarray]:
@@ -85,11 +79,17 @@ def _put_again(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[Stat
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
+    if e.mixed is not None:  # no result keeps them, but at a solution they follow from the volumes
+        pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)
     energy = law.strain_energy(law.measures(F))
     vertices = None if pressure is None else pressure[: mesh.number_of_vertices]
-    velocity = jnp.zeros((3, *determinant(F).shape)) if vertices is None else _velocity(scene, F, vertices)
+    velocity = (
+        jnp.zeros((3, *determinant(F).shape))
+        if scene.porosity is None or vertices is None
+        else _velocity(scene, F, vertices)
+    )
     at = (pack(P), pack(F), jnp.broadcast_to(energy, determinant(F).shape), velocity)
     return advanced(e, End(x, F, vertices)), at
 
@@ -98,7 +98,7 @@ def _whole_stress(e: Equations, F: Matrix, pressure: jax.Array) -> Matrix:
     first, *rest = [solid.stress(F) for solid in e.solids]
     for more in rest:
         first = add_matrices(first, more)
-    if e.volume is None or e.mixed is not None:
+    if e.volume is None:
         return first
     own = e.volume.pressure(e.mesh, determinant(F)) if pressure is None else pressure[: e.mesh.number_of_vertices]
     return add_matrices(first, e.volume.stress(e.mesh, own, F))

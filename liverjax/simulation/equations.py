@@ -209,6 +209,13 @@ def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
+def settled(e: Equations, q: jax.Array) -> jax.Array:
+    """Unknowns q with the pressures that balance the volumes at the end of the step, where they are unknowns."""
+    n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype))
+    pressure = e.mixed.settled(e.mesh, determinant(deformation_gradient(e.mesh, x)))
+    return jnp.concatenate([q[:n], pressure / e.mixed.unit])
+
+
 def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax.Array:
     """Pressures (V,) [Pa] that flow, at unknowns q (3 V,), from a guess of them."""
     assert e.volume is not None
@@ -238,7 +245,7 @@ def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
-        total = total + e.volume.energy(e.mesh, determinant(F))
+        total = total + e.volume.energy(e.mesh, determinant(F))  # of mixed bodies with the best pressures
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 

@@ -23,6 +23,7 @@ from liverjax.simulation.equations import (
     forces,
     positions,
     residual,
+    settled,
     unknowns,
 )
 from liverjax.solvers import step_cutting
@@ -40,6 +41,8 @@ def problem_of(e: Equations) -> Problem:
             volume=lambda q, s: jnp.min(determinant(deformation_gradient(e.mesh, positions(e, q, s)))),
             surrogate=None if isinstance(e.scene.law, laws.StableNeoHookean) else problem_of(_finite(e)),
             rest=_rest(e) if e.scene.solve.kind == "static" else None,
+            settled=None if e.mixed is None else partial(settled, e),
+            positions=None if e.mixed is None else 3 * e.mesh.number_of_nodes,
         )
     return Problem(
         residual=partial(residual, e),

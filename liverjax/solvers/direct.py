@@ -58,10 +58,11 @@ def solve_points(
         C = A.pressures
         coupled = (jnp.stack([jnp.stack(g) for g in A.border]), C.rows[0][0], C.diagonal[0][0], C.nodes)
     nodes = jnp.stack(mesh.element_nodes)
+    signs = mesh.oriented(jnp.ones((len(nodes), 1, mesh.number_of_elements), b[0].dtype))[:, 0]
     size = b[0].size + (0 if coupled is None else mesh.number_of_vertices)
     shape = jax.ShapeDtypeStruct((size,), b[0].dtype)
     host = partial(_solve_points, mesh.order)
-    given = (blocks, nodes, own, coupled, free, b, normals, attached)
+    given = (blocks, (nodes, signs), own, coupled, free, b, normals, attached)
     return jax.pure_callback(host, shape, *given, vmap_method="sequential")
 
 
@@ -122,7 +123,7 @@ def _given_ways(attached: tuple[Attached | GivesWay, ...], size: int) -> tuple[n
 def _solve_points(order: int, *given: object) -> np.ndarray:
     import scipy.sparse
 
-    blocks, nodes, own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
+    blocks, (nodes, signs), own, coupled, free, b, normals, attached = jax.tree.map(np.asarray, given)
     n, c = b[0].shape[1], basis(order).c
     pairs = [(a, b) for a in (1, 2, 3) for b in (1, 2, 3) if a <= b]
     K = np.zeros((4, 4, 3, 3, *blocks.shape[-2:]))
@@ -130,7 +131,8 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
         K[a, k], K[k, a] = block, np.swapaxes(block, 0, 1)
     K[0, 1:] = -K[1:, 1:].sum(axis=0)
     K[:, 0] = -K[:, 1:].sum(axis=1)
-    element = np.einsum("akq,klrsqe,blq->arbse", c, K, c, optimize=True).reshape(3 * len(nodes), 3 * len(nodes), -1)
+    element = np.einsum("akq,klrsqe,blq->arbse", c, K, c, optimize=True)
+    element = (element * signs[:, None, None, None] * signs[:, None]).reshape(3 * len(nodes), 3 * len(nodes), -1)
     at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(3 * len(nodes), -1)
     entries = [(element, at[:, None], at[None]), *_entries(attached, n)]
     if own is not None:
@@ -140,7 +142,8 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
     if coupled is not None:
         border, rows, diagonal, near = coupled
         g = np.concatenate([-border.sum(axis=0)[None], border])
-        G = -np.einsum("akq,krqe,vq->arve", c, g, basis(order).L, optimize=True).reshape(len(at), 4, -1)
+        G = -np.einsum("akq,krqe,vq->arve", c, g, basis(order).L, optimize=True) * signs[:, None, None]
+        G = G.reshape(len(at), 4, -1)
         balance = 3 * n + nodes[:4]
         every = 3 * n + np.arange(len(diagonal))
         entries += [(G, at[:, None], balance[None]), (G, balance[None], at[:, None])]

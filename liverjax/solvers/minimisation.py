@@ -6,6 +6,9 @@ energy falls from point to point, and near the minimum convergence is quadratic.
 untangled as a stable neo-Hookean body of the same moduli, whose energy is finite everywhere: so any law may start
 there.
 
+Where pressures are unknowns of their own, the solution is a saddle of the energy of both. With the pressures that are
+best for the positions it is a minimum again: so the positions are what is varied, and the pressures follow.
+
 Forces without an energy, such as friction, are held constant during each iteration. So they have an energy for that
 iteration, whose gradient at its beginning is the residual.
 """
@@ -29,6 +32,8 @@ _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
 #: Farther away than this, over the forces at work, a true tangent without symmetry is not tried: BiCGSTAB does not tell
 #: that it is not positive, and takes all its iterations.
 _NEAR = 0.1
+#: Tolerance of directions where pressures follow positions: what is left of their balance counts K/mu times.
+_WITH_PRESSURES = 1e-6
 #: Residual at which a surrogate body is untangled enough.
 _UNTANGLED = 1e-4
 
@@ -84,6 +89,11 @@ def _potential(problem: Problem) -> Potential:
     return problem.potential
 
 
+def _settled(problem: Problem, q: jax.Array) -> jax.Array:
+    settled = _potential(problem).settled
+    return q if settled is None else settled(q)
+
+
 def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple[jax.Array, jax.Array, jax.Array]:
     """A point without inverted elements near `start`, if one is found, and its nonlinear and linear iterations."""
     zero, potential = jnp.zeros((), jnp.int32), _potential(problem)
@@ -92,8 +102,10 @@ def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple
         return start, zero, zero
 
     def away():
-        least = minimise(surrogate, start, options._replace(tolerance=_UNTANGLED))
-        return least.q, least.iterations, least.linear_iterations
+        # Its unknowns are positions alone.
+        n = len(start) if potential.positions is None else potential.positions
+        least = minimise(surrogate, start[:n], options._replace(tolerance=_UNTANGLED))
+        return jnp.concatenate([least.q, start[n:]]), least.iterations, least.linear_iterations
 
     return jax.lax.cond(potential.volume(start, jnp.ones((), start.dtype)) <= 0, away, lambda: (start, zero, zero))
 
@@ -101,6 +113,7 @@ def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple
 def _evaluated(
     problem: Problem, q: jax.Array, definite: jax.Array, patience: jax.Array, indefinite: jax.Array, *counts: jax.Array
 ) -> _Descent:
+    q = _settled(problem, q)
     r, force, by = problem.residual(q, jnp.ones((), q.dtype))
     relative = jnp.linalg.norm(r) / jnp.where(force > 0, force, 1.0)
     energy = _potential(problem).energy(q, q)
@@ -109,7 +122,7 @@ def _evaluated(
 
 def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     one, definite = jnp.ones((), c.q.dtype), c.definite > 0
-    if not problem.symmetric:
+    if not problem.symmetric or _potential(problem).settled is not None:
         definite = definite | (c.relative > _NEAR)
     K = jax.lax.cond(
         definite,
@@ -118,6 +131,8 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     )
     goal = 0.3 * options.tolerance / jnp.maximum(c.relative, 1e-300)
     forcing = jnp.clip(jnp.minimum(LINEAR_TOLERANCE, jnp.sqrt(c.relative)), jnp.minimum(goal, 0.5), 0.5)
+    if _potential(problem).settled is not None:
+        forcing = jnp.minimum(forcing, _WITH_PRESSURES)
     dq, linear, positive = problem.solve(K, -c.r, forcing, MOST_LINEAR_ITERATIONS)
     slope = jnp.vdot(c.r, dq)
     usable = jnp.isfinite(slope) & (slope < 0) & (positive | definite)
@@ -141,7 +156,7 @@ def _length(problem: Problem, c: _Descent, dq: jax.Array, slope: jax.Array, usab
     one, size = jnp.ones((), c.q.dtype), jnp.linalg.norm(c.r)
 
     def good(t):
-        q = c.q + t * dq
+        q = _settled(problem, c.q + t * dq)
         energy = _potential(problem).energy(q, c.q)
         falls = energy <= c.energy + _FALL * t * slope
         level = abs(energy - c.energy) <= _ROUNDOFF * jnp.finfo(c.q.dtype).eps * abs(c.energy)

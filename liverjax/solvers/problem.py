@@ -100,3 +100,7 @@ class Potential(NamedTuple):
     surrogate: Problem | None
     #: Where the loads are followed from if the start is a guess, and whether it is; None where a start is a state.
     rest: tuple[jax.Array, jax.Array] | None
+    #: q with the pressures that are best for its positions, where these are unknowns; None: there are none.
+    settled: Callable[[jax.Array], jax.Array] | None = None
+    #: How many of the unknowns are positions; None: all.
+    positions: int | None = None

@@ -28,7 +28,6 @@ from liverjax.physics.volumes.averaged import Averaged
 from liverjax.physics.volumes.mixed import Mixed, MixedVolume
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import Matrix, determinant, dot, scale
-from liverjax.tensors.places import given
 
 
 class Pressures(NamedTuple):
@@ -84,8 +83,7 @@ def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures
     border = volume.border(J)
     store = _compliance(mesh, volume)
     pull = _pull(mesh, [scale(border, g) for g in volume_gradients(mesh, F)])
-    pressure = _pressures_of_state(mesh, volume, store, J)
-    return volume.scalars(mesh, pressure, F), _sealed(mesh, pull, store)
+    return volume.scalars(mesh, volume.settled(mesh, J), F), _sealed(mesh, pull, store)
 
 
 def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
@@ -96,20 +94,6 @@ def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
     one, every = jnp.eye(4)[:, :, None], jnp.ones((4, 4, 1))
     soft, held = (jnp.broadcast_to(mesh.volumes / (20 * a), mesh.volumes.shape) for a in (volume.rest, volume.shear))
     return (every + one) * soft[None, None] + (one - every / 4) * held[None, None]
-
-
-def _pressures_of_state(mesh: TetMesh, volume: Mixed, store: jax.Array, J: jax.Array) -> jax.Array:
-    """Pressures (P,) [Pa] that balance volume ratios J."""
-    none = jnp.zeros(mesh.number_of_vertices, J.dtype)
-    diagonal = given(none, mesh.tetrahedra.T, jnp.einsum("aae->ae", store))
-
-    def solve(apply: Any, b: jax.Array) -> jax.Array:
-        return jax.scipy.sparse.linalg.cg(apply, b, tol=1e-14, maxiter=200, M=lambda r: r / diagonal)[0]
-
-    def compliance(p: jax.Array) -> jax.Array:
-        return volume.compliance(mesh, p)
-
-    return jax.lax.custom_linear_solve(compliance, volume.balance(mesh, none, J), solve, symmetric=True)
 
 
 def _of_averaged(scene: Scene, F: Matrix) -> tuple[Scalars, Pressures]:

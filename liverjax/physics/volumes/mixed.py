@@ -122,6 +122,13 @@ class Mixed(VolumeStress):
         g, g1, _ = self._slopes(determinant(F))
         return scale_matrix((self.part * g + interpolated(mesh, pressure)) * g1, cofactor(F))
 
+    def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+        """Energy [J] with the pressures that are best for volume ratios J: gamma g^2/2 + p g/2."""
+        g = strain(self.kind, J)
+        return jnp.sum(mesh.weights * (0.5 * self.part * g * g)) + 0.5 * jnp.vdot(
+            self.settled(mesh, J), integrals(mesh, g)
+        )
+
     def scalars(self, mesh: TetMesh, pressure: jax.Array, F: Matrix) -> Scalars:
         """Its stress and slope at given pressures."""
         g, g1, g2 = self._slopes(determinant(F))
@@ -144,6 +151,23 @@ class Mixed(VolumeStress):
         mean = interpolated(mesh, pressure)
         shares = [mesh.volumes * ((4 * mean + p) / self.rest + (p - mean) / self.shear) / 20 for p in own]
         return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
+
+    def settled(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+        """Pressures (V,) [Pa] that balance volume ratios J: those of a solution there."""
+        none = jnp.zeros_like(self.before)
+        if mesh.order == 1:
+            share = jnp.stack(4 * [mesh.volumes * (2 / self.rest + 0.75 / self.shear) / 20])
+        else:
+            share = jnp.asarray(basis(mesh.order).L ** 2, J.dtype) @ (mesh.weights / self.rest)
+        diagonal = given(none, mesh.tetrahedra.T, share)
+
+        def solve(apply: Any, b: jax.Array) -> jax.Array:
+            return jax.scipy.sparse.linalg.cg(apply, b, tol=1e-14, maxiter=1000, M=lambda r: r / diagonal)[0]
+
+        def own(p: jax.Array) -> jax.Array:
+            return self.compliance(mesh, p)
+
+        return jax.lax.custom_linear_solve(own, self.balance(mesh, none, J), solve, symmetric=True)
 
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
         """`compliance` as a matrix."""
