@@ -58,7 +58,7 @@ MANY_PROGRAMS = 400
 
 def pytest_addoption(parser):
     """The page of known answers."""
-    text = "run the tests that have a known answer, slow ones too, and write their rows to a JSON file"
+    text = "run the tests that have a known answer, slow ones too, and put their rows into a JSON file"
     parser.addoption("--verification", metavar="FILE", type=Path, help=text)
 
 
@@ -70,11 +70,16 @@ def pytest_collection_modifyitems(config, items):
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Rows of the tests that passed, in the order of their names."""
+    """Rows of the tests that passed, in the order of their names; rows of tests that did not run stay as they are."""
     file = config.getoption("--verification")
     if file:
-        passed = sorted(terminalreporter.stats.get("passed", []), key=lambda report: report.nodeid)
+        stats = terminalreporter.stats
+        ran = {r.nodeid for kind in ("passed", "failed", "skipped", "error") for r in stats.get(kind, [])}
+        passed = stats.get("passed", [])
         rows = [dict(row, test=r.nodeid) for r in passed for name, row in r.user_properties if name == "verified"]
+        before = json.loads(file.read_text())["rows"] if file.exists() else []
+        old = [r for r in before if r["test"] not in ran and Path(config.rootpath, r["test"].split("::")[0]).exists()]
+        rows = sorted(rows + old, key=lambda row: row["test"])
         content = {"rows": rows, "environment": versions()}
         file.write_text(json.dumps(content, indent=1) + "\n")
 
