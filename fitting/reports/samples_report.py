@@ -154,7 +154,7 @@ def table(found: Samples) -> str:
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
     name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # the first that most have
-    rows.append(f"{'sample':32s} {'mean error':>10s}   {name}")
+    rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):
         value, error = own[name]
         mark = " *" if name in edges.moved(fit) else ""
