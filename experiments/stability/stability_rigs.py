@@ -3,10 +3,12 @@
 Tension, a punch of 0.4 of the radius and creep of a neo-Hookean cylinder glued to its plates, at small strain, against
 tests/rig_values.json: converged numbers of a program that shares no line with this one (axisymmetric, small strain,
 `experiments/sources/axisymmetric_reference.py`).
-``python -m experiments stability_rigs`` writes results/stability_rigs.json.
+``python -m experiments stability_rigs`` writes results/stability_rigs.json;
+``python -m experiments.stability.stability_rigs tension meshes`` runs these parts again.
 """
 
 import json
+import sys
 import time
 from typing import Any
 
@@ -16,7 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import liverjax as lj
-from experiments.common import ROOT, either, plain_ticks, save
+from experiments.common import RESULTS, ROOT, either, plain_ticks, save
 from fitting.rigs import glued
 from liverjax.core import status
 from liverjax.core.plotting import COLOURS
@@ -92,17 +94,24 @@ def choices() -> list[tuple[str, glued.Cells]]:
     return made
 
 
-def main() -> None:
-    """The default at every shape, then other meshes at one."""
+def main(wanted: list[str]) -> None:
+    """The default at every shape, then other meshes at one; or the parts that are named."""
+    file = RESULTS / "stability_rigs.json"
     found: dict[str, list] = {"default": [], "meshes": []}
-    for test in TESTS:
+    if wanted and file.is_file():
+        found = json.loads(file.read_text())
+    wanted = wanted or [*TESTS, "meshes"]
+    for test in (t for t in TESTS if t in wanted):
+        found["default"] = [r for r in found["default"] if r["test"] != test]
         for aspect in ASPECTS:
             found["default"] += row(test, aspect, glued.Cells(), RATIOS)
             save("stability_rigs", found)
-    for test in TESTS:
-        for name, cells in choices():
-            found["meshes"] += [{"mesh": name} | r for r in row(test, 1.0, cells, either((20.0, 1e4), (20.0,)))]
-            save("stability_rigs", found)
+    if "meshes" in wanted:
+        found["meshes"] = []
+        for test in TESTS:
+            for name, cells in choices():
+                found["meshes"] += [{"mesh": name} | r for r in row(test, 1.0, cells, either((20.0, 1e4), (20.0,)))]
+                save("stability_rigs", found)
     save("stability_rigs", found, _figure(found["meshes"]))
 
 
@@ -128,4 +137,4 @@ def _figure(rows: list[dict]) -> plt.Figure:
 
 
 if __name__ == "__main__":
-    main()
+    main([a for a in sys.argv[1:] if not a.startswith("-")])

@@ -15,6 +15,25 @@ PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 #: the most patches: the coarse matrix is dense, with 12 unknowns a patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
+#: Neighbours are near where their distance is below this part of the mean one of either; most nodes of a cluster; the
+#: part of its vertices that must have a near neighbour for a mesh to have clusters.
+NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
+
+
+@struct
+class Clusters:
+    """Groups of near nodes in thin cells, and where the blocks of their matrices come from.
+
+    The entries of the matrix between two nodes a < b of a cluster have a place a M + b in its M x M blocks.
+    """
+
+    nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
+    there: jax.Array = param("1", "1 for a member, 0 for padding (G, M)")
+    places: jax.Array = param("1", "in all blocks (G M M), of every source (n,)")
+    sources: tuple[jax.Array, ...] = param(
+        "1", "of vertices (edge,); of functions of elements (element, one function, another, sign of the product) (n,)"
+    )
+
 
 @struct
 class Pattern:
@@ -28,6 +47,7 @@ class Pattern:
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
     patch_functions: jax.Array = param("1", "1 and the place in its patch, about 1 in size, of every node (V, 4)")
     patch_width: jax.Array = param("m", "mean of the patches' widest extents")
+    clusters: Any = param("1", "`Clusters` of the vertices, where cells are thin", default=None)
     number_of_patches: int = static(default=1, about="P")
 
 
@@ -69,6 +89,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
         patches=jnp.asarray(near),
         patch_functions=functions,
         patch_width=widest,
+        clusters=None if traced else vertex_clusters(np.asarray(points), np.stack([low, high])),
         number_of_patches=int(near.max(initial=0)) + 1,
     )
 
@@ -98,3 +119,80 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
     half = xp.where(widest > 0, widest / 2, 1.0)
     place = (points - (low + high)[patch] / 2) / half[patch][:, None]
     return jnp.asarray(xp.concatenate([xp.ones_like(place[:, :1]), place], axis=1)), jnp.asarray(xp.mean(widest))
+
+
+def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
+    """Clusters of vertices (V, 3) that edges (2, N) join; None where few cells are thin; host side."""
+    return _clustered(near_groups(points, edges), edges, (np.arange(edges.shape[1]),))
+
+
+def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) -> Clusters | None:
+    """Clusters of the functions of elements: their numbers (n, E), places (N, 3), signs (n, E); host side."""
+    a, b = np.triu_indices(len(nodes), 1)
+    pairs, elements = np.stack([nodes[a], nodes[b]]).reshape(2, -1), np.tile(np.arange(nodes.shape[1]), len(a))
+    group = near_groups(places, np.unique(np.sort(pairs, axis=0), axis=1))
+    each = (elements, np.repeat(a, nodes.shape[1]), np.repeat(b, nodes.shape[1]), (signs[a] * signs[b]).ravel())
+    return _clustered(group, pairs, each)
+
+
+def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Number of the group of every node (V,): nodes that chains of near pairs (2, N) join; host side."""
+    count, (one, other) = len(places), pairs
+    square = np.sum((places[one] - places[other]) ** 2, axis=1)
+    neighbours = np.maximum(np.bincount(pairs.ravel(), minlength=count), 1)
+    mean = np.bincount(pairs.ravel(), np.tile(square, 2), count) / neighbours
+    near = square < NEAR**2 * np.minimum(mean[one], mean[other])
+    if len(np.unique(pairs[:, near])) < SHARE * count:
+        return np.arange(count)
+    import scipy.sparse.csgraph  # takes long to import, and few meshes want it
+
+    graph = scipy.sparse.coo_array((np.ones(near.sum()), (one[near], other[near])), shape=(count, count))
+    number, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    for large in np.flatnonzero(np.bincount(group) > LARGEST_CLUSTER):
+        left = [np.flatnonzero(group == large)]
+        while left:
+            nodes = left.pop()
+            if len(nodes) <= LARGEST_CLUSTER:
+                group[nodes], number = number, number + 1
+                continue
+            axis = int(np.argmax(np.ptp(places[nodes], axis=0)))
+            order = nodes[np.argsort(places[nodes, axis], kind="stable")]
+            left += [order[: len(order) // 2], order[len(order) // 2 :]]
+    return _packed(np.asarray(group))
+
+
+def _packed(group: np.ndarray) -> np.ndarray:
+    """Groups of several nodes put together up to the size of the largest: blocks of one size are then nearly full."""
+    size = np.bincount(group)
+    largest, free, last = int(size.max()), 0, 0
+    new = np.arange(len(size))
+    for own in np.argsort(-size, kind="stable")[: int((size > 1).sum())]:
+        if free < size[own]:
+            free, last = largest, own
+        new[own], free = last, free - size[own]
+    return new[group]
+
+
+def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, ...]) -> Clusters | None:
+    """Of groups of nodes (V,), with the pairs (2, n) inside them and what belongs to these."""
+    size = np.bincount(group)
+    if size.max(initial=0) < 2:
+        return None
+    number = np.cumsum(size > 1) - 1  # of a group among those of several nodes
+    order = np.argsort(group, kind="stable")
+    place = np.empty(len(group), int)
+    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
+    many, M = size[group] > 1, int(size.max())
+    nodes, there = np.zeros((2, int((size > 1).sum()), M), int)
+    own = np.flatnonzero(many)
+    nodes[number[group[own]], place[own]], there[number[group[own]], place[own]] = own, 1
+    one, other = pairs
+    inside = np.flatnonzero((group[one] == group[other]) & (one != other))
+    one, other = one[inside], other[inside]
+    places = (number[group[one]] * M + place[one]) * M + place[other]
+    return Clusters(
+        nodes=jnp.asarray(nodes, jnp.int32),
+        there=jnp.asarray(there, float),
+        places=jnp.asarray(places, jnp.int32),
+        sources=tuple(jnp.asarray(s[inside], jnp.int32) for s in sources),
+    )

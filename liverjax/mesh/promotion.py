@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import Indices, replace
-from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.adjacency import PAIRS, Clusters, function_clusters
 from liverjax.mesh.basis import FACES
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -21,7 +21,8 @@ def quadratic(mesh: TetMesh) -> TetMesh:
     low, high = mesh.pattern.edges
     points = jnp.concatenate([mesh.points, 0.5 * (mesh.points[low] + mesh.points[high])])
     sets = {name: jnp.asarray(of_faces(mesh, np.asarray(nodes)), jnp.int32) for name, nodes in mesh.node_sets.items()}
-    return replace(mesh, points=points, node_sets=sets, order=2)
+    made = replace(mesh, points=points, node_sets=sets, order=2)
+    return replace(made, clusters=_all_clusters(made))
 
 
 def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
@@ -45,7 +46,26 @@ def cubic(mesh: TetMesh) -> TetMesh:
     _, number = np.unique(triples, axis=0, return_inverse=True)
     more = mesh.pattern.edges.shape[1] + int(number.max()) + 1
     points = jnp.concatenate([mesh.points, jnp.zeros((more, 3), mesh.points.dtype)])
-    return replace(mesh, points=points, faces=jnp.asarray(number.reshape(4, -1), jnp.int32), order=3)
+    made = replace(mesh, points=points, faces=jnp.asarray(number.reshape(4, -1), jnp.int32), order=3)
+    return replace(made, clusters=_all_clusters(made))
+
+
+def _all_clusters(mesh: TetMesh) -> Clusters | None:
+    """Of all functions, each at its middle, where the vertices have clusters; host side."""
+    if mesh.pattern.clusters is None or isinstance(mesh.points, jax.core.Tracer):
+        return None
+    points, tets, (low, high) = (np.asarray(a) for a in (mesh.points, mesh.tetrahedra, mesh.pattern.edges))
+    nodes = np.stack([np.asarray(n) for n in mesh.element_nodes])
+    signs, places = np.ones(nodes.shape), points
+    if mesh.order == 3:
+        first, V = 4 + len(PAIRS), mesh.number_of_vertices
+        signs[first : first + len(PAIRS)] = [np.where(tets[:, i] < tets[:, j], 1, -1) for i, j in PAIRS]
+        middles = (points[low] + points[high]) / 2
+        centres = np.zeros((mesh.number_of_nodes - V - 2 * len(low), 3))
+        for face, number in zip(FACES, np.asarray(mesh.faces), strict=True):
+            centres[number] = points[tets[:, face]].mean(axis=1)
+        places = np.concatenate([points[:V], middles, middles, centres])
+    return function_clusters(nodes, places, signs)
 
 
 def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:

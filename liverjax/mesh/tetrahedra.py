@@ -39,6 +39,7 @@ class TetMesh:
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
     pattern: Pattern = param("1", "which vertices share an element")
     faces: Any = param("1", "number of each of an element's faces (4, E), of order 3", default=None)
+    clusters: Any = param("1", "`Clusters` of all nodes of an order above 1, where cells are thin", default=None)
     order: int = static(default=1, about="of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property

@@ -21,9 +21,10 @@ from liverjax.physics import darcy
 from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
-from liverjax.solvers import attached, block_matrix, direct, point_matrix
+from liverjax.solvers import attached, block_matrix, clusters, direct, point_matrix
 from liverjax.solvers.attached import Attached, GivesWay
 from liverjax.solvers.block_matrix import Block, BlockMatrix
+from liverjax.solvers.clusters import Inverses
 from liverjax.solvers.krylov import (
     conjugate_gradients,
     stabilised_biconjugate_gradients,
@@ -31,7 +32,7 @@ from liverjax.solvers.krylov import (
     true_residual,
 )
 from liverjax.solvers.point_matrix import PointMatrix
-from liverjax.solvers.preconditioner import Coarse, coarse, corrected, worthwhile
+from liverjax.solvers.preconditioner import Coarse, coarse, coarse_of_product, corrected, correction, worthwhile
 from liverjax.tensors.matrices import (
     Matrix,
     add_matrices,
@@ -131,13 +132,14 @@ class Tangent(NamedTuple):
     """A tangent ready to be solved with: assembled at one point, good for some iterations near it."""
 
     matrix: BlockMatrix | PointMatrix
-    inverse: Block  # of its diagonal blocks
-    vertices: Block | None  # of quadratic elements: of the diagonal blocks of the vertices' linear elements
+    inverse: Inverses  # of its diagonal blocks
+    vertices: Inverses | None  # of quadratic elements: of the diagonal blocks of the vertices' linear elements
     slow: Coarse
     x: jax.Array | None  # (V, 3) where it was made, for loads that follow
     s: Any  # part of the step there
     follows: jax.Array | None  # 1 where these loads count, 0 in a tangent without negative eigenvalues
     attached: tuple[Attached | GivesWay, ...] = ()  # elements between nodes, not in the matrix
+    pressures: Coarse | None = None  # of unknown pressures in thin cells
 
 
 def tangent(
@@ -162,11 +164,40 @@ def tangent(
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     # Loads that follow the body need to know where.
     where, part, follows = (None, None, None) if e.conservative else (x, s, jnp.asarray(kind == "true", x.dtype))
-    return Tangent(matrix, inverse, below, slow, where, part, follows, more)
+    K = Tangent(matrix, inverse, below, slow, where, part, follows, more)
+    if not _thin(e):
+        return K
+
+    def slow_pressures() -> Coarse:
+        return _slow_pressures(e, K)
+
+    own = slow_pressures() if near is None else jax.lax.cond(near[0], lambda: near[1].pressures, slow_pressures)
+    return K._replace(pressures=own)
+
+
+def _thin(e: Equations) -> bool:
+    """Whether pressures are unknown in thin cells."""
+    return e.mixed is not None and _groups_in_use(e, e.mesh.pattern.clusters) is not None
+
+
+@jax.jit
+def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
+    """The coarse space of the pressures, motions eliminated roughly.
+
+    In a layer between plates, pressures that vary slowly along it move much less than their mass tells.
+    """
+    motions, volume = _motions(e, K), e.mixed
+
+    def eliminated(p: jax.Array) -> jax.Array:
+        moved = e.free.columns(motions(e.free.columns(mixed_system.pulled(e.mesh, K.matrix, p))))
+        _, balance = mixed_system.with_pressures(e.mesh, volume, K.matrix, (moved, -p / volume.unit))
+        return balance / volume.unit
+
+    return coarse_of_product(e.mesh, eliminated)
 
 
 #: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
-_Assembled = tuple[BlockMatrix | PointMatrix, Block, Block | None, BlockMatrix, tuple[Attached | GivesWay, ...]]
+_Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Attached | GivesWay, ...]]
 
 # A program has the two functions below several times: within jit they are traced once.
 
@@ -192,8 +223,21 @@ def _assembled(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
         diagonal = mixed_system.undrained_diagonal(A, 1.0 if volume.flow is None else volume.flow.mask)
     more = _attached(e, x, s, kind)
     near = _symmetric(e, more)
-    inverse = block_matrix.inverse_blocks(_with_diagonals(e, diagonal, near), e.free.mask, e.free.normals)
+    inverse = _vertex_inverses(e, e.free, A, _with_diagonals(e, diagonal, near))
     return A, inverse, None, attached.with_attached(mesh, A, near), more
+
+
+def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) -> Inverses:
+    """Inverse blocks of the vertices of a matrix with the given diagonal blocks, and of clusters of them."""
+    single = block_matrix.inverse_blocks(diagonal, free.mask, free.normals)
+    groups = _groups_in_use(e, e.mesh.pattern.clusters)
+    entries = clusters.of_rows(groups, e.mesh.pattern.edge_slots, A)
+    return clusters.inverses(groups, entries, diagonal, free.mask, single)
+
+
+def _groups_in_use(e: Equations, groups: Any) -> Any:
+    """Clusters if they are used: a factorisation wants none, and nodes that slide on oblique planes have none."""
+    return None if e.free.normals is not None or e.scene.solve.linear_solver == "direct" else groups
 
 
 @jax.jit
@@ -222,10 +266,11 @@ def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
     own = point_matrix.levels(mesh, A, bulk)
     more = _attached(e, x, s, kind)
     near = _symmetric(e, more)
-    inverse = block_matrix.inverse_blocks(_with_diagonals(e, own.diagonal, near), e.free.mask, e.free.normals)
-    free, below = _of_vertices(e), attached.with_attached(mesh, own.vertices, near)
-    vertices = block_matrix.inverse_blocks(below.diagonal, free.mask, free.normals)
-    return A, inverse, vertices, below, more
+    diagonal, groups = _with_diagonals(e, own.diagonal, near), _groups_in_use(e, mesh.clusters)
+    single = block_matrix.inverse_blocks(diagonal, e.free.mask, e.free.normals)
+    inverse = clusters.inverses(groups, clusters.of_points(groups, mesh.order, A), diagonal, e.free.mask, single)
+    below = attached.with_attached(mesh, own.vertices, near)
+    return A, inverse, _vertex_inverses(e, _of_vertices(e), below, below.diagonal), below, more
 
 
 def _of_vertices(e: Equations) -> Free:
@@ -247,16 +292,24 @@ def _coarse_mask(free: Free) -> jax.Array:
 
 def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]:
     """Inverse diagonal blocks, with the coarse solution added, as a function of flat vectors (3 V,)."""
+    return _with_pressures(e, K, _motions(e, K))
+
+
+def _motions(e: Equations, K: Tangent) -> Callable:
+    """The part for the motions, as a function of columns (V,)."""
+    mesh = e.mesh
+    vertices = _groups_in_use(e, mesh.pattern.clusters)
+    nodes = vertices if mesh.order == 1 else _groups_in_use(e, mesh.clusters)
 
     def fine(columns: Any) -> tuple[jax.Array, ...]:
-        return block_matrix.applied(K.inverse, e.free.columns(columns))
+        return clusters.smoothed(nodes, K.inverse, e.free.columns(columns))
 
     if K.vertices is None:
-        return _with_pressures(e, K, corrected(e.mesh, K.slow, _coarse_mask(e.free), fine))
+        return corrected(e.mesh, K.slow, _coarse_mask(e.free), fine)
     inverse, free = K.vertices, _of_vertices(e)
 
     def linear(columns: Any) -> tuple[jax.Array, ...]:
-        return block_matrix.applied(inverse, free.columns(columns))
+        return clusters.smoothed(vertices, inverse, free.columns(columns))
 
     level = corrected(e.mesh, K.slow, _coarse_mask(free), linear)
 
@@ -266,7 +319,7 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
         added = [point_matrix.prolonged(e.mesh, c) for c in below]
         return tuple(a + b for a, b in zip(fine(columns), added, strict=True))
 
-    return _with_pressures(e, K, levels)
+    return levels
 
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
@@ -275,10 +328,14 @@ def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[ja
         return lambda r: _flat(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
     schur = volume.unit**2 * volume.schur(e.mesh)
+    every = jnp.ones((e.mesh.number_of_vertices, 1), schur.dtype)
+    slow = None if K.pressures is None else correction(e.mesh, K.pressures, every)
 
     def triangular(r: jax.Array) -> jax.Array:
         """Solve for the pressures first, then for the motions under the forces that are left."""
         dp = -r[n:] / schur
+        if slow is not None:
+            dp = dp - slow((r[n:],))[0] / volume.unit**2
         pulled = mixed_system.pulled(e.mesh, K.matrix, volume.unit * dp)
         left = [f - p for f, p in zip(block_matrix.columns(r[:n]), pulled, strict=True)]
         return jnp.concatenate([_flat(e, motions(left)), dp])

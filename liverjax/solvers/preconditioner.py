@@ -39,17 +39,33 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coar
     f, number = mesh.pattern.patch_functions, mesh.pattern.number_of_patches
 
     def invert(A):
-        E = _galerkin(mesh, A, f, mask, number)
-        d = jnp.diagonal(E)
-        # A patch without free nodes along an axis, or a flat one, has motions that vanish: kept out of the inverse.
-        E = E + jnp.diag(jnp.where(d > 0, max(1e-9, 100 * float(jnp.finfo(d.dtype).eps)) * d, 1.0))
-        factor = jax.scipy.linalg.cho_factor(E)
-        inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(len(E), dtype=E.dtype))
-        return jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0.0)
+        return _inverse(_galerkin(mesh, A, f, mask, number))
 
     size = 4 * mask.shape[1] * number
     inverse = jax.lax.cond(used, invert, lambda A: jnp.zeros((size, size), f.dtype), A)
     return Coarse(inverse, jnp.asarray(used))
+
+
+def _inverse(E: jax.Array) -> jax.Array:
+    """The inverse of a coarse matrix; 0 if it is not positive definite."""
+    d = jnp.diagonal(E)
+    # A patch without free nodes along an axis, or a flat one, has motions that vanish: kept out of the inverse.
+    E = E + jnp.diag(jnp.where(d > 0, max(1e-9, 100 * float(jnp.finfo(d.dtype).eps)) * d, 1.0))
+    factor = jax.scipy.linalg.cho_factor(E)
+    inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(len(E), dtype=E.dtype))
+    return jnp.where(jnp.all(jnp.isfinite(inverse)), inverse, 0.0)
+
+
+def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) -> Coarse:
+    """The coarse space of a symmetric matrix of the vertices, given as a function of (V,): a product a function."""
+    f, patch, number = mesh.pattern.patch_functions, mesh.pattern.patches, mesh.pattern.number_of_patches
+
+    def column(k: jax.Array) -> jax.Array:
+        result = product(jnp.where(patch == k // 4, f[:, k % 4], 0.0))
+        return given(jnp.zeros_like(f[:1], shape=(number, 4)), patch, f * result[:, None]).ravel()
+
+    E = jax.lax.map(column, jnp.arange(4 * number))
+    return Coarse(_inverse((E + E.T) / 2), jnp.array(True))
 
 
 def worthwhile(A: BlockMatrix, inertia: Any) -> jax.Array:

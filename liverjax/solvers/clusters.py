@@ -1,0 +1,104 @@
+"""Dense inverse blocks of clusters of near nodes: a part of the preconditioner of meshes with thin cells.
+
+In a thin cell the nodes across it are coupled much more strongly than those along it, and block-Jacobi spreads a motion
+across by one node an iteration. So chains of near nodes (`liverjax.mesh.adjacency.Clusters`) are one block each.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.mesh.adjacency import Clusters
+from liverjax.mesh.basis import basis
+from liverjax.solvers import block_matrix
+from liverjax.solvers.block_matrix import Block, BlockMatrix
+from liverjax.solvers.point_matrix import PointMatrix
+from liverjax.tensors.places import given, taken
+
+#: Entries between nodes that are made at once, of quadratic elements.
+_AT_ONCE = 2048
+
+
+class Inverses(NamedTuple):
+    """Inverse blocks of single nodes, 0 of those in clusters, and of clusters of M nodes."""
+
+    nodes: Block  # 3 x 3 of (V,)
+    clusters: jax.Array | None = None  # (G, 3 M, 3 M)
+
+
+def inverses(
+    clusters: Clusters | None, entries: jax.Array | None, diagonal: Block, mask: jax.Array, single: Block
+) -> Inverses:
+    """Inverse blocks of clusters, beside those of single nodes; a cluster that is not positive definite has none.
+
+    Args:
+        clusters: of the mesh; None: there are none.
+        entries: (n, 3, 3) blocks of the matrix, by the sources of the clusters.
+        diagonal: 3 x 3 of (V,), blocks of the matrix.
+        mask: (V, 3) 1 where free.
+        single: inverse blocks of single nodes, 3 x 3 of (V,).
+    """
+    if clusters is None or entries is None:
+        return Inverses(single)
+    G, M = clusters.nodes.shape
+    above = given(jnp.zeros((G * M * M, 3, 3), entries.dtype), clusters.places, entries).reshape(G, M, M, 3, 3)
+    own = jnp.stack([jnp.stack(row, axis=-1) for row in diagonal], axis=-2)
+    own = taken(own, clusters.nodes)[:, :, None] * jnp.eye(M, dtype=own.dtype)[None, :, :, None, None]
+    K = jnp.transpose(above + jnp.transpose(above, (0, 2, 1, 4, 3)) + own, (0, 1, 3, 2, 4)).reshape(G, 3 * M, 3 * M)
+    free = (taken(mask, clusters.nodes) * clusters.there[..., None]).reshape(G, 3 * M).astype(K.dtype)
+    K = K * free[:, :, None] * free[:, None, :] + jax.vmap(jnp.diag)(1 - free)
+    factor = jnp.linalg.cholesky(K)
+    half = jax.vmap(lambda L: jax.scipy.linalg.solve_triangular(L, jnp.eye(3 * M, dtype=L.dtype), lower=True))(factor)
+    inverse = jnp.einsum("gki,gkj->gij", half, half)
+    good = jnp.all(jnp.isfinite(inverse), axis=(1, 2))
+    inverse = jnp.where(good[:, None, None], inverse, 0.0) * free[:, :, None] * free[:, None, :]
+    inside = clusters.there * good[:, None]
+    outside = 1 - given(jnp.zeros(len(mask), inside.dtype), clusters.nodes, inside)
+    return Inverses(tuple(tuple(outside * entry for entry in row) for row in single), inverse)
+
+
+def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """The inverse blocks times a vector given by its columns (V,)."""
+    single = block_matrix.applied(A.nodes, columns)
+    if clusters is None or A.clusters is None:
+        return single
+    shape = (*clusters.nodes.shape, 3)
+    near = (taken(jnp.stack(columns, axis=-1), clusters.nodes) * clusters.there[..., None]).reshape(shape[0], -1)
+    moved = jnp.einsum("gij,gj->gi", A.clusters, near).reshape(shape)
+    total = given(jnp.stack(single, axis=-1), clusters.nodes, moved)
+    return tuple(total[:, k] for k in range(3))
+
+
+def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) -> jax.Array | None:
+    """Blocks (n, 3, 3) of a matrix of the vertices, by the sources of their clusters."""
+    if clusters is None:
+        return None
+    slots = taken(edge_slots, clusters.sources[0])
+    entries = [jnp.stack([taken(entry.ravel(), slots) for entry in row[:3]], axis=-1) for row in A.rows[:3]]
+    return jnp.stack(entries, axis=-2)
+
+
+def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
+    """The same (n, 3, 3) of all functions of elements: sum over q, k and l of c_ak K_kl c_bl."""
+    if clusters is None:
+        return None
+    c = basis(order).c
+    slopes = jnp.asarray(c[:, 1:] - c[:, :1], A.blocks[1, 1][0][0].dtype)  # (n, 3, Q)
+    pairs = sorted(A.blocks)
+    # By element: what one needs lies together.
+    K = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in pairs])
+    K = jnp.moveaxis(K, -1, 0)  # (E, 6, 3, 3, Q)
+
+    def entry(source):
+        element, one, other, sign = source
+        a, b, own = slopes[one], slopes[other], K[element]
+        block = jnp.zeros((3, 3), K.dtype)
+        for place, (k, m) in enumerate(pairs):
+            block = block + own[place] @ (a[k - 1] * b[m - 1])
+            if k != m:
+                block = block + (own[place] @ (a[m - 1] * b[k - 1])).T
+        return sign * block
+
+    return jax.lax.map(entry, clusters.sources, batch_size=_AT_ONCE)
