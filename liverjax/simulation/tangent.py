@@ -176,8 +176,11 @@ def tangent(
 
 
 def _thin(e: Equations) -> bool:
-    """Whether pressures are unknown in thin cells."""
-    return e.mixed is not None and _groups_in_use(e, e.mesh.pattern.clusters) is not None
+    """Whether pressures are unknown in thin cells of linear elements.
+
+    In quadratic ones, squeezed far, their coarse space makes the iterations more, not less.
+    """
+    return e.mixed is not None and e.mesh.order == 1 and _groups_in_use(e, e.mesh.pattern.clusters) is not None
 
 
 @jax.jit
