@@ -50,7 +50,7 @@ def test_blocks_are_the_inverse_of_the_tangents(order):
         inverse = np.linalg.inv(exact[np.ix_(unknown[used], unknown[used])])
         assert np.abs(block[np.ix_(used, used)] - inverse).max() < 1e-11 * np.abs(inverse).max()
         seen += used.sum()
-    assert seen > 0.9 * free.sum()
+    assert seen > 0.8 * free.sum()
 
 
 def test_cells_of_equal_sides_have_no_clusters():

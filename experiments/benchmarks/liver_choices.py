@@ -1,28 +1,21 @@
 """Error against run time for the liver phantom: time step and integrator, recursion, Newton's tolerance, porous scheme,
-explicit against implicit; and the mesh.
+explicit against implicit.
 
 The error is the largest distance of a node from a fine run at 0.6, 1.2 and 1.8 s, relative to the largest displacement.
-The fine run has the same mesh, but for the last question: there it has quadratic elements, and linear ones are compared
-to it at the vertices, so their error is that of the mesh and of the step.
 
     python -m experiments liver_choices
-
-``python -m experiments.benchmarks.liver_choices mesh`` answers the last question again.
 """
 
-import json
-import sys
 import time
 
 import jax
 import numpy as np
 
 from experiments.benchmarks.baselines import corotational, critical_step, explicit
-from experiments.common import RESULTS, either, plain_ticks, plt, save
+from experiments.common import either, plain_ticks, plt, save
 from experiments.liver import ONE_STEP, error, models, timed_run, with_solve
 from liverjax.core.plotting import COLOURS
 from liverjax.core.struct import replace
-from liverjax.scenes.enriched import enriched
 
 SECONDS, AT = either((1.8, (0.6, 1.2, 1.8)), (0.6, (0.6,)))
 
@@ -33,10 +26,10 @@ class Table:
     def __init__(self, scene, fine):
         self.scene, self.fine, self.series = scene, fine, {}
 
-    def add(self, name, scene, rounds=2):
+    def add(self, name, scene):
         """One more run."""
-        result, row = timed_run(scene, rounds)
-        off = error(result.times, result.positions[:, : self.fine[1].shape[1]], *self.fine, AT)
+        result, row = timed_run(scene)
+        off = error(result.times, result.positions, self.fine[0], self.fine[1], AT)
         self.series.setdefault(name, []).append({"error": off} | row)
         print(name, {k: round(v, 5) for k, v in self.series[name][-1].items()}, flush=True)
 
@@ -109,62 +102,32 @@ def explicit_or_implicit(scene) -> Table:
     return table
 
 
-def meshes(scene) -> Table:
-    """Viscous, Newmark: linear and quadratic elements on the phantom's tetrahedra, against quadratic ones."""
-    vertices, rich = scene.mesh.number_of_vertices, enriched(scene)
-    times, x = fine_run(rich, either(0.01, 0.05))
-    table = Table(scene, (times, x[:, :vertices]))
-    for dt in either((0.05, 0.02), (0.1,)):
-        for name, own in (("linear elements", scene), ("quadratic elements", rich)):
-            table.add(name, with_solve(own, SECONDS, dt, integrator="newmark"), rounds=1)
-    return table
-
-
-QUESTIONS = {
-    "time step, integrator, recursion (viscous)": (time_steps, "viscous"),
-    "Newton's tolerance (viscous, 0.05 s)": (newton, "viscous"),
-    "porous scheme (complete)": (porous, "complete"),
-    "explicit against implicit (hyperelastic)": (explicit_or_implicit, "hyperelastic"),
-}
-MESH = "mesh (viscous, Newmark)"
-
-
-def main(wanted: list[str]) -> None:
-    """Five questions, one figure."""
-    scenes, content = models(), {}
-    if wanted == ["mesh"]:
-        content = json.loads((RESULTS / "liver_choices.json").read_text())
-    else:
-        for title, (question, model) in QUESTIONS.items():
-            table = question(scenes[model])
-            content[title] = _finite(table)
-            if hasattr(table, "limit"):
-                content["critical_step_s"] = table.limit
-    content[MESH] = _finite(meshes(scenes["viscous"]))
-    save("liver_choices", content, _figure(content))
-
-
-def _finite(table: Table) -> dict[str, list[dict]]:
-    """The rows, without numbers that JSON has not."""
-    return {
-        name: [{k: (v if np.isfinite(v) else None) for k, v in r.items()} for r in rows]
-        for name, rows in table.series.items()
+def main() -> None:
+    """Four questions, one figure."""
+    scenes = models()
+    tables = {
+        "time step, integrator, recursion (viscous)": time_steps(scenes["viscous"]),
+        "Newton's tolerance (viscous, 0.05 s)": newton(scenes["viscous"]),
+        "porous scheme (complete)": porous(scenes["complete"]),
+        "explicit against implicit (hyperelastic)": explicit_or_implicit(scenes["hyperelastic"]),
     }
-
-
-def _figure(content: dict) -> plt.Figure:
-    """Error against run time, a panel a question."""
-    fig, all_axes = plt.subplots(2, 3, figsize=(12, 7), layout="constrained")
-    for axes, title in zip(all_axes.ravel(), (*QUESTIONS, MESH), strict=False):
-        for (name, rows), colour in zip(content[title].items(), COLOURS, strict=False):
-            shown = [r for r in rows if r["error"] is not None and r["error"] < 10]
+    fig, all_axes = plt.subplots(2, 2, figsize=(9, 7), layout="constrained")
+    for axes, (title, table) in zip(all_axes.ravel(), tables.items(), strict=True):
+        for (name, rows), colour in zip(table.series.items(), COLOURS, strict=False):
+            shown = [r for r in rows if np.isfinite(r["error"]) and r["error"] < 10]
             axes.loglog([r["run_s"] for r in shown], [100 * r["error"] for r in shown], "o-", color=colour, label=name)
         axes.set(title=title, xlabel=f"run time of {SECONDS} s [s]", ylabel="error of positions [%]")
         plain_ticks(axes.xaxis)
         axes.legend(fontsize=7)
-    all_axes[1, 2].set_visible(False)
-    return fig
+    content = {
+        title: {
+            name: [{k: (v if np.isfinite(v) else None) for k, v in r.items()} for r in rows]
+            for name, rows in table.series.items()
+        }
+        for title, table in tables.items()
+    }
+    save("liver_choices", content | {"critical_step_s": tables["explicit against implicit (hyperelastic)"].limit}, fig)
 
 
 if __name__ == "__main__":
-    main([a for a in sys.argv[1:] if not a.startswith("-")])
+    main()
