@@ -21,11 +21,11 @@ def came_out() -> str:
 
 def _quickest(rows: list[dict], what: str, time: str, limit: float) -> str:
     """Elements and seconds of the quickest row within an error, or that there is none."""
-    good = [r for r in rows if abs(r[what]) <= limit and (what == "error" or r["found"]) and time in r]
+    good = [r for r in rows if abs(r[what]) <= limit and (what == "error" or r["found"])]
     if not good:
         return "none here"
-    best = min(good, key=lambda r: r[time])
-    return f"{best['elements']:,} {best['form']} elements in {short(best[time])} s"
+    best = min(good, key=lambda r: r.get(time, r["elements"]))
+    return f"{best['elements']:,} {best['form']} elements" + (f" in {short(best[time])} s" if time in best else "")
 
 
 def phantom() -> str:
@@ -43,10 +43,10 @@ def table() -> str:
     """Every row."""
     (data,) = load("elements")
     rows = [
-        "Static answers, two load steps (the liver: one); the estimate is one linearised solve a step in the next",
-        "richer elements. Effectivity: what it adds, over what is missing. Corrected: the error with it added. The",
-        "truth of Cook's membrane is that of mixed elements on 20 x 20 cells with their own estimate added, of the",
-        "twisted column likewise on 5 x 5 x 15 cells: mixed rows are judged by their own kind. That of Land's beam is",
+        "Static answers, two load steps (the liver: one, the column: five). The estimate is one linearised solve a step",
+        "in the next richer elements. Effectivity: what it adds, over what is missing. Corrected: the error with it",
+        "added. The truth of Cook's membrane is that of mixed elements on 20 x 20 cells with their own estimate added, of",
+        "the twisted column likewise on 5 x 5 x 15 cells: mixed rows are judged by their own kind. That of Land's beam is",
         "3,840 quadratic elements with theirs, 4.191 mm. Run: on one free core, without and with the estimate.",
         "",
         "| body, K/mu | elements | number | error | effectivity | corrected | iterations | run | corrected run |",
@@ -194,7 +194,7 @@ def sentences() -> str:
             f"{1e3 * a['change']:.2g} and {1e3 * b['change']:.2g} mm."
         )
     own = {r["cells"]: r for r in data["rows"] if (r["body"], r["ratio"], r["form"]) == COOK}
-    if 16 in own:
+    if "corrected_s" in own.get(16, {}):
         fine, coarse = own[16], own[8]
         said.append(
             f"Cook's membrane at K/mu = 1e4, {fine['elements']:,} quadratic mixed elements: "
