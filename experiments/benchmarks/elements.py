@@ -344,20 +344,24 @@ def main(wanted: list[str]) -> None:
 def _figure(rows: list[dict]) -> plt.Figure:
     """Error against run time of the bodies that have a truth."""
     cases = [(b, r) for b, r in dict.fromkeys((row["body"], row["ratio"]) for row in rows if "error" in row)]
-    figure, all_axes = plt.subplots(
-        1, max(len(cases), 1), figsize=(3.1 * max(len(cases), 1), 3.4), squeeze=False, layout="constrained"
-    )
-    for axes, (body, ratio) in zip(all_axes[0], cases, strict=False):
+    lines = -(-len(cases) // 4)
+    figure, all_axes = plt.subplots(lines, 4, figsize=(12.4, 3.2 * lines), squeeze=False, layout="constrained")
+    for axes in all_axes.ravel()[len(cases) :]:
+        axes.set_visible(False)
+    for axes, (body, ratio) in zip(all_axes.ravel(), cases, strict=False):
         for colour, form in zip(COLOURS, FORMS, strict=False):
             own = [r for r in rows if (r["body"], r["ratio"], r["form"]) == (body, ratio, form)]
             if own:
                 seconds = [r["run_s"] for r in own]
                 axes.loglog(seconds, [100 * abs(r["error"]) for r in own], "o-", color=colour, label=form)
-                axes.loglog(seconds, [100 * abs(r["corrected"]) for r in own], "x:", color=colour)
+                both = [r for r in own if "corrected_s" in r and r["found"]]
+                seconds = [r["corrected_s"] for r in both]
+                axes.loglog(seconds, [100 * abs(r["corrected"]) for r in both], "x:", color=colour)
         axes.set_title(body + (f", K/mu = {ratio:g}" if ratio else ""))
         axes.set_xlabel("run time [s]")
         plain_ticks(axes.yaxis)
-    all_axes[0][0].set_ylabel("error [%] (crosses: corrected)")
+    for line in all_axes:
+        line[0].set_ylabel("error [%] (crosses: corrected)")
     figure.legend(*all_axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=len(FORMS))
     return figure
 
