@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 from conftest import ROOT
 
-from fitting.fits import viscoelastic
+from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.estimate import spread
 from fitting.methods.generalised_maxwell import Maxwell
@@ -236,7 +236,7 @@ def test_a_shift_by_inertia_is_not_called_discretisation():
     closed = viscoelastic.closed_form(sweep(), 1)
     moved = closed.uncertainty._replace(values=closed.uncertainty.values * np.array([1.0, 1.0, 2.0]))
     plain, heavy = (
-        viscoelastic._bias(closed, closed._replace(uncertainty=moved, details={"density_kg_m3": density}))
+        simulated_rheometer._bias(closed, closed._replace(uncertainty=moved, details={"density_kg_m3": density}))
         for density in (None, 1060.0)
     )
     assert "relaxation_times[0]: the simulation's discretisation moves it by 1e+02 %" in plain[0]
@@ -300,7 +300,7 @@ def test_better_than_pyvisco_on_the_noise_free_table_2_sweep():
 def coarse_torsion():
     s = sweep()
     closed = viscoelastic.closed_form(s, 2)
-    return s, closed, viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004))
+    return s, closed, simulated_rheometer.through_torsion(s, closed, simulated_rheometer.Simulation(cell_size=0.004))
 
 
 @pytest.mark.core
@@ -316,7 +316,7 @@ def test_the_table_says_what_the_simulation_adds(coarse_torsion):
     near = simulated._replace(
         uncertainty=simulated.uncertainty._replace(values=closed.uncertainty.values + 0.03 * errors)
     )
-    assert viscoelastic.largest_shift(closed, near) == pytest.approx(0.03)
+    assert simulated_rheometer.largest_shift(closed, near) == pytest.approx(0.03)
     assert "agree within 3 % of the standard errors" in sweep_report._agreement([closed, near])[0]
     far = simulated._replace(uncertainty=simulated.uncertainty._replace(values=closed.uncertainty.values + 2 * errors))
     assert "moves a number by 2 standard errors" in sweep_report._agreement([closed, far])[0]
@@ -342,7 +342,8 @@ def test_the_biases_are_what_simulated_and_closed_form_differ_by(coarse_torsion)
 def test_chapter_recursion_biases_the_fit():
     s = sweep(omega=OMEGA[::3])
     closed = viscoelastic.closed_form(s, 2)
-    f = viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004, scheme="chapter"))
+    simulation = simulated_rheometer.Simulation(cell_size=0.004, scheme="chapter")
+    f = simulated_rheometer.through_torsion(s, closed, simulation)
     # First order: at 50 steps a cycle its G'' is 5 % off at 4 Hz, which the parameters have to absorb.
     assert f.converged and np.abs(parameters(f) / TRUTH - 1).max() > 0.02
 

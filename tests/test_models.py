@@ -10,7 +10,7 @@ import scipy.optimize
 from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
-from fitting.fits import viscoelastic
+from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.families import models
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Maxwell
@@ -183,7 +183,7 @@ def test_no_start_of_scipy_is_below_the_spectrum():
     s = read_sweep(ROOT / "data" / GIVEN["lion's mane"])
     found = relaxation_spectrum.fit(s)
     scales, data = np.concatenate(s.deviations), np.concatenate([s.storage, s.loss])
-    A = relaxation_spectrum.mode_columns(s.angular_frequency, found.times) / scales[:, None]
+    A = generalised_maxwell.mode_columns(s.angular_frequency, found.times) / scales[:, None]
     A, b = np.vstack([A, found.prior]), np.concatenate([data / scales, np.zeros(len(found.prior))])
     ours = 0.5 * np.sum((A @ np.concatenate([[found.equilibrium], found.strengths]) - b) ** 2)
     rng = np.random.default_rng(0)
@@ -263,7 +263,7 @@ def test_options_that_do_not_go_together_are_refused(options, sentence, tmp_path
 def test_a_fractional_model_goes_through_the_torsion_simulation():
     s = fractional_sweep("fractional_zener", omega=np.geomspace(0.5, 30, 7))
     closed = next(f for f in models.fractional(s) if f.kind.name == "fractional_zener")
-    f = viscoelastic.through_torsion(s, closed, viscoelastic.Simulation(cell_size=0.004))
+    f = simulated_rheometer.through_torsion(s, closed, simulated_rheometer.Simulation(cell_size=0.004))
     # Of the fit: the conversion (below 1 %) and 50 steps a cycle (0.15 %).
     assert f.converged and np.allclose(f.parameters.values, TRUTHS["fractional_zener"], rtol=0.05)
     assert np.max(f.relative_errors(s)) < 0.01

@@ -11,7 +11,7 @@ import scipy.stats
 from conftest import ROOT
 
 from fitting.__main__ import main
-from fitting.fits import posterior, viscoelastic
+from fitting.fits import posterior, simulated_rheometer, viscoelastic
 from fitting.methods import generalised_maxwell, springpots, uncertainty
 from fitting.methods.least_squares import levenberg_marquardt
 from fitting.methods.sampling import tempering
@@ -214,8 +214,8 @@ def test_relaxation_is_sampled_too(tmp_path):
 def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path):
     sweep = one_mode(0.02, 2)
     closed = viscoelastic.closed_form(sweep, 1)
-    simulation = viscoelastic.Simulation(steps=20)
-    fit = viscoelastic.through_torsion(sweep, closed, simulation)
+    simulation = simulated_rheometer.Simulation(steps=20)
+    fit = simulated_rheometer.through_torsion(sweep, closed, simulation)
     found = posterior.of_simulation(fit, sweep, simulation, 500)
     assert found.simulated["largest_difference"] < 1e-2 and found.r_hat.max() < 1.02
     assert np.all(

@@ -9,7 +9,7 @@ import pytest
 
 import liverjax as lj
 from fitting import __main__ as command
-from fitting.fits.viscoelastic import Simulation, rig_of
+from fitting.fits.simulated_rheometer import Simulation, rig_of
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.rigs import compression, torsion

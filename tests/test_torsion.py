@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting.fits import viscoelastic
+from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep
@@ -144,12 +144,12 @@ def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
 def test_the_linear_rig_has_the_derivatives_of_the_simulation(part):
     """Along a random direction in all parameters, to the order of the strain; a fit needs no more."""
     sweep = Sweep(OMEGA, np.array([320.0, 480.0, 580.0]), np.array([50.0, 110.0, 130.0]))
-    simulation = viscoelastic.Simulation(cell_size=0.004, part=part)
-    rig, law = viscoelastic.rig_of(simulation), lj.laws.typical("neo_hookean")
+    simulation = simulated_rheometer.Simulation(cell_size=0.004, part=part)
+    rig, law = simulated_rheometer.rig_of(simulation), lj.laws.typical("neo_hookean")
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured = np.concatenate([sweep.storage, sweep.loss])
     data = (rig, law, jnp.asarray(OMEGA), torque, measured, np.ones(6))
-    run = jax.jit(partial(viscoelastic.with_jacobian, simulation=simulation))
+    run = jax.jit(partial(simulated_rheometer.with_jacobian, simulation=simulation))
     model = Maxwell(np.array(770.0), np.array([0.235, 0.333]), np.array([0.27, 0.03]))
     u, direction = generalised_maxwell.unconstrained(model), np.random.default_rng(0).normal(size=5)
     slope = np.asarray(run(u, data)[1]) @ direction
@@ -159,11 +159,11 @@ def test_the_linear_rig_has_the_derivatives_of_the_simulation(part):
 
 
 def test_inertia_and_large_strain_keep_the_derivative_and_the_mesh_of_the_simulation(monkeypatch):
-    coarse = viscoelastic.rig_of(viscoelastic.Simulation()).mesh.number_of_nodes
-    for simulation in (viscoelastic.Simulation(density=1060.0), viscoelastic.Simulation(strain=0.05)):
-        assert viscoelastic.rig_of(simulation).mesh.number_of_nodes > 2 * coarse
-        monkeypatch.setattr(viscoelastic, "simulated_residuals", lambda u, *_: (u**2, None))
-        _, J, _ = viscoelastic.with_jacobian(jnp.arange(3.0), (), simulation)
+    coarse = simulated_rheometer.rig_of(simulated_rheometer.Simulation()).mesh.number_of_nodes
+    for simulation in (simulated_rheometer.Simulation(density=1060.0), simulated_rheometer.Simulation(strain=0.05)):
+        assert simulated_rheometer.rig_of(simulation).mesh.number_of_nodes > 2 * coarse
+        monkeypatch.setattr(simulated_rheometer, "simulated_residuals", lambda u, *_: (u**2, None))
+        _, J, _ = simulated_rheometer.with_jacobian(jnp.arange(3.0), (), simulation)
         assert np.allclose(J, np.diag([0.0, 2.0, 4.0]))
 
 
@@ -178,12 +178,12 @@ def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatc
         return SimpleNamespace(storage=jnp.real(G), loss=jnp.imag(G))
 
     monkeypatch.setattr(torsion, "moduli", moduli)
-    simulation = viscoelastic.Simulation()
-    r, J, _ = viscoelastic.with_jacobian(u, data, simulation, kind)
-    G = _discrete(viscoelastic.law_and_prony(kind.maxwell(u), law, simulation)[1], OMEGA, simulation.steps)
+    simulation = simulated_rheometer.Simulation()
+    r, J, _ = simulated_rheometer.with_jacobian(u, data, simulation, kind)
+    G = _discrete(simulated_rheometer.law_and_prony(kind.maxwell(u), law, simulation)[1], OMEGA, simulation.steps)
     expected = np.concatenate([G.real, G.imag]) * np.exp(6.0) / 770 - np.linspace(300, 100, 6)
     assert np.allclose(r[:6], expected / 7, rtol=1e-9) and np.allclose(r[6:], 3 * u[1:] ** 2)
-    whole = jax.jacfwd(lambda u: viscoelastic.simulated_residuals(u, data, simulation, kind)[0])(u)
+    whole = jax.jacfwd(lambda u: simulated_rheometer.simulated_residuals(u, data, simulation, kind)[0])(u)
     assert J.shape == (9, 4) and np.allclose(J, whole, rtol=1e-12, atol=1e-12)
 
 

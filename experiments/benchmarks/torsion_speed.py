@@ -13,8 +13,8 @@ import numpy as np
 
 import liverjax as lj
 from experiments.common import ROOT, either, save, timed
-from fitting.fits import viscoelastic
-from fitting.fits.viscoelastic import Simulation
+from fitting.fits import simulated_rheometer, viscoelastic
+from fitting.fits.simulated_rheometer import Simulation
 from fitting.readers.rheometer import Sweep, read_sweep
 from fitting.rigs import torsion
 
@@ -38,14 +38,14 @@ def simulated(sweep: Sweep, u: jax.Array, simulation: Simulation, rig: torsion.R
 
     def derivative(u, data):
         def twice(u):
-            r, m = viscoelastic.simulated_residuals(u, data, simulation)
+            r, m = simulated_rheometer.simulated_residuals(u, data, simulation)
             return r, (r, m)
 
         J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
         return r, J, m
 
     def linear(u, data):
-        return viscoelastic.with_jacobian(u, data, simulation)
+        return simulated_rheometer.with_jacobian(u, data, simulation)
 
     return timed(derivative if whole else linear, u, data, rounds=3)
 
@@ -55,9 +55,9 @@ def fits(name: str) -> dict[str, Any]:
     sweep = read_sweep(ROOT / "data" / f"{name}_frequency_sweep.csv")
     dense = viscoelastic.generalised_maxwell.spectrum(sweep)
     closed = viscoelastic.choose_modes(sweep, dense)[0]
-    found = viscoelastic.through_torsion(sweep, closed)
+    found = simulated_rheometer.through_torsion(sweep, closed)
     u, simulation = jnp.asarray(found.solution.u), Simulation()
-    fine, coarse = torsion.make_rig(), viscoelastic.rig_of(simulation)
+    fine, coarse = torsion.make_rig(), simulated_rheometer.rig_of(simulation)
     (_, J, m), now = simulated(sweep, u, simulation, coarse, whole=False)
     (r, J_whole, m_whole), before = simulated(sweep, u, simulation, fine, whole=True)
     # Where Gauss-Newton with all derivatives would go from here, in standard errors of the parameters.
@@ -99,7 +99,7 @@ def strains() -> list[dict[str, float]]:
     rows = []
     for strain in STRAINS:
         simulation = Simulation(strain=strain)
-        rig = viscoelastic.rig_of(simulation)
+        rig = simulated_rheometer.rig_of(simulation)
         (_, J, _), (_, J_whole, _) = (simulated(sweep, u, simulation, rig, whole)[0] for whole in (False, True))
         size = np.linalg.norm(np.asarray(J_whole), axis=0)
         error = float(np.max(np.linalg.norm(np.asarray(J - J_whole), axis=0) / size))

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 
 from experiments.common import ROOT, plain_ticks, plt, save
-from fitting.fits import viscoelastic
+from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.readers.rheometer import Sweep, read_sweep
 from liverjax.core.plotting import BLUE, ORANGE
 
@@ -41,10 +41,9 @@ def ways(sweep: Sweep, quick: bool) -> list[dict]:
     ]
     cases = [("exponential", n) for n in (10, 20, 50, 100)] + [("chapter", n) for n in (50, 100)]
     for scheme, steps in cases[:1] if quick else cases:
-        simulation = viscoelastic.Simulation(scheme=scheme, steps=steps)
-        rows.append(
-            row(f"torsion, {scheme} recursion, {steps} steps", viscoelastic.through_torsion(sweep, closed, simulation))
-        )
+        simulation = simulated_rheometer.Simulation(scheme=scheme, steps=steps)
+        found = simulated_rheometer.through_torsion(sweep, closed, simulation)
+        rows.append(row(f"torsion, {scheme} recursion, {steps} steps", found))
         print(rows[-1], flush=True)
     return rows
 

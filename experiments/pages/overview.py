@@ -278,6 +278,8 @@ def _coverage() -> str:
 
 
 def _predicted_decades(found: dict) -> str:
+    if "last" not in found:
+        return f"Before general models needed strong evidence, the chosen one was better in {percent(found['better'])}"
     last, first = found["last"], found["first"]
     return (
         f"The model chosen on two decades predicts the last one better than the next different model in "

@@ -16,7 +16,8 @@ from liverjax.core.struct import Content
 
 if TYPE_CHECKING:
     from fitting.fits.posterior import Posterior
-    from fitting.fits.viscoelastic import Fit, Simulation
+    from fitting.fits.simulated_rheometer import Simulation
+    from fitting.fits.viscoelastic import Fit
     from fitting.methods.generalised_maxwell import Spectrum
     from fitting.readers.rheometer import Sweep
 
@@ -392,15 +393,15 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
 
 def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simulation: "Simulation") -> "Fit":
     """The fit through the torsion simulation."""
-    from fitting.fits import viscoelastic
+    from fitting.fits import simulated_rheometer
 
     bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
     with bar:
-        return viscoelastic.through_torsion(sweep, closed, simulation, options.optimizer, told)
+        return simulated_rheometer.through_torsion(sweep, closed, simulation, options.optimizer, told)
 
 
 def _simulation(options: argparse.Namespace) -> "Simulation":
-    from fitting.fits.viscoelastic import Simulation
+    from fitting.fits.simulated_rheometer import Simulation
 
     return Simulation(
         radius=options.radius or Simulation().radius,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.fits import viscoelastic
+from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods import as_prony_modes, host, uncertainty
@@ -248,7 +248,7 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
     return kind, fit.details | {"conversion": told}
 
 
-def compression_numbers(fit: Fit, simulation: viscoelastic.Simulation) -> dict[str, object]:
+def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
     """The part `precompression` of fit.json, of `of_compressed_sample` or of the simulation after it."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"

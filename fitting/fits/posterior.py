@@ -13,10 +13,11 @@ import jax
 import numpy as np
 import scipy.special
 
-from fitting.fits import time_tests, viscoelastic
+from fitting.fits import simulated_rheometer, time_tests, viscoelastic
 from fitting.fits.families import springpots_in_time
+from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.time_tests import TimeFit
-from fitting.fits.viscoelastic import FLUID, Fit, Kind, Simulation
+from fitting.fits.viscoelastic import FLUID, Fit, Kind
 from fitting.methods import generalised_maxwell, springpots
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.sampling import tempering
@@ -253,13 +254,13 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     effect of the simulation at the minimum. Some draws are then simulated: `Posterior.simulated` has the largest
     difference of their log density, so that the short cut is checked where it is used.
     """
-    data, scales = viscoelastic.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
+    data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     law, omega, measured = data[1], data[2], data[4]
 
     @jax.jit
     @jax.vmap
     def linear(u):
-        sample = viscoelastic.law_and_prony(fit.kind.maxwell(u), law, simulation)
+        sample = simulated_rheometer.law_and_prony(fit.kind.maxwell(u), law, simulation)
         return torsion.linear_moduli(*sample, omega, simulation.steps)
 
     added = (fit.storage + 1j * fit.loss) / np.asarray(linear(fit.solution.u[None]))[0]
@@ -273,7 +274,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     begin = time.perf_counter()
     draws = found.chains.draws.reshape(-1, len(fit.solution.u))
     some = draws[np.linspace(0, len(draws) - 1, SIMULATED).astype(int)]
-    program = compiled(partial(viscoelastic.with_jacobian, simulation=simulation, kind=fit.kind), some[0], data)
+    program = compiled(partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), some[0], data)
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in some])
     likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))

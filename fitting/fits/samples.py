@@ -153,7 +153,7 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
             strengths[place] = mean.get(name, middle[name]) if middle[name] > 0 else 0.0
 
         def smooth(omega):
-            storage, loss = np.split(relaxation_spectrum.mode_columns(omega, grid) @ strengths, 2)
+            storage, loss = np.split(generalised_maxwell.mode_columns(omega, grid) @ strengths, 2)
             return storage + 1j * loss
 
         made = as_prony_modes.convert(smooth, low, high, bool(strengths[0] > 0))

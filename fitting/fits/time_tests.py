@@ -20,6 +20,8 @@ from liverjax.core.struct import Content
 
 #: Answers that are fitted at most: of longer records those nearest to equal steps of log time.
 MOST = 300
+#: Starting points of a fit.
+STARTS = 12
 
 
 class TimeFit(NamedTuple):
@@ -128,7 +130,7 @@ def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> Time
     function, data = residuals_in_time(test, kind)
     scales = data[-1]
     best = viscoelastic.best_of(levenberg_marquardt, function)
-    found, compiling, running = viscoelastic.timed(best, _starts(test, rows, modes, kind), *data)
+    found, compiling, running = viscoelastic.timed(best, _starts(test, modes, kind), *data)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
     spread = uncertainty.estimate(found, False, kind.maxwell)
     fitted = np.asarray(found.residuals) * scales + test.answer[rows]
@@ -190,24 +192,18 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
     return ratio if test.kind == "relaxation" else 1 / ratio, test.time[rows]
 
 
-def _starts(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind, count: int = 12) -> np.ndarray:
-    """Times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
+def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and right-hand side of relative least squares for the equilibrium modulus and modes of these times."""
     modulus, at = apparent(test)
-    low, high = np.log(test.resolved)
-    rng = np.random.default_rng(0)
-    grids = [np.linspace(low, high, modes + 2)[1:-1]]
-    grids += [np.sort(rng.uniform(low - 1, high + 1, modes)) for _ in range(count - 1)]
-    out = []
-    for grid in grids:
-        times = np.exp(np.sort(grid)[::-1])
-        for k in range(1, modes):
-            times[k] = min(times[k], 0.9 * times[k - 1])
-        A = np.column_stack([np.ones(len(rows)), np.exp(-at[:, None] / times)])
-        strengths, _ = generalised_maxwell.non_negative(A / modulus[:, None], np.ones(len(rows)))
-        share = np.maximum(strengths / strengths.sum(), 0.01)
-        u = generalised_maxwell.unconstrained(Maxwell(strengths.sum(), share[1:] / share.sum(), times))
-        out.append(generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u)
-    return np.stack(out)
+    A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
+    return A / modulus[:, None], np.ones(len(at))
+
+
+def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:
+    """Times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
+    each = generalised_maxwell.times_over(test.resolved, modes, STARTS)
+    found = [generalised_maxwell.start_at_times(times, *apparent_equations(test, times)) for times in each]
+    return np.stack([generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u for u in found])
 
 
 def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:

@@ -221,20 +221,10 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
 
 def _starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
     """Times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
-    low, high = np.log(band.resolved)
-    rng = np.random.default_rng(0)
-    grids = [np.linspace(low, high, modes + 2)[1:-1]]
-    grids += [np.sort(rng.uniform(low - 1, high + 1, modes)) for _ in range(STARTS - 1)]
     out = []
-    for grid in grids:
-        times = np.exp(np.sort(grid)[::-1])
-        for k in range(1, modes):
-            times[k] = min(times[k], 0.9 * times[k - 1])
-        rows = [_apparent(t, times) for t in tests]
-        A, b = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
-        strengths, _ = generalised_maxwell.non_negative(A, b)
-        share = np.maximum(strengths / strengths.sum(), 0.01)
-        u = generalised_maxwell.unconstrained(Maxwell(strengths.sum(), share[1:] / share.sum(), times))
+    for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
+        A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
+        u = generalised_maxwell.start_at_times(times, A, b)
         out.append(generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u)
     return np.stack(out)
 
@@ -242,14 +232,9 @@ def _starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: 
 def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Matrix and right-hand side of relative least squares for the equilibrium modulus and the modes."""
     if isinstance(test, TimeTest):
-        modulus, at = time_tests.apparent(test)
-        A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
-        return A / modulus[:, None], np.ones(len(at))
-    x = test.angular_frequency[:, None] * times
-    one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
-    A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])])
+        return time_tests.apparent_equations(test, times)
     b = np.concatenate(_moduli_of(test))
-    A = A[: len(b)]
+    A = generalised_maxwell.mode_columns(test.angular_frequency, times)[: len(b)]
     return A / b[:, None], np.ones(len(b))
 
 
@@ -326,7 +311,8 @@ def _shares(fit: Together) -> list[Share]:
 def shares_by_rows(
     fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], float]
 ) -> list[Share]:
-    """The shares with the errors that the other tests' rows leave, and with the misfit of each test by itself.
+    """The shares of the tests: the errors with the rows of the other tests only, and the misfit of a fit to each test
+    alone.
 
     Args:
         fit: the common fit.

@@ -110,8 +110,15 @@ def fluid_of(u: np.ndarray) -> np.ndarray:
 
 
 def largest_number_of_modes(sweep: Sweep) -> int:
-    """N with 2N + 1 parameters below the 2n moduli at n different frequencies."""
+    """The largest N for which 2N + 1 parameters are fewer than the 2n moduli at n different frequencies."""
     return len(np.unique(sweep.angular_frequency)) - 1
+
+
+def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Moduli G' then G'' (2n, 1 + K) of an equilibrium modulus and of modes of 1 Pa."""
+    x = omega[:, None] * times
+    bottom = np.column_stack([np.zeros(len(omega)), x / (1 + x**2)])
+    return np.vstack([np.column_stack([np.ones(len(omega)), x**2 / (1 + x**2)]), bottom])
 
 
 class Spectrum(NamedTuple):
@@ -128,11 +135,8 @@ def spectrum(sweep: Sweep, per_decade: int = 12) -> Spectrum:
     omega = sweep.angular_frequency
     low, high = np.log10(1 / omega[-1]) - 2, np.log10(1 / omega[0]) + 2
     times = np.logspace(low, high, int((high - low) * per_decade) + 1)
-    x = omega[:, None] * times
-    size = np.hypot(sweep.storage, sweep.loss)
-    top = np.column_stack([np.ones_like(omega), x**2 / (1 + x**2)]) / size[:, None]
-    bottom = np.column_stack([np.zeros_like(omega), x / (1 + x**2)]) / size[:, None]
-    A, b = np.vstack([top, bottom]), np.concatenate([sweep.storage / size, sweep.loss / size])
+    size = np.tile(np.hypot(sweep.storage, sweep.loss), 2)
+    A, b = mode_columns(omega, times) / size[:, None], np.concatenate([sweep.storage, sweep.loss]) / size
     weights, rest = non_negative(A, b)
     return Spectrum(times, weights[1:], float(weights[0]), float(rest / np.sqrt(len(omega))))
 
@@ -198,12 +202,28 @@ def _grouped(dense: Spectrum, modes: int, low: float, high: float) -> np.ndarray
 def _start(sweep: Sweep, times: np.ndarray) -> np.ndarray:
     for k in range(1, len(times)):  # keep the gaps representable
         times[k] = min(times[k], times[k - 1] * np.exp(-0.05))
-    x = sweep.angular_frequency[:, None] * times
-    one, zero = np.ones((len(x), 1)), np.zeros((len(x), 1))
     scale = np.concatenate(sweep.deviations)
-    A = np.vstack([np.hstack([one, x**2 / (1 + x**2)]), np.hstack([zero, x / (1 + x**2)])]) / scale[:, None]
-    strengths, _ = non_negative(A, np.concatenate([sweep.storage, sweep.loss]) / scale)
+    A = mode_columns(sweep.angular_frequency, times) / scale[:, None]
+    return start_at_times(times, A, np.concatenate([sweep.storage, sweep.loss]) / scale)
+
+
+def start_at_times(times: np.ndarray, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Starting point (2N + 1,) at times (N,) [s]; A x = b for equilibrium modulus and strengths, by least squares."""
+    strengths, _ = non_negative(A, b)
     total = strengths.sum()
     share = np.maximum(strengths / total, 0.01)  # a softmax cannot start at zero
     share = share / share.sum()
     return np.asarray(unconstrained(Maxwell(total, share[1:], times)))
+
+
+def times_over(resolved: tuple[float, float], modes: int, count: int) -> list[np.ndarray]:
+    """Relaxation times (N,) [s], descending, for `count` starts: evenly over the decades, then at random."""
+    low, high = np.log(resolved)
+    rng = np.random.default_rng(0)
+    grids = [np.linspace(low, high, modes + 2)[1:-1]]
+    grids += [np.sort(rng.uniform(low - 1, high + 1, modes)) for _ in range(count - 1)]
+    found = [np.exp(np.sort(grid)[::-1]) for grid in grids]
+    for times in found:
+        for k in range(1, modes):
+            times[k] = min(times[k], 0.9 * times[k - 1])
+    return found

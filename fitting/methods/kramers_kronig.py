@@ -4,10 +4,10 @@ Every material that relaxes has a spectrum of non-negative strengths. With x = o
 
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
-because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). Data that break these bounds by more than their scatter are not of the
-material: at the high end the inertia of the instrument breaks them (it adds a term that grows as omega^2 to G'), at the
-low end the start of the test. The distance of the data from the best spectrum of any shape tests the whole band: this
-is the Kramers-Kronig relation together with non-negative dissipation.
+because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). Data that break these bounds by more than their scatter do not show the
+material alone. At the high end the inertia of the instrument breaks them (it adds a term that grows as omega^2 to G'),
+at the low end the start of the test. The distance of the data from the best spectrum of any shape tests the whole band:
+this is the Kramers-Kronig relation together with non-negative dissipation.
 """
 
 import math

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.methods.generalised_maxwell import non_negative
+from fitting.methods.generalised_maxwell import mode_columns, non_negative
 from fitting.readers.rheometer import Sweep
 
 #: Grids tried [times a decade], decades beyond the band on either side, weights tried.
@@ -33,13 +33,6 @@ class GridSpectrum(NamedTuple):
     criterion: float
     decades: float  # of relaxation times whose strengths the data carry
     places: np.ndarray  # (K,) of these times in the whole grid
-
-
-def mode_columns(omega: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Moduli G' then G'' (2n, 1 + K) of an equilibrium modulus and of modes of 1 Pa."""
-    x = omega[:, None] * times
-    bottom = np.column_stack([np.zeros(len(omega)), x / (1 + x**2)])
-    return np.vstack([np.column_stack([np.ones(len(omega)), x**2 / (1 + x**2)]), bottom])
 
 
 def fit(sweep: Sweep) -> GridSpectrum:

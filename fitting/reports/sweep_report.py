@@ -12,7 +12,8 @@ import numpy as np
 from fitting.fits.families import models
 from fitting.fits.honesty import edges, total_error
 from fitting.fits.posterior import Posterior
-from fitting.fits.viscoelastic import Fit, Kind, largest_shift
+from fitting.fits.simulated_rheometer import largest_shift
+from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import moduli, weighed
 from fitting.methods.uncertainty import equilibrium_error

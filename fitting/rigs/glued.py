@@ -16,7 +16,7 @@ import numpy as np
 
 import liverjax as lj
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Array, Indices, Numbers, param, replace, static, struct
 from liverjax.laws import Law
 from liverjax.mesh import cylinders
 from liverjax.mesh.promotion import quadratic
@@ -51,8 +51,8 @@ class Rig:
     """A scene without its law, and the reading of it along z."""
 
     scene: lj.Scene = param("1", "with a law that `read` replaces")
-    nodes: Any = param("1", "node numbers (n,) that are read")
-    weights: Any = param("1", "of each of these nodes (n,) in the reading")
+    nodes: Indices = param("1", "node numbers (n,) that are read")
+    weights: Array = param("1", "of each of these nodes (n,) in the reading")
     reading: str = static(default="force", about="force [N], or mean displacement [m], of the whole cylinder's nodes")
     whole: bool = static(default=False, about="the scene is the whole cylinder, not a sector of it")
 
@@ -127,7 +127,7 @@ def _reading(rig: Rig, positions: jax.Array, reactions: jax.Array) -> jax.Array:
     return (positions[:, rig.nodes, 2] - rest[None]) @ rig.weights
 
 
-def tension(radius: float, height: float, dt: float, strains: Any, cell_size: float | Cells | None = None) -> Rig:
+def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size: float | Cells | None = None) -> Rig:
     """A cylinder pulled (or pressed) between glued plates; the force is read.
 
     Args:
@@ -150,7 +150,7 @@ def tension(radius: float, height: float, dt: float, strains: Any, cell_size: fl
 
 
 def indentation(
-    radius: float, height: float, punch: float, dt: float, depths: Any, cell_size: float | Cells | None = None
+    radius: float, height: float, punch: float, dt: float, depths: Numbers, cell_size: float | Cells | None = None
 ) -> Rig:
     """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; the force on it.
 
@@ -193,7 +193,7 @@ def creep(
     return Rig(scene=scene, nodes=top, weights=weights, reading="displacement", whole=not sample.physics)
 
 
-def _finite_history(name: str, values: Any) -> np.ndarray:
+def _finite_history(name: str, values: Numbers) -> np.ndarray:
     values = np.atleast_1d(np.asarray(values, float))
     if values.ndim != 1 or not len(values) or not np.all(np.isfinite(values)):
         raise InputError(f"{name} must be finite numbers, one a step: mend the list")

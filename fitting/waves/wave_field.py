@@ -125,7 +125,7 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     return np.concatenate([U, blank, blank], axis=-1), ["one component is measured: the other two are unknown"]
 
 
-def _instants(name: str, field: str, values: Any) -> np.ndarray:
+def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
     """Motion (F, T, nx, ny, nz, 3) at T instants of one period."""
     u = _array_of_numbers(name, field, values)
     if u.ndim not in (5, 6) or u.shape[-5] < 3 or u.shape[-1] not in (1, 3) or np.iscomplexobj(u):
@@ -142,7 +142,7 @@ def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
     return a
 
 
-def _plain(name: str, field: str, values: Any) -> np.ndarray:
+def _plain(name: str, field: str, values: object) -> np.ndarray:
     """Real numbers as one row."""
     try:
         return np.asarray(values, float).ravel()
@@ -171,7 +171,7 @@ def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.n
     return hertz
 
 
-def _lengths(name: str, field: str, given: Any, option: str) -> np.ndarray:
+def _lengths(name: str, field: str, given: object, option: str) -> np.ndarray:
     if given is None:
         raise InputError(
             f"{name}: holds no {field}: give {option} with three lengths in metres, e.g. 0.002 0.002 0.002"
@@ -185,7 +185,7 @@ def _lengths(name: str, field: str, given: Any, option: str) -> np.ndarray:
     return values
 
 
-def _whole_numbers(name: str, field: str, values: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+def _whole_numbers(name: str, field: str, values: object, shape: tuple[int, ...]) -> np.ndarray | None:
     if values is None:
         return None
     a = np.asarray(values)

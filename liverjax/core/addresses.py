@@ -35,7 +35,7 @@ MOVED = {
     "fitting.curves": "fitting.readers.curves",
     "fitting.displacements": "fitting.readers.displacements",
     "fitting.field": "fitting.fits.field",
-    "fitting.fit": "fitting.fits.viscoelastic",
+    "fitting.fit": "fitting.fit",
     "fitting.inclusion": "fitting.fits.inclusion",
     "fitting.joint": "fitting.fits.joint",
     "fitting.least_squares": "fitting.methods.least_squares",

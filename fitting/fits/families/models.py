@@ -69,7 +69,7 @@ def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = 
     prior = found.prior[:, 1 - solid :]
 
     def columns(omega):
-        return jnp.asarray(relaxation_spectrum.mode_columns(np.asarray(omega), found.times)[:, 1 - solid :])
+        return jnp.asarray(generalised_maxwell.mode_columns(np.asarray(omega), found.times)[:, 1 - solid :])
 
     def held(u):
         return jnp.asarray(prior) @ jnp.exp(u)

@@ -142,7 +142,7 @@ def _as_a_fit(tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, tol
 
     def moduli(omega, u):
         storage, loss = jnp.split(
-            jnp.asarray(relaxation_spectrum.mode_columns(omega, told.times)[:, 1 - int(solid) :]) @ jnp.exp(u), 2
+            jnp.asarray(generalised_maxwell.mode_columns(omega, told.times)[:, 1 - int(solid) :]) @ jnp.exp(u), 2
         )
         return storage + 1j * loss
 

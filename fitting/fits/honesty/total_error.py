@@ -7,7 +7,8 @@ is not among them: the numbers describe the measured curve, not the material.
 import numpy as np
 
 from fitting.fits.honesty import edges
-from fitting.fits.viscoelastic import Fit, Simulation
+from fitting.fits.simulated_rheometer import Simulation
+from fitting.fits.viscoelastic import Fit
 
 #: What is commonly known of plates [m]: standard deviations of the gap that an instrument states, and of the radius.
 GAP, RADIUS = 50e-6, 10e-6

@@ -1,0 +1,314 @@
+"""Identify a generalised Maxwell model through the simulated rheometer: the torsion of a sample between its plates."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, BestPoint, Fit, Kind, by_importance, fit_at, timed
+from fitting.methods import uncertainty
+from fitting.methods.estimate import Estimate, mesh_bias
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt_host
+from fitting.readers.rheometer import Sweep
+from fitting.rigs import compression, torsion
+from liverjax import laws
+from liverjax.core import status
+from liverjax.core.compiled import compiled
+from liverjax.core.errors import InputError
+from liverjax.physics.viscosity import Prony
+
+
+class Simulation(NamedTuple):
+    """How the torsion fit simulates: geometry [m], law, recursion and resolution."""
+
+    radius: float = torsion.RADIUS
+    height: float = torsion.HEIGHT
+    law: str = "neo_hookean"
+    scheme: str = "exponential"
+    part: str = "all"
+    steps: int = 50
+    cell_size: float | None = None
+    strain: float = 1e-3  # amplitude at the rim (section 5.2)
+    density: float | None = None  # of the sample [kg/m^3]; None: moduli that the instrument corrected for inertia
+    precompression: float = 0.0  # part of the height at rest by which the plates compress the sample (`compression`)
+
+
+#: Strain at the rim up to which the derivatives of the linear rig serve: they are off by less than the strain.
+LINEAR_STRAIN = 1e-2
+
+
+def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
+    """The sample of Prony modes: the law scaled to their G0, and how it relaxes."""
+    viscosity = Prony(
+        ratios=model.ratios,
+        relaxation_times=model.relaxation_times,
+        scheme=simulation.scheme,
+        part=simulation.part,
+    )
+    return laws.scaled(law, model.shear_modulus / law.shear_modulus()), viscosity
+
+
+def _and_prior(r: jax.Array, u: jax.Array, kind: Kind) -> jax.Array:
+    return r if kind.prior is None else jnp.concatenate([r, kind.prior(u)])
+
+
+def simulated_residuals(
+    u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
+) -> tuple[jax.Array, torsion.Moduli]:
+    """Simulated less measured moduli over their deviations (2n,), then rows of a prior; and the simulated moduli.
+
+    Args:
+        u: numbers of `kind`.
+        data: rig, law, angular frequencies (n,) [rad/s], torque amplitudes (n,) [N m], measured moduli G' then G''
+            (2n,) [Pa] and their deviations.
+        simulation: law, recursion and resolution.
+        kind: what u means; its Prony modes are simulated.
+    """
+    rig, law, omega, torque, measured, scales = data
+    drive = torsion.Drive(steps=simulation.steps)
+    m = torsion.moduli(rig, *law_and_prony(kind.maxwell(u), law, simulation), omega, torque, drive)
+    return _and_prior((jnp.concatenate([m.storage, m.loss]) - measured) / scales, u, kind), m
+
+
+def with_jacobian(
+    u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
+) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
+    """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
+
+    The derivative is that of the linear rig; with large strain or inertia it is that of the simulation. Gauss-Newton
+    finds the same minimum with it in a small part of the time (experiments/benchmarks/torsion_speed.py).
+    """
+    if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
+
+        def twice(u):
+            r, m = simulated_residuals(u, data, simulation, kind)
+            return r, (r, m)
+
+        J, (r, m) = jax.jacfwd(twice, has_aux=True)(u)
+        return r, J, m
+    rig, law, omega, _, _, scales = data
+
+    def linear(u):
+        G = _linear_moduli(rig, kind.maxwell(u), law, omega, simulation)
+        return _and_prior(jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales, u, kind)
+
+    r, m = simulated_residuals(u, data, simulation, kind)
+    return r, jax.jacfwd(linear)(u), m
+
+
+def _linear_moduli(
+    rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
+) -> jax.Array:
+    """Complex moduli [Pa] (n,) that the simulation approaches as the strain goes to zero."""
+    scaled, prony = law_and_prony(model, law, simulation)
+    if simulation.precompression:
+        scale = model.shear_modulus / law.shear_modulus()
+        return scale * torsion.held_moduli(torsion.held(rig, law), rig, prony, omega, simulation.steps)
+    return torsion.linear_moduli(scaled, prony, omega, simulation.steps)
+
+
+def rig_of(simulation: Simulation) -> torsion.Rig:
+    """The sample of a simulation; its mesh is coarse where the bias of the mesh is known exactly."""
+    cell, height = simulation.cell_size, simulation.height
+    if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
+        cell = torsion.linear_cell_for(simulation.radius, height)
+    if not simulation.precompression:
+        return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
+    if simulation.part != "all":
+        raise InputError(
+            f"a precompression of {simulation.precompression:g} is of a sample whose whole stress relaxes: leave out "
+            f"part {simulation.part!r}"
+        )
+    tall = height / (1 - simulation.precompression)
+    rest = torsion.make_rig(simulation.radius, tall, cell, density=simulation.density)
+    return compression.compressed(rest, laws.typical(simulation.law), simulation.precompression)
+
+
+def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
+    """Rig, law, angular frequencies, torques, measured moduli and deviations: the data of `simulated_residuals`."""
+    rig = rig_of(simulation)
+    torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
+    measured, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
+    return rig, laws.typical(simulation.law), jnp.asarray(sweep.angular_frequency), torque, measured, scales
+
+
+#: What the closed form says of data and model, which the simulation leaves as it is: words of warnings, and details.
+OF_THE_DATA = (
+    "modes would follow",
+    "about as well as",
+    "would follow the data more closely",
+    "no finite instantaneous",
+    "that relaxes",
+    "Kramers-Kronig",
+    "half decade",
+    "structured misfit",
+    "poses as",
+)
+
+
+KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency", "instrument")
+
+
+def through_torsion(
+    sweep: Sweep,
+    start: Fit,
+    simulation: Simulation = Simulation(),
+    optimizer: str = OPTIMIZERS[0],
+    progress: Callable[[int, float], None] = lambda iteration, cost: None,
+) -> Fit:
+    """Fit the moduli of the simulated rheometer, starting from the closed form.
+
+    Args:
+        sweep: data.
+        start: fit in closed form with the number of modes wanted.
+        simulation: geometry, law and resolution.
+        optimizer: one of `OPTIMIZERS`.
+        progress: told of every evaluation.
+    """
+    from liverjax.physics.viscosity import check
+
+    data = simulation_data(sweep, simulation)
+    rig, law, *_, scales = data
+    check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
+    u0, kind = jnp.asarray(start.solution.u), start.kind
+    if optimizer == OPTIMIZERS[0]:
+        begin = time.perf_counter()
+        program = compiled(partial(with_jacobian, simulation=simulation, kind=kind), u0, data)
+        compiling = time.perf_counter() - begin
+        seen = {}
+
+        def evaluated(u):
+            r, J, seen[np.asarray(u).tobytes()] = program(u, data)
+            return r, J
+
+        found = levenberg_marquardt_host(evaluated, u0, progress=progress)
+        m = seen[np.asarray(found.u).tobytes()]
+        running = time.perf_counter() - begin - compiling
+    else:
+
+        def minimised(u, *data):
+            found = bfgs(lambda u, *data: simulated_residuals(u, data, simulation, kind)[0], u, *data)
+            return found, simulated_residuals(found.u, data, simulation, kind)[1]
+
+        (found, m), compiling, running = timed(minimised, u0, *data)
+    if isinstance(start.solution.u, np.ndarray):  # what follows runs where the closed form did
+        found = Solution(*(np.asarray(field) for field in found))
+    storage, loss = np.asarray(m.storage), np.asarray(m.loss)
+    worst = int(np.max(m.statistics.status))
+    found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
+    details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
+    if rig.held is not None:
+        details["force_of_law_N"] = float(torsion.axial_force(rig, law))
+    advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
+    at = BestPoint("torsion", found, storage, loss, advice)
+    fit = fit_at(sweep, at, kind, (running, compiling), details)
+    if simulation.density is None and simulation.strain <= LINEAR_STRAIN and kind.prior is None:
+        fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
+    more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
+    of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
+    fit = fit._replace(details=fit.details | of_the_model)
+    own = tuple(w for w in fit.warnings if not (w.startswith(MISSES) and any(m.startswith(MISSES) for m in more)))
+    return fit._replace(warnings=by_importance((*own, *more, *_bias(start, fit))))
+
+
+def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
+    """Change of the parameters by the simulation's mesh and time steps, to first order (`mesh_bias`).
+
+    At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time. Those of
+    a compressed sample without a mesh are extrapolated from a finer mesh.
+    """
+    law, omega, scales = data
+    scaled, prony = law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
+    if simulation.precompression:
+        meshless, exact = _of_finer_mesh(fit, scaled, prony, omega, simulation)
+    else:
+        meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
+        exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
+    natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
+    found = fit.solution._replace(u=jnp.asarray(fit.solution.u))
+
+    def moved(missing: np.ndarray) -> np.ndarray:
+        return mesh_bias(found, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
+
+    return fit.uncertainty._replace(
+        mesh_bias=moved(meshless - (fit.storage + 1j * fit.loss)), time_step_bias=moved(exact - meshless)
+    )
+
+
+#: Length of a cell of the finer mesh over that of the mesh, for the extrapolation.
+FINER = 0.62
+
+
+def _of_finer_mesh(
+    fit: Fit, law: laws.Law, prony: Prony, omega: jax.Array, simulation: Simulation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Complex moduli (n,) of a compressed sample without a mesh: by the recursion, and in continuous time.
+
+    The error of the mesh is taken to be of second order.
+    """
+    cell = simulation.cell_size or torsion.linear_cell_for(simulation.radius, simulation.height)
+    rig = rig_of(simulation._replace(cell_size=FINER * cell))
+    of, moduli = jax.jit(torsion.held)(rig, law), jax.jit(torsion.held_moduli, static_argnums=4)
+    fine, exact = (np.asarray(moduli(of, rig, prony, omega, steps)) for steps in (simulation.steps, None))
+    found = fit.storage + 1j * fit.loss
+    meshless = found + (fine - found) / (1 - FINER**2)
+    force = float(torsion.axial_force(rig, laws.typical(simulation.law)))
+    fit.details["force_of_law_mesh_bias_N"] = (fit.details["force_of_law_N"] - force) / (1 - FINER**2)
+    return meshless, meshless + exact - fine
+
+
+def _simulation_details(
+    simulation: Simulation, rig: torsion.Rig, law: laws.Law, m: torsion.Moduli
+) -> dict[str, object]:
+    """Settings and statistics of the simulation, for the report."""
+    whole = simulation.part == "all"  # then the bias is the same at every frequency, and known
+    return {
+        "law": simulation.law,
+        "radius_m": simulation.radius,
+        "height_m": simulation.height,
+        "density_kg_m3": simulation.density,
+        "nodes": rig.mesh.number_of_nodes,
+        "elements": rig.mesh.number_of_elements,
+        "geometry_factor": float(m.bias[0].real if whole else torsion.geometry_factor(rig, law)),
+        "steps_per_cycle": simulation.steps,
+        "scheme": simulation.scheme,
+        "part": simulation.part,
+        "precompression_strain": simulation.precompression,
+        "rim_strain": simulation.strain,
+        "newton_iterations": int(np.max(m.statistics.iterations)),
+        "newton_residual": float(np.max(m.statistics.residual)),
+        "newton_status": status.advice(np.max(m.statistics.status)),
+        "transient": float(np.max(m.defect)),
+    }
+
+
+def largest_shift(closed: Fit, simulated: Fit) -> float:
+    """Largest change of a parameter by the simulation, over its standard error."""
+    shift = np.abs(simulated.uncertainty.values - closed.uncertainty.values)
+    errors = simulated.uncertainty.standard_errors
+    known = np.isfinite(errors) & (shift > 1e-6 * np.abs(closed.uncertainty.values))
+    return float(np.max(shift[known] / np.maximum(errors[known], 1e-300), initial=0.0))
+
+
+def _bias(closed: Fit, simulated: Fit) -> list[str]:
+    """A warning where the simulation moves a parameter by more than its standard error, with the cause."""
+    shift = simulated.uncertainty.values - closed.uncertainty.values
+    errors = simulated.uncertainty.standard_errors
+    cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
+    if simulated.details.get("precompression_strain"):
+        cause, remedy = "the plates, which hold the sides of the sample, move", "which plates yours are decides it"
+    if simulated.details.get("density_kg_m3") is not None:  # which the closed form knows nothing of
+        cause, remedy = "the sample's inertia and the discretisation move", "raise --steps to see which it is"
+    out = []
+    for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):
+        if abs(d) > e and abs(d) > 1e-6 * abs(v):
+            out.append(
+                f"{name}: {cause} it by {100 * d / v:.2g} %, more than its standard error ({100 * e / v:.2g} %); "
+                f"{remedy}"
+            )
+    return out
