@@ -17,7 +17,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.physics.registry import law_at_rest
 from liverjax.scenes.scene import Scene
-from liverjax.simulation.equations import Equations, State, advanced, equations, force_sizes, initial_state
+from liverjax.simulation.equations import Equations, Sizes, State, advanced, equations, force_sizes, initial_state
 from liverjax.simulation.run import Result, prepared
 from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, pack
 
@@ -74,7 +74,7 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
 
 
 @jax.jit
-def _put_again(scene: Scene, sizes: Any, state: State, given: Any) -> tuple[State, tuple]:
+def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[State, tuple]:
     """The state after a step that ended at x; stress, F, energy and the fluid's velocity at the points (…, Q, E)."""
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)

@@ -13,9 +13,9 @@ from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     """The mesh with every tetrahedron cut into eight (Bey 1995), of the same order; host side.
 
-    The old vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`: the vertices
-    are the nodes of `quadratic(mesh)`. A node set takes in the new nodes on all faces that it holds. The surface keeps
-    its flat triangles: refinement does not bring it nearer to the organ.
+    The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
+    vertices are the nodes of `quadratic(mesh)`. A node set takes in the new nodes on all faces that it holds. The
+    surface keeps its flat triangles: refinement does not bring it nearer to the organ.
 
     Args:
         near: node numbers (n,). With them only the edges that meet these nodes are halved, and as many others as keep

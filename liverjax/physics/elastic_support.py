@@ -66,7 +66,7 @@ class ElasticSupport(Physics):
         if not numbers.size or numbers.max() >= mesh.number_of_nodes:
             raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
 
-    def freeze(self, memory: Any, step: Step) -> "Springs":
+    def freeze(self, memory: None, step: Step) -> "Springs":
         """One symmetric block a node."""
         own = blocks(self, step.mesh)
         if self.history is None:

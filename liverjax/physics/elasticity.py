@@ -17,7 +17,7 @@ class Elasticity(Physics):
 
     law: Law = param("1", "the law")
 
-    def freeze(self, memory: Any, step: Step) -> "Elastic":
+    def freeze(self, memory: None, step: Step) -> "Elastic":
         """The law itself."""
         return Elastic(law=self.law)
 

@@ -80,7 +80,7 @@ class Loads(Physics):
     history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
-    def freeze(self, memory: Any, step: Step) -> "Loading":
+    def freeze(self, memory: None, step: Step) -> "Loading":
         """Dead loads are summed once; which part of them acts depends on the part of the step."""
         if self.history is not None or any(load.history is not None for load in self.traction):
             begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))

@@ -14,7 +14,7 @@ from liverjax import laws
 from liverjax.core import history
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content
+from liverjax.core.struct import Content, Indices
 from liverjax.laws import Law
 from liverjax.mesh import shapes
 from liverjax.mesh.files import read_mesh
@@ -389,7 +389,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     vectors = bool(given) and given["history"].ndim == 2
     if ("value" in table) + ("pressure" in table) + vectors != 1:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
-    triangles: Any = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
+    triangles: Indices = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
     if len(triangles) == 0:
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
     triangles = jnp.asarray(triangles, jnp.int32)

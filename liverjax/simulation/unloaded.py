@@ -9,7 +9,7 @@ Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite el
 the equations of the forward run.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from liverjax.physics.prescribed import Fixed
 from liverjax.physics.viscosity import lasting
 from liverjax.scenes.scene import Scene
 from liverjax.simulation import tangent
-from liverjax.simulation.equations import Equations, equations, force_sizes, initial_state, residual, unknowns
+from liverjax.simulation.equations import Equations, Sizes, equations, force_sizes, initial_state, residual, unknowns
 from liverjax.solvers.block_matrix import columns, flat
 from liverjax.solvers.newton import NewtonOptions, newton_root
 
@@ -109,7 +109,7 @@ def _reference_shape(mesh: TetMesh, given: jax.Array, e: Equations, z: jax.Array
     return with_points(mesh, given - u)
 
 
-def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Any) -> tuple[Equations, jax.Array]:
+def _with_displacements(scene: Scene, given: jax.Array, z: jax.Array, sizes: Sizes) -> tuple[Equations, jax.Array]:
     """The equations of the body with the reference shape of z, and its unknowns."""
     n = 3 * scene.mesh.number_of_nodes
     still = equations(scene, initial_state(scene), jnp.ones((), given.dtype), sizes)

@@ -83,7 +83,8 @@ def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
 
 
 def _entries(attached: tuple[Attached | GivesWay, ...], n: int) -> list[tuple]:
-    """Values, lines and columns of elements between nodes, of unknowns in which all x of n nodes come first."""
+    """Values, lines and columns of the matrices of elements between nodes. In the order of the unknowns all x of the n
+    nodes come first."""
     found = []
     for nodes, blocks in (own for own in attached if isinstance(own, Attached)):
         at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(-1, nodes.shape[1])

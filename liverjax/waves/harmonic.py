@@ -9,7 +9,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, replace, struct
+from liverjax.core.struct import Number, Numbers, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
 from liverjax.physics.contact.friction import RoughObstacle
@@ -58,7 +58,7 @@ class Harmonic:
 
 def harmonic(
     scene: Scene,
-    frequencies_Hz: Any = None,
+    frequencies_Hz: Numbers | None = None,
     factors: Number | None = None,
     about: jax.Array | None = None,
     motion: Number | None = None,

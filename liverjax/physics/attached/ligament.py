@@ -79,7 +79,7 @@ class Ligament(Physics):
         L = self._lengths(mesh)
         return jnp.full_like(L, self.rest_length) if self.pre_tension is None else L - self.pre_tension / self.stiffness
 
-    def freeze(self, memory: Any, step: Step) -> "Fibres":
+    def freeze(self, memory: None, step: Step) -> "Fibres":
         """Rest lengths, and the stiffness of one fibre."""
         rest = self._rest(step.mesh)
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))

@@ -65,7 +65,7 @@ class Membrane(Physics):
         """On the same triangles."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
-    def freeze(self, memory: Any, step: Step) -> "Stretched":
+    def freeze(self, memory: None, step: Step) -> "Stretched":
         """The incompressible part of the law, where it has one."""
         isochoric = self.law.isochoric_part()
         law, solved = (self.law, jnp.ones(0)) if isochoric is None else (isochoric, None)
@@ -76,7 +76,7 @@ class Membrane(Physics):
 class Stretched(Elements):
     """The membrane during a step."""
 
-    triangles: Any = param("1", "node numbers (m, 3)")
+    triangles: Indices = param("1", "node numbers (m, 3)")
     thickness: Any = param("m", "of the layer")
     law: Law = param("1", "isochoric, or whole where the stretch of the thickness is solved for")
     solved: object = param("1", "not None: the stretch of the thickness is solved for", default=None)

@@ -79,7 +79,7 @@ class Vessel(Physics):
             )
         layers.check(self.law, name)
 
-    def freeze(self, memory: Any, step: Step) -> "Bars":
+    def freeze(self, memory: None, step: Step) -> "Bars":
         """The isochoric part of the law, where it has one."""
         law = self.law.isochoric_part() or self.law
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)

@@ -147,7 +147,7 @@ class Obstacle(Physics):
             return zero + history.value_at(self.by, k * dt, self.times, self.history)
         return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
 
-    def freeze(self, memory: Any, step: Step) -> "Touching":
+    def freeze(self, memory: None, step: Step) -> "Touching":
         """Its places at the beginning and at the end of the step."""
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
@@ -183,7 +183,7 @@ class Touching(NodalForce):
         return 0.5 * jnp.sum(weighted_stiffness(self.obstacle, mesh) * depth**2)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of the energy: along the normal, and of the normal."""
+        """Second derivative of the energy: the part along the normal, and the part by the change of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
         # A surface that just touches counts as pressed: else a body that lies on a plane begins with nothing below it.

@@ -82,7 +82,7 @@ class AveragedVolume(Physics):
 
     law: Law = param("1", "of which the volumetric part counts")
 
-    def freeze(self, memory: Any, step: Step) -> "Averaged":
+    def freeze(self, memory: None, step: Step) -> "Averaged":
         """The energy of the nodes."""
         return Averaged(law=nodal_energy(step.mesh, self.law))
 
