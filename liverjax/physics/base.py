@@ -16,7 +16,7 @@ A `VolumeStress` has pressures at the nodes. The mixed system of positions and p
 (`liverjax.simulation.mixed_system`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
@@ -65,7 +65,7 @@ class Free(NamedTuple):
             field = nodes.gathered(field, x)
         return field
 
-    def columns(self, columns: Any) -> list[jax.Array]:
+    def columns(self, columns: Sequence[jax.Array]) -> list[jax.Array]:
         """The free part of a field given by its columns x, y, z (V,)."""
         if self.tied:
             return list(self.vectors(jnp.stack(columns, axis=-1)).T)

@@ -40,9 +40,9 @@ class Equations(NamedTuple):
     physics: tuple[Physics, ...]
     acting: tuple  # what acts of each of them, None where nothing does
     state: State  # at the beginning
-    k: Any  # number of the step, from 1
+    k: Number  # number of the step, from 1
     free: Free
-    noise: Any  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
+    noise: Number  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
     roundoff: jax.Array  # [N] of positions rounded to their digits
 
     @property
@@ -81,7 +81,7 @@ class Forces(NamedTuple):
 
     internal: jax.Array  # (V, 3) [N] of the elements
     nodal: list[jax.Array]  # (V, 3) [N] of each physics that acts at nodes
-    pressure: Any  # (V,) [Pa], or None
+    pressure: jax.Array | None  # (V,) [Pa]
     x: jax.Array  # (V, 3) [m]
     F: Matrix
 
@@ -154,7 +154,7 @@ def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None)
     )
 
 
-def positions(e: Equations, q: jax.Array, s: Any) -> jax.Array:
+def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
     """Positions (V, 3) from unknowns q (3 V,) and the held nodes, at part s of the step."""
     held, solve, free = e.mesh.points, e.scene.solve, e.free
     q = q[: 3 * e.mesh.number_of_nodes]

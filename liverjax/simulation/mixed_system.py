@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from liverjax.core.struct import Number
 from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.tetrahedra import TetMesh
@@ -102,7 +103,7 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
     return point_matrix.pull(mesh, A, pressures)
 
 
-def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Any) -> jax.Array:
+def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> jax.Array:
     """Stiffness [Pa/m^3] of every point against a change of its volume where nothing flows between elements.
 
     C is the matrix of the pressures. Its diagonal is shared out by volume, so that the sum of the elements is not
@@ -112,7 +113,7 @@ def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Any) -> jax
     return interpolated(mesh, share) / mesh.weights
 
 
-def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Any) -> block_matrix.Block:
+def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Number) -> block_matrix.Block:
     """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the pressure's matrix: right where nothing flows."""
     soft = -mask / A.diagonal[3][3]
     near = soft[A.nodes]

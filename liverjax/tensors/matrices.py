@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number
+from liverjax.core.struct import Number, T
 
 Vector = tuple[Any, ...]
 Matrix = tuple[Vector, ...]
@@ -133,7 +133,7 @@ def pack(A: Matrix) -> jax.Array:
     return jnp.stack([jnp.stack(jnp.broadcast_arrays(*row), axis=-1) for row in A], axis=-2)
 
 
-def stored(values: Any) -> Any:
+def stored(values: T) -> T:
     """The same pytree, written to memory: a branch keeps XLA:CPU from computing it again for every use.
 
     Its leaves are one number, or arrays; the first array is not empty.

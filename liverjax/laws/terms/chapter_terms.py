@@ -4,12 +4,12 @@ A documented variant: `liverjax.laws.terms.invariant_terms` sums the scalars ove
 roundoff at a cost that does not grow with the number of products. `liverjax.laws.products` has the laws.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from liverjax.core.struct import Number
+from liverjax.core.struct import Number, T
 from liverjax.laws import products
 from liverjax.tensors.matrices import (
     IDENTITY,
@@ -152,7 +152,7 @@ def _node(s: _At, D: Vector) -> _Node:
     return _Node(D, matvec(s.cof, D), matvec(s.B, D), S, [[matvec(s.F, v) for v in group] for group in S])
 
 
-def _written(values: Any) -> Any:
+def _written(values: T) -> T:
     """The same with its arrays written to memory (`stored`). Plain numbers stay as they are, so that products with 0
     can be left out."""
     leaves, tree = jax.tree.flatten(values)

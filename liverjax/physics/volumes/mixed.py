@@ -15,7 +15,8 @@ grow without bound where K is large. So linear elements have - (p - mean of p)^2
 element (Bochev, Dohrmann and Gunzburger 2006): it goes with the square of the element's size.
 """
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +100,7 @@ class Mixed(VolumeStress):
     """Pressures as unknowns during a step."""
 
     part: Number = param("Pa", "gamma, which stays with the displacements")
-    rest: Any = param("Pa", "K - gamma, carried by the pressures")
+    rest: Number = param("Pa", "K - gamma, carried by the pressures")
     shear: Number = param("Pa", "shear modulus")
     before: jax.Array = param("Pa", "pressures at the beginning of the step (V,)")
     unit: jax.Array = param("N/m^3", "pressure of an unknown of 1 m, so that all residuals are forces")
@@ -161,7 +162,7 @@ class Mixed(VolumeStress):
             share = jnp.asarray(basis(mesh.order).L ** 2, J.dtype) @ (mesh.weights / self.rest)
         diagonal = given(none, mesh.tetrahedra.T, share)
 
-        def solve(apply: Any, b: jax.Array) -> jax.Array:
+        def solve(apply: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
             return jax.scipy.sparse.linalg.cg(apply, b, tol=1e-14, maxiter=1000, M=lambda r: r / diagonal)[0]
 
         def own(p: jax.Array) -> jax.Array:
