@@ -78,7 +78,9 @@ def pytest_terminal_summary(terminalreporter, config):
         passed = stats.get("passed", [])
         rows = [dict(row, test=r.nodeid) for r in passed for name, row in r.user_properties if name == "verified"]
         before = json.loads(file.read_text())["rows"] if file.exists() else []
-        old = [r for r in before if r["test"] not in ran and Path(config.rootpath, r["test"].split("::")[0]).exists()]
+        made = {row["benchmark"] for row in rows}  # a test may have got another name
+        old = [r for r in before if r["test"] not in ran and r["benchmark"] not in made]
+        old = [r for r in old if Path(config.rootpath, r["test"].split("::")[0]).exists()]
         rows = sorted(rows + old, key=lambda row: row["test"])
         content = {"rows": rows, "environment": versions()}
         file.write_text(json.dumps(content, indent=1) + "\n")

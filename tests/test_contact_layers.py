@@ -108,30 +108,25 @@ def carried(scene: lj.Scene, x, reactions):
     return jnp.sum(reactions[-1, scene.mesh.node_sets["bottom"], 2])
 
 
-ALL = (0.5, 1.0, 3.0, 10.0)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("shape", "ratio", "thicknesses"),
-    [(shape, ratio, ALL) for ratio in (3.0, 1e3) for shape in ("sphere", "cone", "punch")],
-)
-def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thicknesses, verified):
+@pytest.mark.parametrize("thickness", [0.5, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("shape", ["sphere", "cone", "punch"])
+@pytest.mark.parametrize("ratio", [3.0, 1e3])
+def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thickness, verified):
     """Within 1 %, and the bar of the mesh's estimate covers the rest; K/mu = 1000 is a Poisson's ratio of 0.4995."""
-    for thickness in thicknesses:
-        scene, parts, depth, exact = pressed(shape, ratio, thickness)
-        lj.check_scene(scene)
-        result = lj.simulate(scene, mesh_error=True).check()
-        off = parts * float(carried(scene, result.positions, result.reactions)) / exact - 1
-        assert bool(jnp.all(result.mesh_error.found))
-        change = result.mesh_error.change(partial(carried, scene), result)[1]
-        bar = BAR * parts * abs(float(change)) / exact
-        left = float(lj.obstacle_forces(scene, result).depth[0, -1]) / depth
-        print(f"{shape} {ratio:g} {thickness:g}: off {100 * off:.3f} %, bar {100 * bar:.3f} %, left {100 * left:.3f} %")
-        # Finite strain and what the contact leaves of the depth are a thousandth each.
-        assert abs(off) < 0.01 and abs(off) < bar + 0.002
-        name = f"{shape} on a layer of {thickness:g} contact radii, K/mu = {ratio:g}"
-        verified(name, "integral equation", abs(off), 0.01, bar=bar)
+    scene, parts, depth, exact = pressed(shape, ratio, thickness)
+    lj.check_scene(scene)
+    result = lj.simulate(scene, mesh_error=True).check()
+    off = parts * float(carried(scene, result.positions, result.reactions)) / exact - 1
+    change = result.mesh_error.change(partial(carried, scene), result)[1]
+    bar = BAR * parts * abs(float(change)) / exact
+    left = float(lj.obstacle_forces(scene, result).depth[0, -1]) / depth
+    print(f"{shape} {ratio:g} {thickness:g}: off {100 * off:.3f} %, bar {100 * bar:.3f} %, left {100 * left:.3f} %")
+    # Finite strain and what the contact leaves of the depth are a thousandth each.
+    assert abs(off) < 0.01 and abs(off) < bar + 0.002
+    assert bool(jnp.all(result.mesh_error.found))
+    name = f"{shape} on a layer of {thickness:g} contact radii, K/mu = {ratio:g}"
+    verified(name, "integral equation", abs(off), 0.01, bar=bar)
 
 
 @pytest.mark.slow

@@ -174,6 +174,7 @@ def test_gradients_through_pressures_of_their_own(order):
     assert min(abs(d - slope) for d in differences) < 1e-7 * abs(slope)
 
 
+@pytest.mark.slow
 def test_a_robust_step_of_a_mixed_body():
     """With the best pressures its energy has the residual as gradient, and its least is what the load leads to.
 
