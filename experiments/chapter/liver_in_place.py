@@ -152,7 +152,7 @@ def scenes() -> tuple[dict[str, lj.Scene], dict[str, lj.Scene], dict[str, lj.Sce
     cases = {"held at two places": ()} | {f"with {name}": own for name, own in physics.items()}
     rest = {name: replace(bare, physics=own) for name, own in (cases | {"with all": everything}).items()}
     exact = replace(solve, tolerance=1e-10)
-    loaded = {name: replace(rest[name], solve=exact) for name in ("held at two places", "with plane", "with all")}
+    loaded = {name: replace(rest[name], solve=exact) for name in ("held at two places", "with all")}
     motion = {
         f"{model}, {what}": replace(livers[model], physics=own)
         for model in either(tuple(livers), ("viscous",))
