@@ -1,5 +1,6 @@
 """Pressure and flux of the fluid at parts of the body: steady flow through a stiff sponge, and what has entered."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,10 +8,19 @@ import pytest
 import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.mesh.nodal import integrals
-from liverjax.physics import porosity
+from liverjax.physics import darcy, porosity
 from liverjax.physics.base import Step
+from liverjax.physics.darcy import Guess
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation.equations import free_directions
+from liverjax.simulation.equations import (
+    equations,
+    flowing_lack,
+    flowing_pressure,
+    free_directions,
+    initial_state,
+    residual,
+    unknowns,
+)
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -47,6 +57,30 @@ def test_fluid_is_driven_through(order):
     assert np.allclose(pressures(scene), 300.0 - 2000.0 * x, rtol=1e-6)
     driven = scene_from(content([{"where": LOW, "flux": 1e-3}, {"where": TOP, "pressure": 100.0}], order))
     assert np.allclose(pressures(driven), 100.0 + 500.0 * (0.1 - x), rtol=1e-6)
+
+
+def test_forces_and_fluid_together_lack_nothing_and_are_symmetric():
+    """Derivatives of a step are of both together, with pressures that are given among them."""
+    soft = {"bulk": 400.0, "limit_bulk": 2200.0, "permeability": 2e-5}
+    body = content([{"where": LOW, "pressure": 300.0}, {"where": TOP, "flux": 1e-3}], **soft)
+    scene = scene_from(body | {"law": {"name": "neo_hookean", "mu": 300.0, "bulk": 400.0}})
+    e = equations(scene, initial_state(scene), jnp.ones(()))
+    rng = np.random.default_rng(0)
+    q = unknowns(e, scene.mesh.points + 1e-3 * jnp.asarray(rng.normal(size=scene.mesh.points.shape)))
+    n, P = len(q), flowing_pressure(e, q, jnp.ones(()), Guess(jnp.zeros(scene.mesh.number_of_nodes), 1.0))
+    r, left = flowing_lack(e, q, P)
+    flow = e.volume.flow
+    allowed = 10 * flow.tolerance * jnp.linalg.norm(darcy.flow_product(flow, flow.given))
+    assert np.allclose(r, residual(e, q, jnp.ones(()))[0], rtol=1e-6) and jnp.linalg.norm(left) < allowed
+    given = np.asarray(flow.mask) == 0
+    assert np.array_equal(np.flatnonzero(given), np.flatnonzero(np.asarray(scene.mesh.points)[:, 0] == 0))
+    moved = flowing_lack(e, q, P + 7.0 * jnp.asarray(given))
+    assert np.allclose(moved[0], r, rtol=1e-12) and np.allclose(moved[1][given], -7.0)
+    D = np.asarray(jax.jit(jax.jacfwd(lambda u: jnp.concatenate(flowing_lack(e, u[:n], u[n:]))))(jnp.append(q, P)))
+    for rows in (slice(n), slice(n, None)):
+        for columns in (slice(n), slice(n, None)):
+            size = np.abs(D[rows, columns]).max()
+            assert size > 0 and np.abs(D[rows, columns] - D[columns, rows].T).max() < 1e-13 * size
 
 
 def test_a_sealed_sponge_keeps_what_enters():

@@ -13,7 +13,7 @@ from liverjax.elements import projection
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh import shapes
 from liverjax.scenes.scene_file import scene_from
-from liverjax.simulation import equations
+from liverjax.simulation import equations, tangent
 from liverjax.solvers.block_matrix import flat
 from liverjax.tensors.matrices import pack, unpack
 
@@ -289,6 +289,20 @@ def test_a_following_pressure_is_held_in_each_iteration():
     run = jax.jit(lambda start: lj.simulate(robust, start=start))
     for start in (MESH.points, inverted_start(0.2, 1)):
         assert np.abs(run(start).check().positions - rest).max() < 1e-6 * 0.1
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_the_kind_of_a_tangent_may_be_chosen_when_the_program_runs(taken):
+    mesh, law = shapes.box((1.0, 1.0, 1.0), (1, 1, 1)), laws.typical("saint_venant_kirchhoff")
+    scene = lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))
+    e = equations.equations(scene, equations.initial_state(scene), 1.0)
+    x = 0.4 * mesh.points  # below 0.577 its stiffness has negative eigenvalues
+    chosen = jax.jit(lambda taken: tangent.tangent(e, None, x, 1.0, None, ("projected", taken)))(jnp.array(taken))
+    kind, other = ("projected", "true") if taken else ("true", "projected")
+    expected, not_this = (tangent.tangent(e, None, x, 1.0, None, k).matrix.rows for k in (kind, other))
+    size = np.abs(np.array(expected)).max()
+    assert np.abs(np.array(chosen.matrix.rows) - np.array(expected)).max() < 1e-13 * size
+    assert np.abs(np.array(not_this) - np.array(expected)).max() > 1e-3 * size
 
 
 def test_a_start_of_the_wrong_shape_is_refused():

@@ -6,7 +6,15 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.solvers import newton, step_cutting
-from liverjax.solvers.krylov import conjugate_gradients, differentiable_solve, started, symmetric_solve
+from liverjax.solvers.krylov import (
+    EARLIER,
+    Earlier,
+    conjugate_gradients,
+    differentiable_solve,
+    no_earlier,
+    started,
+    symmetric_solve,
+)
 from liverjax.solvers.problem import Problem, StepOptions
 
 RNG = np.random.default_rng(0)
@@ -105,28 +113,52 @@ def test_a_solve_begun_near_its_solution_is_as_exact_and_takes_less():
 
 
 def test_derivatives_handed_from_step_to_step():
-    """x_k = A^-1 (x_(k-1)^2 + p): the next solve begins where the last ended, in both modes, and changes no number."""
-    near = []
+    """x_k = A^-1 (x_(k-1)^2 + p): the next solve begins with those before, in both modes, and changes no number."""
+    found = []
 
-    def solver(b, guess):
-        jax.debug.callback(lambda a: near.append(np.asarray(a)), guess)
-        return jnp.linalg.solve(A, b), jnp.zeros(())
+    def solver(b, earlier):
+        x = jnp.linalg.solve(A, b)
+        jax.debug.callback(lambda *a: found.append([np.asarray(v) for v in a]), earlier, x)
+        return x, b, jnp.zeros(())
 
     def end(p, handed):
-        x, last = jnp.zeros(20), (jnp.zeros(20), jnp.zeros(20))
+        x, nothing = jnp.zeros(20), no_earlier(p, p)
+        last = nothing
         for _ in range(3):
-            both = (x**2 + p, last)
-            x, last = symmetric_solve(lambda u: (A @ u[0], u[1]), both, solver, 1e-10)
-            last = last if handed else (jnp.zeros(20), jnp.zeros(20))
+            x, last = symmetric_solve(lambda u: (A @ u[0], u[1]), (x**2 + p, last), solver, 1e-10)
+            last = last if handed else nothing
         return jnp.sum(x**3)
 
     plain, handed = (jax.grad(lambda p, h=h: end(p, h))(b) for h in (False, True))
     jax.effects_barrier()
     assert np.allclose(plain, handed, rtol=1e-12, atol=0)
-    # Reverse mode: the first solve of the way back begins at 0, the next at twice the first solution, then on the line.
-    assert not near[-3].any() and near[-2].any() and near[-1].any()
+    # Reverse mode: the first solve of the way back has none before it, the next that one, then both, the latest first.
+    (first, x), (second, y), (third, _) = ((Earlier(*e), x) for e, x in found[-3:])
+    assert not first.solutions.any() and np.array_equal(second.solutions[0], x) and not second.solutions[1:].any()
+    assert np.array_equal(third.solutions[:2], [y, x]) and np.allclose(third.loads[:2], [A @ y, A @ x], rtol=1e-10)
     forward = jax.jvp(lambda p: end(p, True), (b,), (jnp.ones(20),))[1]
     assert np.isclose(forward, plain.sum(), rtol=1e-12)
+
+
+def test_earlier_solves_of_nearly_the_same_loads_are_combined():
+    """Loads on a curve in time, hardly apart: the next is foretold as by a polynomial of their number."""
+
+    def load(t):
+        return jnp.sin(jnp.arange(20.0) + t) + t**2 * b
+
+    earlier = no_earlier(b, b)
+    for k in range(EARLIER):
+        earlier = earlier.with_latest(load(0.01 * k), jnp.linalg.solve(A, load(0.01 * k)))
+    new = load(0.01 * EARLIER)
+    left = jnp.linalg.norm(new - A @ earlier.combined(new)) / jnp.linalg.norm(new)
+    line = jnp.linalg.norm(new - 2 * earlier.loads[0] + earlier.loads[1]) / jnp.linalg.norm(new)
+    assert left < 1e-6 < 1e-5 < line
+    assert not no_earlier(b, b).combined(b).any()
+    # The same load many times over says nothing new, and harms nothing.
+    same = no_earlier(b, b)
+    for _ in range(EARLIER):
+        same = same.with_latest(b, A @ b)
+    assert np.allclose(same.combined(2 * b), 2 * A @ b, rtol=1e-12)
 
 
 def test_a_guess_takes_up_what_the_last_steps_foretold():

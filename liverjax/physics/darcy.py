@@ -89,6 +89,13 @@ def right_side(flow: Flow, b: jax.Array) -> jax.Array:
     return flow.mask * (b if flow.given is None else b - flow_product(flow, flow.given))
 
 
+def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
+    """b - A P (V,) of all pressures P (V,) [Pa]; where they are given, what they lack, so that a solution leaves 0."""
+    own = flow.mask * pressure
+    error = own - pressure if flow.given is None else own - pressure + flow.given
+    return right_side(flow, b) - flow.mask * flow_product(flow, own) + error
+
+
 class Guess(NamedTuple):
     """Pressures to begin a solve with, and the accuracy that it needs."""
 

@@ -253,6 +253,16 @@ class CoupledSponge(Sponge):
         """Pressures from the volume change of this step."""
         return pressure(self.porosity, mesh, self.fluid, self.flow, J, guess)
 
+    def in_force(self, pressure: jax.Array) -> jax.Array:
+        """Pressures (V,) [Pa] with the given ones where they are given."""
+        free = self.flow.mask * pressure
+        return free if self.flow.given is None else free + self.flow.given
+
+    def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
+        """Volumes (V,) [m^3] that pressures leave over: 0 at a solution. Where they are given, minus their error."""
+        b = self.flow.store * self.fluid.pressure - integrals(mesh, J - self.fluid.J)
+        return darcy.lack(self.flow, b, pressure)
+
     def matrix(self, mesh: TetMesh, J: jax.Array, positive: bool) -> BlockMatrix:
         """Matrix of storage and flow; it is positive."""
         return self.flow.matrix

@@ -190,16 +190,25 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
 
 
 @jax.jit  # a program has it several times: it is traced once
-def forces(e: Equations, q: jax.Array, s: Number, guess: Guess | None = None) -> Forces:
-    """Forces of all physics at unknowns q (3 V,), at part s of the step; `guess` of pressures that flow, or None."""
+def forces(
+    e: Equations, q: jax.Array, s: Number, guess: Guess | None = None, pressure: jax.Array | None = None
+) -> Forces:
+    """Forces of all physics at unknowns q (3 V,), at part s of the step.
+
+    Pressures that flow are solved for, from a `guess` where there is one, or are given as `pressure` (V,) [Pa].
+    """
     x = positions(e, q, s)
     F = deformation_gradient(e.mesh, x)
     first, *rest = [solid.stress(F) for solid in e.solids]
-    P, pressure = first, None
+    P = first
     for other in rest:
         P = add_matrices(P, other)
+    if e.mixed is not None:
+        pressure = _unknown_pressure(e, q)
+    elif e.volume is not None and pressure is None:
+        pressure = e.volume.pressure(e.mesh, determinant(F), guess)
     if e.volume is not None:
-        pressure = e.volume.pressure(e.mesh, determinant(F), guess) if e.mixed is None else _unknown_pressure(e, q)
+        assert pressure is not None
         P = add_matrices(P, e.volume.stress(e.mesh, pressure, F))
     return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F)
 
@@ -220,6 +229,13 @@ def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax
     """Pressures (V,) [Pa] that flow, at unknowns q (3 V,), from a guess of them."""
     assert e.volume is not None
     return e.volume.pressure(e.mesh, determinant(deformation_gradient(e.mesh, positions(e, q, s))), guess)
+
+
+def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Out-of-balance forces (3 V,) [N] at the end of the step with pressures (V,) [Pa], and their own balance (V,)."""
+    volume: Any = e.volume
+    f = forces(e, q, jnp.ones((), q.dtype), None, volume.in_force(pressure))
+    return flat(e.free.vectors(f.total, f.x)), volume.balance(e.mesh, pressure, determinant(f.F))
 
 
 def residual(

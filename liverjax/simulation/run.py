@@ -44,12 +44,14 @@ class Result:
         return self
 
 
-def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any) -> Callable:
+def _step_by_step(
+    scene: Scene, sizes: Sizes, report: Callable[[int], None] | None, near: Any, differentiable: bool = True
+) -> Callable:
     """A function (state and tangent, k) -> state and tangent after step k, and the rows for `_result`."""
 
     def physics(carry, k):
         state, kept = carry
-        new, reactions, statistics, kept = step(equations(scene, state, k, sizes), kept, near)
+        new, reactions, statistics, kept = step(equations(scene, state, k, sizes), kept, near, differentiable)
         # A state that is not finite spoils nothing further: the run stays where it last was.
         finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
         good = finite & (statistics.status != status.NOT_FINITE)
@@ -59,8 +61,10 @@ def _step_by_step(scene: Scene, sizes: Sizes, report: Callable[[int], None] | No
         kept = kept._replace(made=kept.made & good)
         return (new, kept), (new.x, jnp.where(good, reactions, 0.0), P, statistics)
 
+    one_step = gradient_checkpoints.one_step(physics) if differentiable else physics
+
     def advance(carry, k):
-        new = gradient_checkpoints.one_step(physics)(carry, k)
+        new = one_step(carry, k)
         if report is not None:
             jax.debug.callback(report, k)
         return new
@@ -93,7 +97,7 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     kept, _ = beginning(equations(scene, state, numbers[0], sizes))
-    advance = _step_by_step(scene, sizes, report, None)
+    advance = _step_by_step(scene, sizes, report, None, differentiable=False)
 
     def unless_over(carry, k):
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(advance, carry, k)[1])

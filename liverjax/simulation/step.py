@@ -10,15 +10,17 @@ from liverjax import laws
 from liverjax.core import status
 from liverjax.core.struct import Number, replace
 from liverjax.elements.gradients import volume_ratios
+from liverjax.physics import darcy
 from liverjax.physics.base import End, NodalForce
 from liverjax.physics.darcy import Guess
 from liverjax.physics.elasticity import Elastic
-from liverjax.simulation import tangent
+from liverjax.simulation import mixed_system, tangent
 from liverjax.simulation.equations import (
     Equations,
     State,
     advanced,
     energy,
+    flowing_lack,
     flowing_pressure,
     forces,
     positions,
@@ -26,7 +28,14 @@ from liverjax.simulation.equations import (
     settled,
     unknowns,
 )
-from liverjax.solvers import step_cutting
+from liverjax.solvers import block_matrix, step_cutting
+from liverjax.solvers.krylov import (
+    Earlier,
+    conjugate_gradients,
+    stabilised_biconjugate_gradients,
+    started,
+    true_residual,
+)
 from liverjax.solvers.problem import Beside, Kept, Potential, Problem, StepOptions, StepStatistics
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
@@ -37,7 +46,7 @@ def problem_of(e: Equations) -> Problem:
     if e.scene.solve.robust != "off":
         potential = Potential(
             energy=partial(energy, e),
-            definite=partial(_tangent, e, e.scene.solve.robust),
+            definite=partial(_definite, e),
             volume=lambda q, s: jnp.min(determinant(deformation_gradient(e.mesh, positions(e, q, s)))),
             surrogate=None if isinstance(e.scene.law, laws.StableNeoHookean) else problem_of(_finite(e)),
             rest=_rest(e) if e.scene.solve.kind == "static" else None,
@@ -50,7 +59,7 @@ def problem_of(e: Equations) -> Problem:
         solve=partial(tangent.solve, e),
         preconditioner=partial(tangent.preconditioner, e),
         # Where nodes move together on circles, the tangent is that of small turns: near, but not the derivative.
-        adjoint=partial(tangent.adjoint, e) if e.conservative and not e.free.tied else None,
+        adjoint=partial(adjoint, e) if e.conservative and not e.free.tied else None,
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
@@ -74,13 +83,20 @@ def _flowing(e: Equations) -> Beside | None:
     volume: Any = e.volume
     if volume is None or volume.flow is None:
         return None
-    return Beside(volume.fluid.pressure, partial(flowing_pressure, e), Guess)
+    return Beside(volume.fluid.pressure, partial(flowing_pressure, e), Guess, partial(flowing_lack, e))
 
 
 def _tangent(
-    e: Equations, kind: str, q: jax.Array, s: Number, pressure: jax.Array | None, near: Any
+    e: Equations, kind: tangent.Kind, q: jax.Array, s: Number, pressure: jax.Array | None, near: Any
 ) -> tangent.Tangent:
     return tangent.tangent(e, pressure, positions(e, q, s), s, near, kind)
+
+
+def _definite(
+    e: Equations, q: jax.Array, s: Number, pressure: jax.Array | None, near: Any, taken: jax.Array | None = None
+) -> tangent.Tangent:
+    kind = e.scene.solve.robust
+    return _tangent(e, kind if taken is None else (kind, taken), q, s, pressure, near)
 
 
 def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
@@ -100,25 +116,122 @@ def _finite(e: Equations) -> Equations:
     return e._replace(scene=replace(e.scene, law=stable), acting=(Elastic(law=stable), *nodal))
 
 
-def step(e: Equations, kept: Kept | None = None, near: Any = None) -> tuple[State, jax.Array, StepStatistics, Kept]:
+def step(
+    e: Equations, kept: Kept | None = None, near: Any = None, differentiable: bool = True
+) -> tuple[State, jax.Array, StepStatistics, Kept]:
     """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step.
 
-    `kept` is the tangent of the last step; derivatives may take the coarse space of `near`.
+    `kept` is the tangent of the last step; derivatives, where there are any, may take the coarse space of `near`.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
         tolerance=jax.lax.stop_gradient(solve.tolerance),
         max_iterations=solve.newton_iterations,
         one_step=solve.newton == "one_step",
+        differentiable=differentiable,
     )
     # Straight on where there is inertia; one step of Newton starts at x, as printed.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
-    q, statistics, kept = step_cutting.solve(problem_of(e), unknowns(e, x), options, guess, kept, near)
-    f = forces(e, q, jnp.ones((), x.dtype), None if kept.beside is None else Guess(kept.beside, 1.0))
+    problem = problem_of(e)
+    q, statistics, kept = step_cutting.solve(problem, unknowns(e, x), options, guess, kept, near)
+    known = None if kept.beside is None or problem.adjoint is not None else Guess(kept.beside, 1.0)
+    f = forces(e, q, jnp.ones((), x.dtype), known, None if problem.adjoint is None else kept.beside)
     projected = e.free.normals is not None or e.free.tied
     reactions = f.total - e.free.vectors(f.total, f.x) if projected else (1 - e.free.mask) * f.total
     found = (statistics.status == status.CONVERGED) | (statistics.status == status.ONE_STEP)
     inverted = found & jnp.any(volume_ratios(e.mesh, f.x) <= 0)
     statistics = statistics._replace(status=jnp.where(inverted, status.INVERTED, statistics.status))
     return advanced(e, End(f.x, f.F, f.pressure)), reactions, statistics, kept
+
+
+def adjoint(
+    e: Equations,
+    K: tangent.Tangent,
+    b: jax.Array,
+    tolerance: Number,
+    max_iterations: int,
+    earlier: Earlier | None = None,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Solve K x = b with the pressures, for derivatives. Return x, its load (3 V,) and its residual over |b|.
+
+    Where pressures flow, b and x hold them too: of forces and of minus the balance of volumes. The load has their
+    balance eliminated. Iterations begin with `earlier` solves where that helps. No load follows the body here.
+    """
+    volume = tangent.volume_with_pressures(e)
+    flows = e.mixed is None and volume is not None and volume.flow is not None
+    if flows:
+        return _with_flow(e, K, b, (tolerance, max_iterations), earlier)
+    apply = tangent.product(e, K, exactly=True)
+    if e.scene.solve.linear_solver == "direct":
+        x = tangent.factorised_solution(e, K, b)
+        return x, b, true_residual(apply, b, x)
+    method = conjugate_gradients if e.mixed is None else stabilised_biconjugate_gradients
+
+    def iterated(b: jax.Array, tolerance: Number) -> tuple[jax.Array, jax.Array]:
+        x, s = method(apply, b, tangent.preconditioner(e, K), tolerance, max_iterations)
+        return x, s.residual
+
+    if earlier is None:
+        x, residual = iterated(b, tolerance)
+    else:
+        x, residual = started(iterated, apply, b, earlier.combined(b), tolerance)
+    return x, b, residual
+
+
+#: Of `_with_flow`: tolerance of its solves for motions and for pressures, and how often at most.
+_INNER, _INNER_PRESSURE, _REFINEMENTS = 5e-2, 1e-2, 60
+
+
+def _with_flow(
+    e: Equations, K: tangent.Tangent, b: jax.Array, limits: tuple[Number, int], earlier: Earlier | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`adjoint` of the mixed system where pressures flow, by iterative refinement.
+
+    Motions and pressures are refined together, so no solve for pressures is more accurate than needed.
+    """
+    volume: Any = tangent.volume_with_pressures(e)
+    n, flow, (tolerance, max_iterations) = 3 * e.mesh.number_of_nodes, volume.flow, limits
+    loose = flow._replace(tolerance=_INNER_PRESSURE)
+    given = (flow.mask - 1) * b[n:]  # pressures that are given answer for themselves
+
+    def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The forces still out of balance after the pressures balance the volumes, and the change of pressures for
+        that."""
+        motion = e.free.columns(block_matrix.columns(x))
+        force, balance = mixed_system.balances(e.mesh, K.matrix, motion)
+        balance = balance - b[n:] - darcy.flow_product(flow, P)
+        dP = mixed_system.pressure_change(e.mesh, loose, K.matrix, balance, exactly=True)
+        force = block_matrix.sums(force, mixed_system.pulled(e.mesh, K.matrix, -P - dP))
+        return b[:n] - tangent.flat_free(e, tangent.with_nodal_products(e, K, motion, force)), dP
+
+    def go_on(c):
+        _, _, r, _, last, k = c
+        size = jnp.linalg.norm(r)
+        return (size > tolerance * scale) & (size < last) & (k < _REFINEMENTS)
+
+    def step(c):
+        x, P, r, dP, _, k = c
+        size = jnp.linalg.norm(r)
+        # The last refinement does no more than is asked for.
+        inner = jnp.clip(0.3 * tolerance * scale / size, _INNER, 0.5)
+        x, P = x + tangent.solve(e, K, r, inner, max_iterations)[0], P + dP
+        return x, P, *left(x, P), size, k + 1
+
+    load, begin = left(jnp.zeros_like(b[:n]), jnp.zeros_like(b[n:]))
+    size = jnp.linalg.norm(load)
+    scale = jnp.where(size > 0, size, 1.0)
+    nothing = jnp.zeros_like(b)
+    if e.scene.solve.linear_solver == "direct":
+        near = tangent.factorised_solution(e, K, b)
+        done = jnp.array(_REFINEMENTS)
+    else:
+        near = nothing if earlier is None else earlier.combined(load)
+        done = jnp.array(0)
+    x, P = near[:n], flow.mask * near[n:]
+    r, dP = left(x, P)
+    helps = jnp.linalg.norm(r) < size
+    x, P, r, dP = (jnp.where(helps, a, b) for a, b in zip((x, P, r, dP), (0 * x, 0 * P, load, begin), strict=True))
+    start = (x, P, r, dP, jnp.asarray(jnp.inf, b.dtype), done)
+    x, P, r, dP, *_ = jax.lax.while_loop(go_on, step, start)
+    return jnp.concatenate([x, P + dP + given]), load, jnp.linalg.norm(r) / scale

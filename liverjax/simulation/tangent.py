@@ -17,7 +17,6 @@ from liverjax.elements import mjed, projection
 from liverjax.elements.gradients import volume_gradients
 from liverjax.laws.terms import invariant_terms
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.physics import darcy
 from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
@@ -28,8 +27,6 @@ from liverjax.solvers.clusters import Inverses
 from liverjax.solvers.krylov import (
     conjugate_gradients,
     stabilised_biconjugate_gradients,
-    started,
-    true_residual,
 )
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.solvers.preconditioner import Coarse, coarse, coarse_of_product, corrected, correction, worthwhile
@@ -49,9 +46,24 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 #: How the stiffness of elements is made: true, without negative eigenvalues, or as in the chapter's section 4.1.2 iii.
 KINDS = ("true", "projected", "regularised")
 
+#: One of `KINDS`; or one of the last two and whether to take it, known when the program runs: else the true one.
+Kind = str | tuple[str, jax.Array]
 
-def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> dict[tuple[int, int], Matrix]:
+
+def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
+    """`make` of a kind. Where it is chosen when the program runs, both are in it; what follows is there once."""
+    if isinstance(kind, str):
+        return make(kind)
+    name, taken = kind
+    return jax.lax.cond(taken, lambda: make(name), lambda: make("true"))
+
+
+def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: Kind = "true") -> dict[tuple[int, int], Matrix]:
     """K_ab [N/m] of corners 1 <= a <= b <= 3 of every point, at given nodal pressures (V,) [Pa] or None."""
+    return _of_kind(kind, partial(_own_blocks, e, pressure, F))
+
+
+def _own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str) -> dict[tuple[int, int], Matrix]:
     mesh, F = e.mesh, stored(F)
     D = [tuple(mesh.gradients[a]) for a in range(3)]
     volume = None if e.volume is None else e.volume.scalars(mesh, pressure, F)
@@ -72,14 +84,14 @@ def own_blocks(e: Equations, pressure: Any, F: Matrix, kind: str = "true") -> di
 
 
 def element_blocks(
-    e: Equations, pressure: jax.Array | None, F: Matrix, kind: str = "true"
+    e: Equations, pressure: jax.Array | None, F: Matrix, kind: Kind = "true"
 ) -> dict[tuple[int, int], Matrix]:
     """K_ab [N/m] of `PAIRS` of every linear element, at given nodal pressures (V,) [Pa] or None."""
     full = mjed.all_blocks(own_blocks(e, pressure, F, kind))
     return {(a, b): full[a][b] for a, b in PAIRS}
 
 
-def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: str = "true") -> BlockMatrix:
+def stiffness(e: Equations, pressure: jax.Array | None, x: jax.Array, kind: Kind = "true") -> BlockMatrix:
     """Derivative of all forces at positions x (V, 3) [m] and given pressures (V,) [Pa], or None."""
     K = element_blocks(e, pressure, deformation_gradient(e.mesh, x), kind)
     return block_matrix.force_matrix(e.mesh, K, node_blocks(e))
@@ -95,13 +107,17 @@ def node_blocks(e: Equations) -> Block | None:
     return total
 
 
-def _attached(e: Equations, x: jax.Array, s: Number, kind: str) -> tuple[Attached | GivesWay, ...]:
+def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Attached | GivesWay, ...]:
     """Stiffness of the physics' elements between nodes, and its losses by numbers that adapt."""
-    found: list[Attached | GivesWay | None] = []
-    for a in e.nodal:
-        found.append(a.attached(e.mesh, x, s) if kind == "true" else a.definite(e.mesh, x, s))
-        found.append(a.gives_way(e.mesh, x, s, kind != "true"))
-    return tuple(own for own in found if own is not None)
+
+    def of(kind: str) -> tuple[Attached | GivesWay, ...]:
+        found: list[Attached | GivesWay | None] = []
+        for a in e.nodal:
+            found.append(a.attached(e.mesh, x, s) if kind == "true" else a.definite(e.mesh, x, s))
+            found.append(a.gives_way(e.mesh, x, s, kind != "true"))
+        return tuple(own for own in found if own is not None)
+
+    return _of_kind(kind, of)
 
 
 def _symmetric(e: Equations, more: tuple[Attached | GivesWay, ...]) -> tuple[Attached, ...]:
@@ -123,7 +139,7 @@ def _shift(e: Equations) -> jax.Array | None:
     return own[0][0][0] if own and own[0] is not None else None
 
 
-def _coupled(e: Equations) -> VolumeStress | None:
+def volume_with_pressures(e: Equations) -> VolumeStress | None:
     """The physics whose pressures are unknowns beside the positions."""
     return e.volume if e.volume is not None and e.volume.coupled else None
 
@@ -148,22 +164,23 @@ def tangent(
     x: jax.Array,
     s: Number,
     near: tuple[Any, Tangent] | None = None,
-    kind: str = "true",
+    kind: Kind = "true",
 ) -> Tangent:
     """The derivative of the forces at positions x (V, 3) [m], at part s of the step.
 
     `pressure` (V,) [Pa] is that of the nodes, or None; `near` a flag and a tangent whose coarse space will do where the
-    flag is set; `kind` is one of `KINDS`. Everything in the result is without derivative.
+    flag is set; `kind` is a `Kind`. Everything in the result is without derivative.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
-    matrix, inverse, below, A, more = _assembled(e, pressure, x, s, kind=kind)
+    name, taken = (kind, None) if isinstance(kind, str) else kind
+    matrix, inverse, below, A, more = _assembled(e, pressure, (x, s), taken, name)
 
     def new() -> Coarse:
         return _coarse(e, A)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     # Loads that follow the body need to know where.
-    where, part, follows = (None, None, None) if e.conservative else (x, s, jnp.asarray(kind == "true", x.dtype))
+    where, part, follows = (None, None, None) if e.conservative else (x, s, _true(kind, x.dtype))
     K = Tangent(matrix, inverse, below, slow, where, part, follows, more)
     if not _thin(e):
         return K
@@ -199,16 +216,24 @@ def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
     return coarse_of_product(e.mesh, eliminated)
 
 
+def _true(kind: Kind, dtype: Any) -> jax.Array:
+    """1 for the true tangent, else 0."""
+    return jnp.asarray(kind == "true" if isinstance(kind, str) else ~kind[1], dtype)
+
+
 #: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Attached | GivesWay, ...]]
 
 # A program has the two functions below several times: within jit they are traced once.
 
 
-@partial(jax.jit, static_argnames="kind")
-def _assembled(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: str) -> _Assembled:
+@partial(jax.jit, static_argnames="name")
+def _assembled(
+    e: Equations, pressure: jax.Array | None, at: tuple[jax.Array, Number], taken: jax.Array | None, name: str
+) -> _Assembled:
     """The tangent without its coarse space."""
-    mesh, volume = e.mesh, _coupled(e)
+    mesh, volume, (x, s) = e.mesh, volume_with_pressures(e), at
+    kind: Kind = name if taken is None else (name, taken)
     if mesh.order > 1:
         return _of_points(e, pressure, x, s, kind)
     acting = volume if e.mixed is None else e.mixed
@@ -218,7 +243,7 @@ def _assembled(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
     else:
         F = deformation_gradient(mesh, x)
         K, J = element_blocks(e, pressure, F, kind), determinant(F)
-        pressures = acting.matrix(mesh, J, kind != "true")
+        pressures = _of_kind(kind, lambda kind: acting.matrix(mesh, J, kind != "true"))
         slope = 1.0 if e.mixed is None else e.mixed.border(J)
         A = mixed_system.coupled(mesh, K, node_blocks(e), F, pressures, slope)
         diagonal = tuple(row[:3] for row in A.diagonal[:3])
@@ -250,14 +275,14 @@ def _coarse(e: Equations, A: BlockMatrix) -> Coarse:
     return coarse(e.mesh, A, _coarse_mask(_of_vertices(e)), used)
 
 
-def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: str) -> _Assembled:
+def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number, kind: Kind) -> _Assembled:
     """The tangent of quadratic elements: moduli at their points, and two levels of a preconditioner."""
-    mesh, volume = e.mesh, _coupled(e)
+    mesh, volume = e.mesh, volume_with_pressures(e)
     F = deformation_gradient(mesh, x)
     A = PointMatrix(stored(own_blocks(e, pressure, F, kind)), node_blocks(e), None, None)
     bulk = None
     if volume is not None:
-        C = volume.matrix(mesh, determinant(F), kind != "true")
+        C = _of_kind(kind, lambda kind: volume.matrix(mesh, determinant(F), kind != "true"))
         border = [scale(mesh.weights, g) for g in volume_gradients(mesh, F)[1:]]
         A = A._replace(border=stored(border), pressures=C)
         bulk = mixed_system.undrained_bulk(mesh, C, 1.0 if volume.flow is None else volume.flow.mask)
@@ -265,7 +290,8 @@ def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
         g = mesh.weights * e.mixed.border(determinant(F))
         A = A._replace(border=stored([scale(g, v) for v in volume_gradients(mesh, F)[1:]]))
         if e.scene.solve.linear_solver == "direct":
-            A = A._replace(pressures=e.mixed.matrix(mesh, determinant(F), kind != "true"))
+            C = _of_kind(kind, lambda kind: e.mixed.matrix(mesh, determinant(F), kind != "true"))
+            A = A._replace(pressures=C)
     own = point_matrix.levels(mesh, A, bulk)
     more = _attached(e, x, s, kind)
     near = _symmetric(e, more)
@@ -328,7 +354,7 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
     """A preconditioner of columns (V,) as a function of flat vectors, with pressures where these are unknown."""
     if e.mixed is None:
-        return lambda r: _flat(e, motions(block_matrix.columns(r)))
+        return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
     schur = volume.unit**2 * volume.schur(e.mesh)
     every = jnp.ones((e.mesh.number_of_vertices, 1), schur.dtype)
@@ -341,12 +367,12 @@ def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[ja
             dp = dp - slow((r[n:],))[0] / volume.unit**2
         pulled = mixed_system.pulled(e.mesh, K.matrix, volume.unit * dp)
         left = [f - p for f, p in zip(block_matrix.columns(r[:n]), pulled, strict=True)]
-        return jnp.concatenate([_flat(e, motions(left)), dp])
+        return jnp.concatenate([flat_free(e, motions(left)), dp])
 
     return triangular
 
 
-def _flat(e: Equations, columns: Any) -> jax.Array:
+def flat_free(e: Equations, columns: Any) -> jax.Array:
     """The free part of columns (V,) as a flat vector."""
     if e.free.normals is None and not e.free.tied:
         return e.free.mask.T.ravel() * jnp.concatenate(columns)
@@ -355,7 +381,7 @@ def _flat(e: Equations, columns: Any) -> jax.Array:
 
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
     """K as a function of flat vectors (3 V,). Pressures that follow motion are solved roughly, or `exactly`."""
-    A, volume, n = K.matrix, _coupled(e), 3 * e.mesh.number_of_nodes
+    A, volume, n = K.matrix, volume_with_pressures(e), 3 * e.mesh.number_of_nodes
 
     def apply(v: jax.Array) -> jax.Array:
         motion, balance = e.free.columns(block_matrix.columns(v[:n])), None
@@ -369,13 +395,13 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
             force = block_matrix.product(A, motion)
         else:
             force = point_matrix.product(e.mesh, A, motion)
-        force = _with_nodal(e, K, motion, force)
-        return _flat(e, force) if balance is None else jnp.concatenate([_flat(e, force), balance])
+        force = with_nodal_products(e, K, motion, force)
+        return flat_free(e, force) if balance is None else jnp.concatenate([flat_free(e, force), balance])
 
     return apply
 
 
-def _with_nodal(
+def with_nodal_products(
     e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
     """Forces, columns (V,), with those of elements between nodes and of loads that follow a motion."""
@@ -395,7 +421,7 @@ def solve(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solve K dq = b; return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
     if e.scene.solve.linear_solver == "direct":
-        dq = _factorised(e, K, b)
+        dq = factorised_solution(e, K, b)
         return dq, jnp.zeros((), jnp.int32), jnp.vdot(dq, b) >= 0
     # A block-triangular preconditioner is not symmetric either.
     method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
@@ -403,84 +429,19 @@ def solve(
     return dq, s.iterations, s.positive
 
 
-def _factorised(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """The same by a factorisation. Where pressures depend on motion, it is of the coupled matrix."""
-    n, volume, nothing = 3 * e.mesh.number_of_nodes, _coupled(e), jnp.ones(0)
+def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
+    """The same by a factorisation. Where pressures depend on motion, it is of the coupled matrix, and b may be too."""
+    n, volume, nothing = 3 * e.mesh.number_of_nodes, volume_with_pressures(e), jnp.ones(0)
     # The factorised matrix is of pressures that push inwards, and of minus their balance.
-    unit = None if e.mixed is None else -e.mixed.unit
-    free, load, balance = e.free.mask.T, b[:n].reshape(3, -1), nothing if unit is None else b[n:] / unit
+    unit = 1.0 if e.mixed is None else -e.mixed.unit
+    free, load, balance = e.free.mask.T, b[:n].reshape(3, -1), b[n:] / unit
     if isinstance(K.matrix, PointMatrix):
         known = nothing if volume is None or volume.flow is None else volume.flow.mask
         x = direct.solve_points(e.mesh, K.matrix, (free, known), (load, balance), e.free.normals, K.attached)
     else:
-        if volume is not None or unit is not None:
+        if volume is not None or e.mixed is not None:
             known = jnp.ones_like(free[:1]) if volume is None or volume.flow is None else volume.flow.mask[None]
             free = jnp.concatenate([free, known])
-            load = jnp.concatenate([load, jnp.zeros_like(load[:1]) if unit is None else balance[None]])
+            load = jnp.concatenate([load, balance[None] if len(balance) else jnp.zeros_like(load[:1])])
         x = direct.solve(K.matrix, free, load, e.free.normals, K.attached).ravel()
-    return x[:n] if unit is None else jnp.concatenate([x[:n], x[n:] / unit])
-
-
-def adjoint(
-    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int, near: jax.Array | None = None
-) -> tuple[jax.Array, jax.Array]:
-    """Solve K x = b with the pressures, for derivatives. Return x and its residual over |b|.
-
-    Iterations begin at `near` where that helps. No load follows the body here.
-    """
-    apply = product(e, K, exactly=True)
-    if e.scene.solve.linear_solver == "direct":
-        x = _factorised(e, K, b)
-        return x, true_residual(apply, b, x)
-    volume = _coupled(e)
-    flows = e.mixed is None and volume is not None and volume.flow is not None
-    method = conjugate_gradients if e.mixed is None else stabilised_biconjugate_gradients
-
-    def iterated(b: jax.Array, tolerance: Number) -> tuple[jax.Array, jax.Array]:
-        if flows:
-            return _refined(e, K, b, tolerance, max_iterations)
-        x, s = method(apply, b, preconditioner(e, K), tolerance, max_iterations)
-        return x, s.residual
-
-    return iterated(b, tolerance) if near is None else started(iterated, apply, b, near, tolerance)
-
-
-#: Of `_refined`: tolerance of its solves for motions and for pressures, and how often at most.
-_INNER, _INNER_PRESSURE, _REFINEMENTS = 5e-2, 1e-2, 60
-
-
-def _refined(
-    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
-) -> tuple[jax.Array, jax.Array]:
-    """Solution of K x = b where pressures flow, and its residual over |b|: iterative refinement of the mixed system.
-
-    Motions and pressures are refined together, so no solve for pressures is more accurate than needed.
-    """
-    volume: Any = _coupled(e)
-    A, flow, goal = K.matrix, volume.flow, tolerance * jnp.linalg.norm(b)
-    loose = flow._replace(tolerance=_INNER_PRESSURE)
-
-    def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The forces still out of balance after the pressures balance the volumes, and the change of pressures for
-        that."""
-        motion = e.free.columns(block_matrix.columns(x))
-        force, balance = mixed_system.balances(e.mesh, A, motion)
-        dP = mixed_system.pressure_change(e.mesh, loose, A, balance - darcy.flow_product(flow, P), exactly=True)
-        force = block_matrix.sums(force, mixed_system.pulled(e.mesh, A, -P - dP))
-        return b - _flat(e, _with_nodal(e, K, motion, force)), dP
-
-    def go_on(c):
-        _, _, r, _, last, k = c
-        size = jnp.linalg.norm(r)
-        return (size > goal) & (size < last) & (k < _REFINEMENTS)
-
-    def step(c):
-        x, P, r, dP, _, k = c
-        x, P = x + solve(e, K, r, _INNER, max_iterations)[0], P + dP
-        return x, P, *left(x, P), jnp.linalg.norm(r), k + 1
-
-    P = jnp.zeros_like(flow.store)
-    start = (jnp.zeros_like(b), P, b, P, jnp.asarray(jnp.inf, b.dtype), jnp.zeros((), jnp.int32))
-    x, _, r, *_ = jax.lax.while_loop(go_on, step, start)
-    scale = jnp.linalg.norm(b)
-    return x, jnp.linalg.norm(r) / jnp.where(scale > 0, scale, 1.0)
+    return jnp.concatenate([x[:n], x[n:] / unit])[: len(b)]

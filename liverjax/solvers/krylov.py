@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from liverjax.core.struct import Number
 
@@ -121,44 +122,81 @@ def stabilised_biconjugate_gradients(
     return x, LinearStatistics(k, true_residual(matvec, b, x), jnp.array(True))
 
 
-#: A vector, and the solutions of the last two solves, the latest first.
-WithLast = tuple[jax.Array, tuple[jax.Array, ...]]
+#: Earlier solves that a solve of a sequence begins with, and the part of a load, less what newer ones make of it, below
+#: which it says nothing new: their solutions are as exact as this.
+EARLIER, _NEW = 6, 1e-7
+
+
+class Earlier(NamedTuple):
+    """Loads and solutions of earlier solves, the latest first; zeros where there were none."""
+
+    loads: jax.Array  # (EARLIER, n)
+    solutions: jax.Array  # (EARLIER, m)
+
+    def combined(self, b: jax.Array) -> jax.Array:
+        """The combination (m,) of solutions whose loads come nearest to b (n,): by Gram and Schmidt, twice."""
+
+        def add(c, pair):
+            Q, Y, b, x, k = c
+            (q, y), whole = pair, jnp.linalg.norm(pair[0])
+            for _ in range(2):
+                h = Q @ q
+                q, y = q - h @ Q, y - h @ Y
+            size = jnp.linalg.norm(q)
+            factor = jnp.where(size > _NEW * whole, 1.0 / jnp.where(size > 0, size, 1.0), 0.0)
+            q, y = factor * q, factor * y
+            h = jnp.vdot(q, b)
+            return (Q.at[k].set(q), Y.at[k].set(y), b - h * q, x + h * y, k + 1), None
+
+        empty = (jnp.zeros_like(self.loads), jnp.zeros_like(self.solutions))
+        start = (*empty, b, jnp.zeros_like(self.solutions[0]), 0)
+        return jax.lax.scan(add, start, (self.loads, self.solutions))[0][3]
+
+    def with_latest(self, load: jax.Array, solution: jax.Array) -> "Earlier":
+        """The same with one more; the oldest is left out."""
+        pairs = ((self.loads, load), (self.solutions, solution))
+        return Earlier(*(jnp.concatenate([new[None], old[:-1]]) for old, new in pairs))
+
+
+def no_earlier(load: jax.Array, solution: jax.Array) -> Earlier:
+    """Nothing yet, for loads and solutions like these."""
+    return Earlier(*(jnp.zeros((EARLIER, len(each)), each.dtype) for each in (load, solution)))
+
+
+#: A vector, and earlier solves.
+WithEarlier = tuple[jax.Array, Earlier]
 
 
 def symmetric_solve(
-    matvec: Callable[[WithLast], WithLast],
-    both: WithLast,
-    solver: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]],
+    matvec: Callable[[WithEarlier], WithEarlier],
+    both: WithEarlier,
+    solver: Callable[[jax.Array, Earlier], tuple[jax.Array, jax.Array, jax.Array]],
     tolerance: Number,
-) -> WithLast:
-    """The solution of A x = b for symmetric A, as a linear map of b; then the last two solutions of such solves.
+) -> WithEarlier:
+    """The solution of A x = b for symmetric A, as a linear map of b; then the earlier solves with this one.
 
     Its derivatives are solves as well, in both modes. NaN as of `differentiable_solve`.
 
     Args:
-        matvec: (x, last two) -> (A x, the same two).
-        both: b, and the last two solutions: the solve begins on the line through them.
-        solver: (b, near) -> solution, and the true residual over |b|.
+        matvec: (x, earlier) -> (A x, the same earlier).
+        both: b, and earlier solves, for this one to begin with.
+        solver: (b, earlier) -> solution, its load (b, or what is left of it where unknowns are eliminated), and the
+            true residual over |b|.
         tolerance: of the solver.
     """
-
-    # One vector of all three: a derivative by one part alone has no cotangents of the others, which JAX does not take.
-    def joined(parts):
-        return jnp.concatenate([parts[0], *parts[1]])
-
-    def parted(vector):
-        x, latest, earlier = jnp.split(vector, 3)
-        return x, (latest, earlier)
+    # One vector of all: a derivative by one part alone has no cotangents of the others, which JAX does not take.
+    joined, parted = ravel_pytree(both)
 
     def solve(_, vector):
-        b, (latest, earlier) = parted(vector)
-        x, residual = solver(b, 2 * latest - earlier)
-        return joined((jnp.where(_good(residual, tolerance, b), x, jnp.nan), (x, latest)))
+        b, earlier = parted(vector)
+        x, load, residual = solver(b, earlier)
+        x = jnp.where(_good(residual, tolerance, b), x, jnp.nan)
+        return ravel_pytree((x, earlier.with_latest(load, x)))[0]
 
     def product(vector):
-        return joined(matvec(parted(vector)))
+        return ravel_pytree(matvec(parted(vector)))[0]
 
-    return parted(jax.lax.custom_linear_solve(product, joined(both), solve=solve, transpose_solve=solve))
+    return parted(jax.lax.custom_linear_solve(product, joined, solve=solve, transpose_solve=solve))
 
 
 def _good(residual: jax.Array, tolerance: Number, b: jax.Array) -> jax.Array:

@@ -124,11 +124,7 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     one, definite = jnp.ones((), c.q.dtype), c.definite > 0
     if not problem.symmetric or _potential(problem).settled is not None:
         definite = definite | (c.relative > _NEAR)
-    K = jax.lax.cond(
-        definite,
-        lambda: _potential(problem).definite(c.q, one, c.by, None),
-        lambda: problem.tangent(c.q, one, c.by, None),
-    )
+    K = _potential(problem).definite(c.q, one, c.by, None, definite)
     goal = 0.3 * options.tolerance / jnp.maximum(c.relative, 1e-300)
     forcing = jnp.clip(jnp.minimum(LINEAR_TOLERANCE, jnp.sqrt(c.relative)), jnp.minimum(goal, 0.5), 0.5)
     if _potential(problem).settled is not None:

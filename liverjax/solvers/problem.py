@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 
 from liverjax.core.struct import Number
+from liverjax.solvers.krylov import Earlier
 
 #: Most iterations of one linear solve.
 MOST_LINEAR_ITERATIONS = 3000
@@ -31,6 +32,8 @@ class StepOptions(NamedTuple):
     one_step: bool = False  # one linear solve a step and no more; derivatives are not those of it
     max_halvings: int = 6
     max_cuts: int = 12
+    #: Without derivatives a program is traced in two thirds of the time.
+    differentiable: bool = True
 
 
 class Kept(NamedTuple):
@@ -45,8 +48,8 @@ class Kept(NamedTuple):
     surprise: jax.Array
     trust: jax.Array
     beside: jax.Array | None = None  # what is solved for beside the root, there (`Problem.beside`)
-    #: Of derivatives: solutions of their last two linear solves, for the next to begin near. A run carries zeros.
-    adjoints: tuple[jax.Array, ...] = ()
+    #: Of derivatives: their last linear solves, for the next to begin with. A run carries zeros.
+    adjoints: Earlier | tuple[()] = ()
 
 
 class Beside(NamedTuple):
@@ -57,6 +60,9 @@ class Beside(NamedTuple):
     solved: Callable[..., jax.Array]
     #: (solution nearby, tolerance over the usual one) -> guess for `residual` and `solved`.
     guess: Callable[[jax.Array, Number], tuple]
+    #: (q, solution) -> what r(q, 1) and the solution's own equation lack. Derivatives are of both together: no solve
+    #: of its own is differentiated. Where r has a symmetric derivative, that of both together is symmetric too.
+    lack: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 class Problem(NamedTuple):
@@ -73,9 +79,11 @@ class Problem(NamedTuple):
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
-    #: (tangent, b, tolerance, max_iterations, near) -> as `solve`, with dr/dq itself, and the residual over |b|: for
-    #: derivatives, where dr/dq is symmetric; near is a guess. None: they are solved for with products of dr/dq.
-    adjoint: Callable[[Any, jax.Array, Number, int, jax.Array], tuple[jax.Array, jax.Array]] | None = None
+    #: (tangent, b, tolerance, max_iterations, earlier solves) -> solution with dr/dq itself, its load and its residual
+    #: over |b|: for derivatives, where dr/dq is symmetric. Where there is a `beside`, b and the solution are of both
+    #: together (`Beside.lack`), and the load is what is left when what is beside is eliminated. None: they are solved
+    #: for with products of dr/dq.
+    adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
     #: Whether dr/dq is.
     symmetric: bool = True
     #: Whether r depends on s.
@@ -92,8 +100,8 @@ class Potential(NamedTuple):
 
     #: (q, start) -> energy whose gradient at start is r(start, 1). Forces without an energy are held as at start.
     energy: Callable[[jax.Array, jax.Array], jax.Array]
-    #: As `Problem.tangent`, of a matrix without negative eigenvalues.
-    definite: Callable[[jax.Array, jax.Array, Any, Any], Any]
+    #: As `Problem.tangent`, of a matrix without negative eigenvalues; a fifth argument: only where it is true.
+    definite: Callable[..., Any]
     #: (q, s) -> the least J of an element: not above 0 where elements are inverted.
     volume: Callable[[jax.Array, Any], jax.Array]
     #: The same of a body whose energy is finite where elements are inverted; None where it is already.

@@ -16,7 +16,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from liverjax.core import status
 from liverjax.core.struct import Number
-from liverjax.solvers.krylov import Known, differentiable_solve, symmetric_solve
+from liverjax.solvers.krylov import Earlier, Known, differentiable_solve, no_earlier, symmetric_solve
 from liverjax.solvers.minimisation import minimise, untangled
 from liverjax.solvers.problem import (
     LINEAR_TOLERANCE,
@@ -83,7 +83,8 @@ def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
     no, beside = jnp.array(False), None if problem.beside is None else problem.beside.before
     # Derivatives that begin near the last: where the matrix is symmetric, so that transposed it is the same.
-    adjoints = () if problem.adjoint is None else (jnp.zeros_like(start), jnp.zeros_like(start))
+    both = start if beside is None else jnp.concatenate([start, beside])
+    adjoints = () if problem.adjoint is None else no_earlier(start, both)
     empty = (jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), a) for a in (made, beside))
     tangent, beside = jax.lax.stop_gradient(tuple(empty))
     return Kept(tangent, no, zero, no, jax.lax.stop_gradient(jnp.zeros_like(start)), zero, beside, adjoints)
@@ -100,7 +101,8 @@ def solve(
     """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative.
 
     Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, `near`
-    one for derivatives.
+    one for derivatives. Of what is kept, the solution beside the root has the root's derivative if the problem has an
+    `adjoint`.
     """
     start = jax.lax.stop_gradient(start)
     guess = predicted = None if guess is None else jax.lax.stop_gradient(guess)
@@ -109,9 +111,6 @@ def solve(
     one = jnp.ones((), start.dtype)
     if guess is not None:
         guess = guess + kept.trust * kept.surprise
-
-    def at_end(q):
-        return problem.residual(q, one)[0]
 
     kind = jax.tree.map(lambda a: a.dtype, kept)
 
@@ -134,12 +133,18 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # Two rules: how the root was found has no derivative, and the root's own is by the tangent there.
-    q, aux = jax.lax.custom_root(at_end, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
-    statistics, kept = jax.lax.stop_gradient(aux)
+    # Two rules: how the root was found has no derivative, and the root's own is by the tangent there. For the first any
+    # function will do whose root depends on nothing.
+    if options.differentiable:
+        found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
+    else:
+        found_by = follow(None, start)
+    q, (statistics, kept) = jax.lax.stop_gradient(found_by)
     kept = jax.tree.map(lambda a, dtype: a.astype(dtype), kept, kind)
-    q, beside, statistics = checkpoint_name((jax.lax.stop_gradient(q), kept.beside, statistics), ROOT)
-    root, adjoints = _with_derivative(problem, q, beside, last, options.tolerance, near)
+    q, beside, statistics = checkpoint_name((q, kept.beside, statistics), ROOT)
+    root, adjoints = q, last
+    if options.differentiable:
+        root, beside, adjoints = _with_derivative(problem, q, beside, last, options.tolerance, near)
     code, iterations, linear, cuts = (n.astype(jnp.int32) for n in statistics[:4])
     kept = kept._replace(beside=beside, adjoints=adjoints)
     return root, StepStatistics(code, iterations, linear, cuts, statistics.residual), kept
@@ -152,32 +157,47 @@ def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
 
 
 def _with_derivative(
-    problem: Problem, q: jax.Array, beside: jax.Array | None, last: tuple[jax.Array, ...], tolerance: Number, near: Any
-) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    """The root q with the derivative of the residual's root, and the solutions for the next derivative to begin near.
+    problem: Problem,
+    q: jax.Array,
+    beside: jax.Array | None,
+    last: Earlier | tuple[()],
+    tolerance: Number,
+    near: Any,
+) -> tuple[jax.Array, jax.Array | None, Earlier | tuple[()]]:
+    """The root q and what is beside it, with the derivatives of the residual's root; and solves for the next to begin
+    with.
 
-    These solutions must be carried from step to step. So they count as further unknowns, equal to `last`. Forward mode
+    These solves must be carried from step to step. So they count as further unknowns, equal to `last`. Forward mode
     hands them on, and reverse mode hands them back, from the later step to the earlier.
     """
-    one = jnp.ones((), q.dtype)
+    one, n = jnp.ones((), q.dtype), len(q)
+    both, lacking = q, None
+    if beside is not None and problem.beside is not None and problem.adjoint is not None:
+        both, lacking = jnp.concatenate([q, beside]), problem.beside.lack
+
+    def residual(u):
+        if lacking is not None:
+            return jnp.concatenate(lacking(u[:n], u[n:])), beside
+        r, _, by = _evaluated_near(problem, u, one, beside, 1.0)
+        return r, by
 
     def lack(unknowns):
-        q, hints = unknowns
-        r, _, by = _evaluated_near(problem, q, one, beside, 1.0)
-        return (r, tuple(a - b for a, b in zip(hints, last, strict=True))), by
+        u, hints = unknowns
+        return residual(u)[0], jax.tree.map(jnp.subtract, hints, last)
 
     def tangent_solve(linear, y):
         some = None if near is None else (jnp.array(True), near)
-        by = lack((q, last))[1] if beside is None else beside
+        by = residual(q)[1] if beside is None else beside
         K = problem.tangent(q, one, jax.lax.stop_gradient(by), some)
         limits = (jnp.maximum(_ADJOINT * tolerance, 1e-13), MOST_LINEAR_ITERATIONS)
         if problem.adjoint is None:
             known = Known(problem.symmetric)
             matvec, b = (lambda v: linear((v, ()))[0]), y[0]
             return differentiable_solve(matvec, b, problem.preconditioner(K), *limits, known), ()
-        return symmetric_solve(linear, y, lambda b, near: problem.adjoint(K, b, *limits, near), limits[0])
+        return symmetric_solve(linear, y, lambda b, earlier: problem.adjoint(K, b, *limits, earlier), limits[0])
 
-    return jax.lax.custom_root(lambda u: lack(u)[0], (q, last), lambda _, u: u, tangent_solve)
+    root, hints = jax.lax.custom_root(lack, (both, last), lambda _, u: u, tangent_solve)
+    return root[:n], beside if lacking is None else root[n:], hints
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
