@@ -42,6 +42,7 @@ from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve, with_parameters
 from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.scene_file import load_scene
+from liverjax.scenes.springpots import SpringpotSeries
 from liverjax.simulation.batch import Batch, simulate_batch
 from liverjax.simulation.gradients import Gradient, value_and_gradient
 from liverjax.simulation.obstacle_forces import obstacle_forces
@@ -70,6 +71,7 @@ __all__ = [
     "Scene",
     "SeparatedModel",
     "Solve",
+    "SpringpotSeries",
     "TetMesh",
     "Traction",
     "boundary",

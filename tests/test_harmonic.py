@@ -368,6 +368,66 @@ def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
     assert np.abs(bare - expected).max() > 1e-3 * np.abs(expected).max()
 
 
+SPRINGPOTS = """
+[springpots]
+times = [0.0125, 0.002]
+exponents = [0.2, 0.6]
+limits = [1e9, 4.0]
+spring = 0.3
+part = "isochoric"
+"""
+
+
+def test_springpots_of_a_scene_file(tmp_path):
+    """A springpot, and one in a row with a spring, beside 0.3 of the law: factors by the formula in mpmath."""
+    mpmath = pytest.importorskip("mpmath")
+    (tmp_path / "scene.toml").write_text(FILE + "frequencies = [40.0, 60.0]\n" + SPRINGPOTS)
+    scene = lj.load_scene(tmp_path / "scene.toml")
+    expected = []
+    for hertz in (40, 60):
+        s = 2 * mpmath.pi * 1j * hertz
+        first = 1 / ((s * mpmath.mpf("0.0125")) ** mpmath.mpf("-0.2") + mpmath.mpf("1e-9"))
+        second = 1 / ((s * mpmath.mpf("0.002")) ** mpmath.mpf("-0.6") + mpmath.mpf("0.25"))
+        expected.append(complex(mpmath.mpf("0.3") + first + second))
+    bare = replace(scene, springpots=None, viscosity=replace(PRONY, ratios=jnp.array([0.7]), part="isochoric"))
+    found = lj.harmonic(scene).check().displacement
+    given = lj.harmonic(bare, factors=np.array(expected)).displacement
+    np.testing.assert_allclose(found, given, rtol=1e-10, atol=1e-18)
+    # The volume does not relax: with part = "all" the motion is another one.
+    other = lj.harmonic(replace(scene, springpots=replace(scene.springpots, part="all"))).displacement
+    assert np.abs(other - found).max() > 1e-3 * np.abs(found).max()
+
+    def size(exponent):
+        own = replace(scene.springpots, exponents=jnp.array([0.2, exponent]))
+        return jnp.sum(jnp.abs(lj.harmonic(replace(scene, springpots=own)).displacement) ** 2) * 1e10
+
+    slope, h = jax.grad(size)(0.6), 1e-4
+    assert np.isclose(slope, (size(0.6 + h) - size(0.6 - h)) / (2 * h), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("times = [0.0125, 0.002]", "", "needs times"),
+        ("exponents = [0.2, 0.6]", "exponents = [0.2]", "differ in length"),
+        ("exponents = [0.2, 0.6]", "exponents = [0.2, 1.6]", "springpots.exponents"),
+        ('part = "isochoric"', 'part = "none"', "part = 'none'"),
+        (
+            "[springpots]",
+            "[viscosity]\nratios = [0.1]\nrelaxation_times = [0.1]\n[springpots]",
+            "leave one of them out",
+        ),
+        ('kind = "harmonic"\nfrequencies = [40.0]', 'kind = "static"', "for kind = 'harmonic'"),
+    ],
+)
+def test_springpots_that_cannot_be_are_refused(tmp_path, old, new, words):
+    text = FILE + "frequencies = [40.0]\n" + SPRINGPOTS
+    assert old in text
+    (tmp_path / "scene.toml").write_text(text.replace(old, new))
+    with pytest.raises(lj.InputError, match=words):
+        lj.load_scene(tmp_path / "scene.toml")
+
+
 @pytest.mark.parametrize(
     ("line", "more", "words"),
     [

@@ -18,6 +18,7 @@ from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import Displaced, Fixed
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes.regions import Region
+from liverjax.scenes.springpots import SpringpotSeries
 
 
 @struct
@@ -74,6 +75,7 @@ class Scene:
     law: Law = param("1", "its hyperelastic law")
     region: tuple[Region, ...] = param("1", "parts of the body with other numbers in the law", default=())
     viscosity: Prony | None = param("1", "Prony series", default=None)
+    springpots: SpringpotSeries | None = param("1", "fractional model, of harmonic motion alone", default=None)
     porosity: Porosity | None = param("1", "sponge and fluid", default=None)
     body: Body | None = param("1", "density and gravity", default=None)
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())

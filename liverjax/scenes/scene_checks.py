@@ -17,6 +17,7 @@ from liverjax.physics.volumes.mixed import check as check_mixed_law
 from liverjax.scenes.region_checks import check_region_elements, check_region_numbers
 from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Body, Scene
+from liverjax.scenes.springpots import check_springpots
 
 #: What the choices of [solve] may be.
 CHOICES = {
@@ -52,6 +53,8 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies is not None):
         raise InputError("[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) go together: give both, or neither")
+    if scene.springpots is not None and scene.solve.kind != "harmonic":
+        raise InputError("[springpots] are for kind = 'harmonic': a run in time takes [viscosity], a Prony series")
     _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
@@ -154,6 +157,8 @@ def check_numbers(scene: Scene) -> None:
         law.check()
         if scene.viscosity is not None:
             viscosity.check(scene.viscosity, law)
+        if scene.springpots is not None:
+            check_springpots(scene.springpots, law, scene.viscosity)
     if scene.porosity is not None:
         porosity.check(scene.porosity)
 

@@ -30,6 +30,7 @@ from liverjax.scenes import regions
 from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.scene_checks import CHOICES, check_scene
+from liverjax.scenes.springpots import SpringpotSeries
 
 #: Of a cylinder: what it needs, then what it may have.
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
@@ -37,6 +38,7 @@ _KEYS = {
     "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
     "region": ("where", "set", "law", "viscosity", "porosity"),
     "viscosity": ("ratios", "relaxation_times", "part", "scheme"),
+    "springpots": ("times", "exponents", "limits", "spring", "part"),
     "porosity": (
         "bulk",
         "limit_bulk",
@@ -99,6 +101,7 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
         law=_law(content["law"]),
         region=tuple(_region(mesh, k, t) for k, t in enumerate(_tables(content, "region"))),
         viscosity=prony,
+        springpots=_section(content, "springpots", _read_springpots),
         porosity=_section(content, "porosity", lambda table: _porosity(mesh, table)),
         body=_section(content, "body", _read_body),
         fixed=tuple(_fixed(mesh, k, t) for k, t in enumerate(_tables(content, "fixed"))),
@@ -288,6 +291,19 @@ def _prony(table: dict) -> Prony:
             raise InputError(f"[viscosity] needs {key}: give a list of numbers, one a mode")
     g, tau = (jnp.asarray(_numbers(f"[viscosity] {k}", table[k])) for k in ("ratios", "relaxation_times"))
     return Prony(ratios=g, relaxation_times=tau, **{k: table[k] for k in ("part", "scheme") if k in table})
+
+
+def _read_springpots(table: dict) -> SpringpotSeries:
+    for key in ("times", "exponents"):
+        if key not in table:
+            raise InputError(f"[springpots] needs {key}: give a list of numbers, one a springpot")
+    values: Content = {k: table[k] for k in ("part",) if k in table}
+    if "spring" in table:
+        values["spring"] = _number("[springpots] spring", table["spring"])
+    for key in ("times", "exponents", "limits"):
+        if key in table:
+            values[key] = jnp.asarray(_numbers(f"[springpots] {key}", table[key]))
+    return SpringpotSeries(**values)
 
 
 def _porosity(mesh: TetMesh, table: dict) -> Porosity:

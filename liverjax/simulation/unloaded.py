@@ -23,6 +23,7 @@ from liverjax.mesh.tetrahedra import TetMesh, with_points
 from liverjax.physics.prescribed import Fixed
 from liverjax.physics.viscosity import lasting
 from liverjax.scenes.scene import Scene
+from liverjax.scenes.springpots import series_at_rest
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, Sizes, equations, force_sizes, initial_state, residual, unknowns
 from liverjax.solvers.block_matrix import columns, flat
@@ -59,6 +60,8 @@ def unload(scene: Scene) -> Unloaded:
 
 def resting(scene: Scene) -> Scene:
     """The same body after a long rest under the loads of time 0."""
+    if scene.springpots is not None:
+        scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
     if scene.viscosity is not None:
         left = lasting(scene.viscosity, scene.mesh.order)

@@ -17,7 +17,9 @@ from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import prescribed
+from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Scene
+from liverjax.scenes.springpots import check_springpots, series_at_rest, springpot_factors
 from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
 from liverjax.waves import sparse
@@ -74,8 +76,9 @@ def harmonic(
         scene: `Scene`. What `displaced` prescribes is the amplitude of a motion in phase.
         frequencies_Hz: (F,), above 0; default: those of scene.solve.
         factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
-            default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or 1 without one. Where
-            volumes have pressures of their own (volumetric "mixed", "nodal"), or a sponge has them, they do not relax.
+            default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or of its springpots; else 1.
+            Where volumes have pressures of their own (volumetric "mixed", "nodal"), or a sponge has them, they do not
+            relax.
         about: positions (V, 3) [m] of an equilibrium that has rested for long, as of `simulate`; default: the
             reference shape. The law's stress there stiffens the body. A fluid has flowed until its pressure is 0.
         motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
@@ -89,6 +92,8 @@ def harmonic(
             that cannot be used.
     """
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
+    if scene.springpots is not None:
+        factors = springpot_factors(scene.springpots, omegas) if factors is None else factors
     scene = _small(scene, mass)
     mesh = scene.mesh
     number, elements = len(omegas), mesh.number_of_elements
@@ -219,4 +224,9 @@ def _small(scene: Scene, mass: str) -> Scene:
     if sponge is not None:
         inlets = tuple(replace(inlet, times=None, history=None) for inlet in sponge.inlet)
         sponge = replace(sponge, inlet=inlets)
-    return prepared(replace(scene, traction=traction, body=body, solve=solve, porosity=sponge))
+    scene = replace(scene, traction=traction, body=body, solve=solve, porosity=sponge)
+    if scene.springpots is not None:
+        for law in laws_of(scene.law, scene.region):
+            check_springpots(scene.springpots, law, scene.viscosity)
+        scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
+    return prepared(scene)

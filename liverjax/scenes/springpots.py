@@ -1,0 +1,70 @@
+"""Springpots beside the law, for harmonic motion: fractional models of soft tissue.
+
+A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). With the
+law's stiffness G0,
+
+    G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k):
+
+with spring 0 and one springpot the springpot alone, with spring 1 the fractional Kelvin-Voigt model, with a limit (a
+spring in a row with the springpot) the fractional Zener model (Bagley and Torvik 1983, J. Rheol. 27, 201).
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core import bounds
+from liverjax.core.errors import InputError
+from liverjax.core.struct import Number, param, static, struct
+from liverjax.laws.base import Law, isochoric_part
+from liverjax.physics.viscosity import PARTS, Prony
+
+
+@struct
+class SpringpotSeries:
+    """The complex modulus over the law's own; of harmonic motion alone."""
+
+    times: Any = param("s", "tau_k (K,): there a springpot is as stiff as the law", above=0.0)
+    exponents: Any = param("1", "alpha_k (K,), 0 a spring, 1 a dashpot", lower=0.0, upper=1.0)
+    limits: Any = param("1", "stiffness over the law's of a spring in a row with each (K,)", above=0.0, default=None)
+    spring: Number = param("1", "what is left at frequency 0: 1 the law, 0 nothing", lower=0.0, default=1.0)
+    part: str = static(default="all", about="all: of the whole stress; isochoric: of its isochoric part")
+
+
+def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) -> None:
+    """Refuse springpots that give no modulus; host side.
+
+    Raises:
+        InputError: lengths that differ, values out of bounds, an unknown part or one that the law has not, a viscosity
+            beside them.
+    """
+    if viscosity is not None:
+        raise InputError("the scene has [viscosity] and [springpots]: leave one of them out")
+    bounds.check(own, "springpots")
+    shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
+    if len(shapes) != 1 or len(np.shape(own.times)) != 1:
+        raise InputError("springpots times, exponents and limits differ in length: give one of each a springpot")
+    if own.part not in PARTS:
+        raise InputError(f"springpots part = {own.part!r} is not known: use one of {', '.join(PARTS)}")
+    if own.part == "isochoric" and isochoric_part(law) is None:
+        raise InputError(
+            f"springpots part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
+            "use part = 'all' or a law with bulk"
+        )
+
+
+def series_at_rest(own: SpringpotSeries) -> Prony:
+    """A series whose stress, when it has relaxed, is that of the springpots at rest."""
+    return Prony(ratios=1 - jnp.atleast_1d(own.spring), relaxation_times=jnp.ones(1), part=own.part)
+
+
+def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:
+    """G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
+    times, alpha = jnp.atleast_1d(own.times)[:, None], jnp.atleast_1d(own.exponents)[:, None]
+    # (i omega tau)^-alpha, whose phase is a quarter turn a unit of alpha.
+    compliance = jnp.exp(-alpha * (jnp.log(omegas[None] * times) + 0.5j * jnp.pi))
+    if own.limits is not None:
+        compliance = compliance + 1 / jnp.atleast_1d(own.limits)[:, None]
+    return jnp.asarray(own.spring) + jnp.sum(1 / compliance, axis=0)
