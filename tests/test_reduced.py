@@ -11,7 +11,7 @@ from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.reduced.correction import Learnt, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
-from liverjax.reduced.sampling import MOST_STATES, nonnegative_weights, states_of
+from liverjax.reduced.sampling import MOST_STATES, nonnegative_weights, sampled, states_of
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -128,6 +128,18 @@ def test_weights_give_all_forces_and_are_few():
     xi = nonnegative_weights(G, np.ones(200), 1e-8)
     assert np.all(xi >= 0) and np.count_nonzero(xi) <= 7
     assert np.allclose(G @ xi, G.sum(axis=1), rtol=0, atol=1e-8 * np.abs(G).sum(axis=1).max())
+
+
+def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained):
+    scene, model = trained
+    whole, mu = with_all_points(scene, model.modes), 800.0
+    q = lj.simulate_reduced(model, scene).coordinates
+    # Mirrored elements, of which this law has no force, and a body that has not moved.
+    bad = jnp.stack([jnp.zeros_like(q[0]), -1e3 * q[1], 1e3 * q[2]])
+    alone = sampled(whole, scene, {"law.mu": np.array([mu])}, q[None], 1e-3)
+    beside = sampled(whole, scene, {"law.mu": np.array([mu, mu])}, jnp.stack([q, bad]), 1e-3)
+    assert len(alone.points) > 1
+    assert np.array_equal(alone.points, beside.points) and np.allclose(alone.weights, beside.weights, rtol=1e-9)
 
 
 def test_the_error_is_stated(trained):
