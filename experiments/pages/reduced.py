@@ -61,6 +61,7 @@ def correction(r: dict) -> str:
     low, high = r["change_effectivity_range"]
     without = f"{percent(r['uncorrected_median'])} (95 % below {percent(r['uncorrected_95'])})"
     return (
+        f"{percent(r['within_half_percent'])} of the runs are off by at most 0.5 %. "
         f"Errors are those after the correction; without it they are {without}, and the size of the correction is "
         f"{low:.2g} to {high:.2g} of them: right within a factor 2 in {percent(r['change_within_factor_2'])}. With the "
         f"motion of all nodes and its error stated a step takes {r['answer_ms']:.2g} ms. Of {r['runs']} runs "

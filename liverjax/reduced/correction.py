@@ -5,9 +5,10 @@ and the part of each field is a polynomial of the coordinates: linear in all, qu
 time, the rates of the coordinates count too. The numbers are those of least squares with a small ridge (closures of
 reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301).
 
-Groups of runs are left out in turn. The errors of these runs decide how many coordinates have products. Each group left
-out gives other polynomials. The difference between their answers, times a factor found from the runs left out,
-estimates the error of the corrected motion (the jackknife; Tukey 1958).
+Groups of runs are left out in turn. How far off the runs left out are decides how many coordinates have products. The
+same runs tell the error of the corrected motion: the logarithm of it is linear in the logarithms of three numbers that
+are known without the full run. They are the size of the correction, the largest displacement, and the leverage of the
+terms: the variance of the least squares there, over that of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -18,29 +19,33 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import Number, param, static, struct
+from liverjax.reduced.principal import principal_fields
 
 #: Groups of runs that are left out in turn, and the fewest runs that are corrected.
-GROUPS, FEWEST_RUNS = 6, 6
+GROUPS, FEWEST_RUNS = 12, 6
 #: Numbers of coordinates that have products; as many as `RATES` have products with rates.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
 #: The ridge over the squares of the features; part of the differences outside of the fields, and the most fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
-#: Part of the runs left out whose errors the stated ones are above.
-ABOVE = 0.9
 #: The most differences from which fields are made.
 FIELD_STATES = 1500
+#: Exponents of the stated error where few runs tell none: the root of the leverage times a constant.
+FEW_RUNS_EXPONENTS = np.array([0.0, -1.0, 0.5])
+#: As many runs speak for these exponents.
+FEW_RUNS = 10.0
 
 
 @struct
 class Correction:
-    """Polynomials with k terms for m fields, and the g that were made without a group of runs."""
+    """Polynomials with k terms for m fields, and what tells the error that they leave."""
 
     fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
     factors: jax.Array = param("m^2.5", "of every term in every field (k, m)")
-    committee: jax.Array = param("m^2.5", "the same without each group of runs (g, k, m)")
+    inverse: jax.Array = param("1", "of the normal equations of the terms (k, k)")
     scale: jax.Array = param("m", "size of the first coordinate")
-    effectivity: jax.Array = param("1/m^1.5", "largest error of a node over the committee's spread")
+    statement: jax.Array = param("1", "logarithm of the stated error: constant and exponents (4,), see `_logarithms`")
     left: jax.Array = param("1", "error of each run left out, over its largest displacement (R,)")
+    ratios: jax.Array = param("1", "stated over true error of each run left out (R,)")
     products: int = static(default=0, about="number of coordinates that have products")
 
 
@@ -71,13 +76,51 @@ def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
-def stated_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """Stated largest distance of a node from the full model after the correction: (T,) [m]."""
-    return own.effectivity * jackknife(terms(q, own.scale, own.products, dt), own.committee - own.factors[None])
+def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None) -> jax.Array:
+    """Stated largest distance of a node from the full model up to each step, after the correction: (T,) [m].
+
+    Args:
+        own: `Correction`.
+        q: coordinates (T, n) [m].
+        moved: corrected displacements of the nodes (T, V, 3) [m].
+        dt: time step [s], None without time.
+    """
+    a = terms(q, own.scale, own.products, dt)
+    numbers = _lengths(jnp.tensordot(a @ own.factors, own.fields, axes=1)), _lengths(moved), _leverage(a, own.inverse)
+    corrected, far, leverage = (jax.lax.cummax(number) for number in numbers)
+    still = far == 0
+    x = _logarithms(corrected, jnp.where(still, 1.0, far), leverage)
+    return jnp.where(still, 0.0, far * jnp.exp(own.statement[0] + x @ own.statement[1:]))
+
+
+def _lengths(u: jax.Array) -> jax.Array:
+    """Largest length of vectors (T, V, 3) at each step (T,)."""
+    square = jnp.max(jnp.sum(u**2, axis=-1), axis=-1)
+    # The root has no derivative at zero.
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
+    """Variance of the least squares at terms a (T, k), over that of the data: (T,)."""
+    return jnp.sum((a @ inverse) * a, axis=1)
+
+
+def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
+    """What the stated error is told from (R, 3): part that is corrected, displacement, leverage; all above 0."""
+    tiny = jnp.finfo(moved.dtype).tiny
+    return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
+
+
+class _LeftOut(NamedTuple):
+    """Of every run (R,), by the polynomial without its group."""
+
+    off: np.ndarray  # largest error [m]
+    corrected: np.ndarray  # largest correction [m]
+    leverage: np.ndarray  # largest [1]
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """The correction with the smallest errors in the runs left out; None if runs are too few or no correction helps."""
+    """The correction with the smallest errors of runs left out; None with too few runs or where none is better."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -86,7 +129,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
     fields = _error_fields(weighted.reshape(-1, roots.size * 3))
     parts = weighted.reshape(R, -1, fields.shape[1]) @ fields.T
     scale = float(np.std(runs.q[..., 0])) or 1.0
-    group = np.random.default_rng(0).permutation(R) % GROUPS
+    group = np.random.default_rng(0).permutation(R) % min(GROUPS, R)
     best, least = None, float(np.median(_farthest(runs.missing) / runs.moved))
     for products in PRODUCTS:
         of_run = partial(terms, scale=scale, products=products, dt=runs.dt)
@@ -94,23 +137,53 @@ def learnt_correction(runs: Learnt) -> Correction | None:
         if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # more terms than half of the states tell nothing
             break
         sums = _least_squares(A, parts, group)
-        committee = np.stack([sums.without(g) for g in range(GROUPS)])
-        guess = np.stack([a @ committee[g] for a, g in zip(A, group, strict=True)])
-        off = _farthest(runs.missing - (guess @ fields).reshape(runs.missing.shape) / roots)
-        if not (middle := float(np.median(off / runs.moved))) < least:
+        out = _left_out(A, sums, group, runs.missing, fields.reshape(-1, *runs.missing.shape[2:]) / roots)
+        if not (middle := float(np.median(out.off / runs.moved))) < least:
             continue
-        ratios = off / np.maximum(_spreads(A, sums, committee, group), 1e-300)
         least = middle
+        statement, ratios = _statement(out, runs.moved)
+        factors, inverse = sums.without()
         best = Correction(
             fields=jnp.asarray(fields.reshape(-1, *runs.missing.shape[2:]) / roots),
-            factors=jnp.asarray(sums.without()),
-            committee=jnp.asarray(committee),
+            factors=jnp.asarray(factors),
+            inverse=jnp.asarray(inverse),
             scale=jnp.asarray(scale),
-            effectivity=jnp.asarray(np.quantile(ratios, ABOVE)),
-            left=jnp.asarray(off / runs.moved),
+            statement=jnp.asarray(statement),
+            left=jnp.asarray(out.off / runs.moved),
+            ratios=jnp.asarray(ratios),
             products=products,
         )
     return best
+
+
+def _left_out(
+    A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
+) -> _LeftOut:
+    """How far off each group of runs is, by the polynomial of the others: of terms A (R, T, k)."""
+    found = np.zeros((3, len(A)))
+    for g in range(len(sums.squares)):
+        own = group == g
+        factors, inverse = sums.without(g)
+        correction = np.tensordot(A[own] @ factors, fields, axes=1)
+        leverage = np.sum((A[own] @ inverse) * A[own], axis=2).max(axis=1)
+        found[:, own] = _farthest(missing[own] - correction), _farthest(correction), leverage
+    return _LeftOut(*found)
+
+
+def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Constant and exponents (4,) of the stated error, and stated over true error of the runs left out (R,).
+
+    The exponents are those of least squares of logarithms; few runs leave them near `FEW_RUNS_EXPONENTS`. The
+    constant puts the runs left out as far above the true error as below.
+    """
+    x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
+    y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS
+    middle, size = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-6)
+    z = (x - middle) / size
+    more = np.linalg.solve(z.T @ z + FEW_RUNS * np.eye(3), z.T @ (y - y.mean())) / size
+    low, high = np.quantile(y - x @ more, [0.01, 0.99])
+    constant = 0.5 * (low + high)
+    return np.concatenate([[constant], FEW_RUNS_EXPONENTS + more]), np.exp(constant + x @ more - y)
 
 
 def _farthest(u: np.ndarray) -> np.ndarray:
@@ -120,12 +193,7 @@ def _farthest(u: np.ndarray) -> np.ndarray:
 
 def _error_fields(weighted: np.ndarray) -> np.ndarray:
     """Orthonormal fields (m, 3 V) of differences (N, 3 V), both times the roots of the volumes."""
-    some = weighted[:: max(1, len(weighted) // FIELD_STATES)]
-    size, vectors = np.linalg.eigh(some @ some.T)
-    size, vectors = np.maximum(size[::-1], 0.0), vectors[:, ::-1]
-    outside = np.sqrt(np.maximum(size.sum() - np.cumsum(size), 0.0) / size.sum())
-    m = min(int(np.sum(outside > OUTSIDE)) + 1, int(np.sum(size > 1e-12 * size[0])), MOST_FIELDS)
-    return np.linalg.qr((vectors[:, :m].T @ some).T)[0].T
+    return principal_fields(weighted[:: max(1, len(weighted) // FIELD_STATES)], OUTSIDE)[:MOST_FIELDS]
 
 
 class _LeastSquares(NamedTuple):
@@ -136,11 +204,12 @@ class _LeastSquares(NamedTuple):
     size: np.ndarray  # of the terms (k,)
     states: int
 
-    def without(self, *groups: int) -> np.ndarray:
-        """Factors (k, m) from all runs but those of some groups."""
-        kept = np.setdiff1d(np.arange(GROUPS), groups)
+    def without(self, *groups: int) -> tuple[np.ndarray, np.ndarray]:
+        """Factors (k, m) from all runs but those of some groups, and the inverse (k, k) of their normal equations."""
+        kept = np.setdiff1d(np.arange(len(self.squares)), groups)
         H = self.squares[kept].sum(axis=0) + RIDGE * self.states * np.eye(len(self.size))
-        return np.linalg.solve(H, self.products[kept].sum(axis=0)) / self.size[:, None]
+        inverse = np.linalg.inv(H) / np.outer(self.size, self.size)
+        return np.linalg.solve(H, self.products[kept].sum(axis=0)) / self.size[:, None], inverse
 
 
 def _least_squares(A: np.ndarray, parts: np.ndarray, group: np.ndarray) -> _LeastSquares:
@@ -148,25 +217,8 @@ def _least_squares(A: np.ndarray, parts: np.ndarray, group: np.ndarray) -> _Leas
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size = np.where(size > 0, size, 1.0)
     squares, products = [], []
-    for g in range(GROUPS):
+    for g in range(group.max() + 1):
         own, y = (A[group == g] / size).reshape(-1, A.shape[2]), parts[group == g].reshape(-1, parts.shape[2])
         squares.append(own.T @ own)
         products.append(own.T @ y)
     return _LeastSquares(np.stack(squares), np.stack(products), size, A.shape[0] * A.shape[1])
-
-
-def _spreads(A: np.ndarray, sums: _LeastSquares, committee: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Largest spread along each run (R,) [m^2.5] of the polynomials made without its group, and without a second group
-    too."""
-    found = np.zeros(len(A))
-    for g in range(GROUPS):
-        apart = np.stack([sums.without(g, other) - committee[g] for other in range(GROUPS) if other != g])
-        for r in np.flatnonzero(group == g):
-            found[r] = float(jackknife(jnp.asarray(A[r]), jnp.asarray(apart)).max())
-    return found
-
-
-def jackknife(a: jax.Array, apart: jax.Array) -> jax.Array:
-    """Standard error (T,) of polynomials with terms a (T, k), from those without a group less the whole (g, k, m)."""
-    off = jnp.sum(jnp.einsum("tk,gkm->gtm", a, apart) ** 2, axis=2)
-    return jnp.sqrt((len(apart) - 1) * jnp.mean(off, axis=0))

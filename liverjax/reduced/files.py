@@ -14,7 +14,7 @@ from liverjax.reduced.correction import Correction
 from liverjax.reduced.model import ReducedModel
 
 #: Arrays of a correction.
-_LEARNT = ("fields", "factors", "committee", "scale", "effectivity", "left")
+_LEARNT = ("fields", "factors", "inverse", "scale", "statement", "left", "ratios")
 _UNITS = {"modes": "1", "slopes": "1/m", "weights": "m^3", "points": "1"}
 
 

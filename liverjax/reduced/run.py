@@ -10,9 +10,10 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, struct
+from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.base import End, Free, Solid, Step
+from liverjax.physics.elasticity import Elastic
 from liverjax.physics.inertia import FACTOR
 from liverjax.physics.loads import Loads, dead_loads
 from liverjax.physics.prescribed import prescribed
@@ -74,6 +75,7 @@ class _Equations(NamedTuple):
     dt: jax.Array
     newmark: bool | None
     spread: jax.Array | None  # sizes of the slopes (n, 9, S) [1/m] where a part of the body is moved
+    noise: jax.Array  # size of forces whose roundoff is the tolerance [N]: no load leaves only these
 
 
 def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
@@ -91,11 +93,25 @@ def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
     return e.gradient + jnp.tensordot(q, e.model.slopes, axes=1)
 
 
+def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
+    """First Piola-Kirchhoff stress (9, S) of deformation gradients (9, S)."""
+    return jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in solid.stress(as_matrix(F)) for entry in row])
+
+
+def _noise(model: ReducedModel, scene: Scene) -> jax.Array:
+    """As `liverjax.simulation.equations.Equations.noise`: roundoff of a stretch along x, over the tolerance [N]."""
+    law = solid_at_points(model, replace(scene, viscosity=None)).law
+    rest = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)).astype(model.slopes.dtype)
+    P = jax.jvp(lambda F: _stresses(Elastic(law=law), F), (rest,), (jnp.zeros_like(rest).at[0].set(1.0),))[1]
+    force = jnp.linalg.norm(jnp.tensordot(model.slopes, model.weights[None] * P, axes=2))
+    return jax.lax.stop_gradient(20 * float(np.finfo(np.float64).eps) / scene.solve.tolerance * force)
+
+
 def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Out-of-balance forces (n,) and the size of all forces, with the deformation gradients F (9, S) of q."""
-    P = jnp.stack([jnp.broadcast_to(entry, F.shape[1:]) for row in e.acting.stress(as_matrix(F)) for entry in row])
+    P = _stresses(e.acting, F)
     internal = jnp.tensordot(e.model.slopes, e.model.weights[None] * P, axes=2)
-    r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load)
+    r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
         # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
         size = size + jnp.linalg.norm(jnp.tensordot(e.spread, e.model.weights[None] * jnp.abs(P), axes=2))
@@ -289,6 +305,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
+    noise = _noise(model, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:
@@ -296,7 +313,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
         acting = solid.freeze(memory, step)
         newmark = solve.integrator == "newmark"
         load, gradient = given
-        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread)
+        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise)
         found = _newton(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
         F = as_matrix(_deformation(e, found.q))
@@ -344,13 +361,19 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
     """Positions (T, V, 3) [m] of the nodes, with the correction that the model has learnt."""
     mesh, solve = scene.mesh, scene.solve
-    u = jnp.tensordot(result.coordinates, model.modes, axes=1)
-    if model.correction is not None:
-        u = u + correction_at(model.correction, result.coordinates, solve.dt)
+    u = _free_motion(model, scene, result)
     if scene.displaced:
         numbers = jnp.arange(1, solve.steps + 1, dtype=u.dtype)
         u = u + jax.vmap(lambda k, t: prescribed(mesh, scene.displaced, t, k / solve.steps))(numbers, result.times)
     return mesh.points[None] + u
+
+
+def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
+    """Displacements (T, V, 3) [m] of the nodes by modes and correction, without prescribed ones."""
+    u = jnp.tensordot(result.coordinates, model.modes, axes=1)
+    if model.correction is not None:
+        u = u + correction_at(model.correction, result.coordinates, scene.solve.dt)
+    return u
 
 
 def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
@@ -366,4 +389,5 @@ def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
     """
     if model.correction is None:
         raise InputError("this reduced model has no correction: make it from more rows, or take lj.reduced_error")
-    return stated_at(model.correction, result.coordinates, scene.solve.dt)
+    moved = _free_motion(model, scene, result)
+    return stated_at(model.correction, result.coordinates, moved, scene.solve.dt)

@@ -18,6 +18,7 @@ from liverjax.physics.base import End, Free, Step
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
+from liverjax.reduced.principal import principal_fields
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 
@@ -109,11 +110,7 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
     """
     from scipy.optimize import nnls
 
-    size, vectors = np.linalg.eigh(G @ G.T)
-    size, vectors = np.maximum(size[::-1], 0.0), vectors[:, ::-1]
-    left = np.sqrt(np.maximum(size.sum() - np.cumsum(size), 0.0) / size.sum())
-    rank = min(int(np.sum(left > tolerance)) + 1, int(np.sum(size > 1e-14 * size[0])))
     # Rows of length 1: small vectors count as much as large ones.
-    V = (vectors[:, :rank] / np.sqrt(size[:rank])).T @ G
+    V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])
     return nnls(V, V.sum(axis=1), maxiter=20 * V.shape[1])[0]

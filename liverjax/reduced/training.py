@@ -14,6 +14,7 @@ from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.prescribed import free_degrees
 from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
 from liverjax.reduced.model import ReducedModel, refuse_unknown_physics, with_all_points
+from liverjax.reduced.principal import principal_fields
 from liverjax.reduced.run import simulate_reduced
 from liverjax.reduced.sampling import sampled
 from liverjax.scenes.scene import Scene, with_parameters
@@ -139,17 +140,6 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Modes (n, V, 3) that leave out at most `tolerance` of fields u (N, V, 3), in the norm of lumped volumes (V,).
-
-    They come from the eigenvalues of the fields' products (Sirovich 1987). Products keep only half of the digits, so
-    the smallest tolerance is 1e-7.
-    """
-    flat = (u * np.sqrt(volumes)[:, None]).reshape(len(u), -1)
-    size, vectors = np.linalg.eigh(flat @ flat.T)
-    size, vectors = np.maximum(size[::-1], 0.0), vectors[:, ::-1]
-    left = np.sqrt(np.maximum(size.sum() - np.cumsum(size), 0.0) / size.sum())
-    n = min(int(np.sum(left > tolerance)) + 1, int(np.sum(size > 1e-14 * size[0])))
-    modes = vectors[:, :n].T @ flat
-    # Orthonormal to all digits.
-    modes = np.linalg.qr(modes.T)[0].T
-    return modes.reshape(n, *u.shape[1:]) / np.sqrt(volumes)[:, None]
+    """Modes (n, V, 3) that leave out at most `tolerance` of fields u (N, V, 3), in the norm of lumped volumes (V,)."""
+    modes = principal_fields((u * np.sqrt(volumes)[:, None]).reshape(len(u), -1), tolerance)
+    return modes.reshape(-1, *u.shape[1:]) / np.sqrt(volumes)[:, None]
