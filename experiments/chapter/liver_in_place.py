@@ -4,8 +4,8 @@ The phantom is held at its vena cava and its suspensory ligament and lies on its
 as in Fig. 6. What each part changes in the displacement of the tip (the node that moves most by itself) is told beside
 the run time and the mesh's error; quadratic elements on the same mesh stand beside it. The motion of
 four models, with and without viscosity and fluid, is run with all parts and without: the tip's peak and the fluid's
-pressure. The complete model has the mesh's estimate, and is run with quadratic elements as well: in richer functions a
-capsule that is pressed folds, and elements at the clamps turn inside out, so the estimate's linear solve fails. The
+pressure. The complete model asks for the mesh's estimate, whose linear solve fails in some steps: why is not shown. It
+can be run with quadratic elements as well (``finer``). The
 capsule's numbers (8 MPa, 50 um) are in the range of the literature; those of ligaments, vessels and plane are chosen:
 no measurement of one liver has them all.
 

@@ -21,7 +21,7 @@ def table() -> str:
         f"The viscous phantom, {data['elements']:,} linear tetrahedra, 24 steps of 0.05 s; gravity, a pull at the",
         "tip, modulus, a ratio and a relaxation time are free (9 numbers). Errors are the largest distance of a node",
         "from the full model over its largest displacement, in runs from a box 10 % wider than that of the training.",
-        "Times are of one core of a busy machine:",
+        "Times are of one core:",
         "",
         "| training runs | training | modes | points | a step | full step | gradient over run | error: median | 95 % | "
         "largest | stated over true error | within a factor 2 |",
