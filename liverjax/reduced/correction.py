@@ -86,14 +86,18 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
         dt: time step [s], None without time.
     """
     a = terms(q, own.scale, own.products, dt)
-    numbers = _lengths(jnp.tensordot(a @ own.factors, own.fields, axes=1)), _lengths(moved), _leverage(a, own.inverse)
+    numbers = (
+        _largest_of_steps(jnp.tensordot(a @ own.factors, own.fields, axes=1)),
+        _largest_of_steps(moved),
+        _leverage(a, own.inverse),
+    )
     corrected, far, leverage = (jax.lax.cummax(number) for number in numbers)
     still = far == 0
     x = _logarithms(corrected, jnp.where(still, 1.0, far), leverage)
     return jnp.where(still, 0.0, far * jnp.exp(own.statement[0] + x @ own.statement[1:]))
 
 
-def _lengths(u: jax.Array) -> jax.Array:
+def _largest_of_steps(u: jax.Array) -> jax.Array:
     """Largest length of vectors (T, V, 3) at each step (T,)."""
     square = jnp.max(jnp.sum(u**2, axis=-1), axis=-1)
     # The root has no derivative at zero.

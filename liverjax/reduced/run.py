@@ -13,7 +13,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.base import End, Free, Solid, Step
-from liverjax.physics.elasticity import Elastic
+from liverjax.physics.elasticity import Elastic, Elasticity
 from liverjax.physics.inertia import FACTOR
 from liverjax.physics.loads import Loads, dead_loads
 from liverjax.physics.prescribed import prescribed
@@ -100,9 +100,10 @@ def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
 
 def _noise(model: ReducedModel, scene: Scene) -> jax.Array:
     """As `liverjax.simulation.equations.Equations.noise`: roundoff of a stretch along x, over the tolerance [N]."""
-    law = solid_at_points(model, replace(scene, viscosity=None)).law
+    own = solid_at_points(model, replace(scene, viscosity=None))
+    assert isinstance(own, Elasticity)
     rest = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)).astype(model.slopes.dtype)
-    P = jax.jvp(lambda F: _stresses(Elastic(law=law), F), (rest,), (jnp.zeros_like(rest).at[0].set(1.0),))[1]
+    P = jax.jvp(lambda F: _stresses(Elastic(law=own.law), F), (rest,), (jnp.zeros_like(rest).at[0].set(1.0),))[1]
     force = jnp.linalg.norm(jnp.tensordot(model.slopes, model.weights[None] * P, axes=2))
     return jax.lax.stop_gradient(20 * float(np.finfo(np.float64).eps) / scene.solve.tolerance * force)
 
