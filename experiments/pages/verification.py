@@ -11,7 +11,7 @@ def tests() -> str:
         order = "" if r["order"] is None else f"{r['order']:.2f}"
         file, name = r["test"].split("::")
         off = f"{r['difference']:.1e}" + (f" (the mesh's bar {r['bar']:.1e})" if "bar" in r else "")
-        cells = (r["benchmark"], r["source"], off, f"{r['allowed']:.0e}", order)
+        cells = (r["benchmark"], r["source"], off, _allowed(r["allowed"]), order)
         rows.append("| " + " | ".join(cells) + f" | `{file.removeprefix('tests/')}` `{name.split('[')[0]}` |")
     return "\n".join(rows)
 
@@ -41,3 +41,9 @@ def meshes() -> str:
 
 
 PARTS = {"tests": tests, "meshes": meshes}
+
+
+def _allowed(tolerance: float) -> str:
+    """One digit, or two where one would be another number."""
+    short = f"{tolerance:.0e}"
+    return short if abs(float(short) / tolerance - 1) < 0.01 else f"{tolerance:.1e}"
