@@ -27,7 +27,9 @@ from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
 #: Starts of each model, how far the random ones lie from the one that follows the Prony modes, and iterations.
-STARTS, AROUND, MOST_STEPS = 4, 0.7, 80
+STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
+#: An exponent is a logistic function of its number. Beyond this size a start has no slope to leave by.
+MOST_LOGIT = 2.0
 
 
 class Spans(NamedTuple):
@@ -98,9 +100,15 @@ def _starts_near(model: Maxwell, spans: Spans) -> np.ndarray:
     rng, out = np.random.default_rng(0), []
     for case, fit in zip(FRACTIONAL, models.fractional(like), strict=True):
         first = np.asarray(springpots.full(case, jnp.asarray(fit.solution.u)))
-        free = np.isin(np.arange(springpots.SIZE), case.free)
-        out.append(first + AROUND * free * np.vstack([np.zeros(6), rng.standard_normal((STARTS - 1, 6))]))
+        out.append(np.vstack([first, _around(first, case, rng)]))
     return np.stack(out)
+
+
+def _around(u: np.ndarray, case: Fractional, rng: np.random.Generator) -> np.ndarray:
+    """Random starts (STARTS - 1, 6) about numbers u (6,) of a model, exponents not near 0 or 1."""
+    place = np.arange(springpots.SIZE)
+    near = np.where(place % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
+    return near + AROUND * np.isin(place, case.free) * rng.standard_normal((STARTS - 1, len(u)))
 
 
 class _Springpot(NamedTuple):
@@ -305,9 +313,8 @@ def _shares_of_springpots(fit: Together) -> list[Share]:
     assert fit.kind.values is not None and fit.parameters is not None
     u, jacobian = jnp.asarray(fit.solution.u), np.asarray(fit.solution.jacobian)
     slope = np.asarray(jax.jacfwd(fit.kind.values)(u))
-    starts = np.tile(np.asarray(springpots.full(case, u)), (1, STARTS, 1))
-    free = np.isin(np.arange(springpots.SIZE), case.free)
-    starts = starts + AROUND * free * np.random.default_rng(1).standard_normal(starts.shape)
+    whole = np.asarray(springpots.full(case, u))
+    starts = np.vstack([whole, _around(whole, case, np.random.default_rng(1))])[None]
     minima = _each_model(tuple(map(together.name_of, fit.tests)))
 
     def alone(k: int) -> float:
