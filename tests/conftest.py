@@ -51,9 +51,9 @@ QUICK = {
     )
 }
 #: Programs after which a file begins without any. Each takes a megabyte or two, and ten of the 65,530 memory maps that
-#: Linux grants a process (150 if it is compiled in parts: some 430 programs made jax 0.10.1 crash). Files that compile
-#: few go on with what is there.
-MANY_PROGRAMS = 400
+#: Linux grants a process, or 150 if it is compiled in parts: some 430 of these made jax 0.10.1 crash. Files that
+#: compile few go on with what is there.
+MANY_PROGRAMS = 400 if "parallel_codegen_split_count=1" in os.environ.get("XLA_FLAGS", "") else 100
 
 
 def pytest_addoption(parser):
@@ -122,8 +122,8 @@ def pytest_unconfigure(config):
         shutil.rmtree(config.compiled, ignore_errors=True)
 
 
-#: Programs compiled or found on disk since caches were last emptied. Tests count with it, for to remove a listener of
-#: their own would remove this one too.
+#: Programs compiled or found on disk since caches were last emptied. Tests that count programs read it: a listener of
+#: their own could not be removed without this one.
 COMPILED: list[float] = []
 
 
