@@ -79,11 +79,20 @@ def check(prony: Prony, law: Law) -> None:
     check_series(prony)
     if prony.scheme not in SCHEMES:
         raise InputError(f"viscosity scheme = {prony.scheme!r} is not known: use one of {', '.join(SCHEMES)}")
-    if prony.part not in PARTS:
-        raise InputError(f"viscosity part = {prony.part!r} is not known: use one of {', '.join(PARTS)}")
-    if prony.part == "isochoric" and isochoric_part(law) is None:
+    check_part(prony.part, law, "viscosity")
+
+
+def check_part(part: str, law: Law, section: str) -> None:
+    """Refuse a part of the law that does not relax or is not there; host side.
+
+    Raises:
+        InputError: an unknown part, or isochoric relaxation of a law without isochoric split.
+    """
+    if part not in PARTS:
+        raise InputError(f"{section} part = {part!r} is not known: use one of {', '.join(PARTS)}")
+    if part == "isochoric" and isochoric_part(law) is None:
         raise InputError(
-            f"viscosity part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
+            f"{section} part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
             "use part = 'all' or a law with bulk"
         )
 

@@ -18,7 +18,7 @@ from liverjax.physics.base import End, Free, Step
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
-from liverjax.reduced.principal import principal_fields
+from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 

@@ -14,7 +14,7 @@ from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics.prescribed import free_degrees
 from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
 from liverjax.reduced.model import ReducedModel, refuse_unknown_physics, with_all_points
-from liverjax.reduced.principal import principal_fields
+from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import simulate_reduced
 from liverjax.reduced.sampling import sampled
 from liverjax.scenes.scene import Scene, with_parameters

@@ -18,8 +18,8 @@ import numpy as np
 from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, static, struct
-from liverjax.laws.base import Law, isochoric_part
-from liverjax.physics.viscosity import PARTS, Prony
+from liverjax.laws.base import Law
+from liverjax.physics.viscosity import Prony, check_part
 
 
 @struct
@@ -46,13 +46,7 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
         raise InputError("springpots times, exponents and limits differ in length: give one of each a springpot")
-    if own.part not in PARTS:
-        raise InputError(f"springpots part = {own.part!r} is not known: use one of {', '.join(PARTS)}")
-    if own.part == "isochoric" and isochoric_part(law) is None:
-        raise InputError(
-            f"springpots part = 'isochoric' needs a law with an isochoric part, which {type(law).__name__} has not: "
-            "use part = 'all' or a law with bulk"
-        )
+    check_part(own.part, law, "springpots")
 
 
 def series_at_rest(own: SpringpotSeries) -> Prony:
