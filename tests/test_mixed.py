@@ -1,13 +1,17 @@
 """Pressures of their own, of linear and of quadratic elements: no locking, no wiggles, iterations that do not grow."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import ROOT
 
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.mesh import promotion
+from liverjax.mesh.basis import basis
 from liverjax.physics.volumes import mixed
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import equations, initial_state, positions, residual, settled, unknowns
@@ -126,6 +130,69 @@ def test_mixed_elements_pass_the_patch_test(order, kind):
     # moment of all forces is compared, the integral of P over the body.
     whole = np.einsum("ni,nj->ij", np.asarray(result.reactions[-1]), np.asarray(mesh.points))
     assert np.allclose(whole, law.first_piola(F) * 0.03 * 0.02 * 0.02, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_cooks_membrane_is_that_of_another_program(verified):
+    """Sixteen cells, small near the clamped corner, at K/mu = 1e4: scikit-fem's converged mean rise within 0.5 %."""
+    from experiments.benchmarks import elements
+
+    known = json.loads((ROOT / "experiments/results/cooks_membrane.json").read_text())["10000"]["64"]
+    errors = []
+    for n in (8, 16):
+        scene = elements.membrane(n, 1e4, "quadratic, mixed, graded")
+        result = lj.simulate(scene).check()
+        errors.append(float(elements.rise(scene)(result.positions, result.reactions)) / known - 1)
+    assert abs(errors[1]) < 5e-3 and errors[0] < 2 * errors[1] < 0, errors
+    verified("Cook's membrane, K/mu = 1e4, 1,536 graded elements", "scikit-fem", abs(errors[1]), 5e-3)
+
+
+def _squeezed(p: jax.Array, ratio: float) -> tuple[jax.Array, jax.Array]:
+    """A balanced motion [m] of a linear solid (Papkovich, Neuber), and its K div u over mu, which outlasts K."""
+    nu, a = (3 * ratio - 2) / (6 * ratio + 2), 100.0
+
+    def b(p):
+        # Harmonic. So small that what is of second order, and roundoff, stay below the error when K multiplies them.
+        return 1e-10 * jnp.exp(a * p[0]) * jnp.sin(a * p[1])
+
+    move = 4 * (1 - nu) * b(p) * jnp.array([1.0, 0, 0]) - jax.grad(lambda p: p[0] * b(p))(p)
+    return move, 4 / 3 * (1 + nu) * jax.grad(b)(p)[0]
+
+
+def _pressure_error(order: int, n: int, ratio: float) -> tuple[float, float]:
+    """Root mean squares of what displacements [m] of vertices and pressures over mu miss; these at inner points."""
+    box = lj.shapes.box((0.01, 0.01, 0.01), (n, n, n))
+    mesh = lj.quadratic(box) if order == 2 else box
+    X = np.asarray(mesh.points)
+    exact = jax.vmap(lambda p: _squeezed(p, ratio))
+    outer = np.flatnonzero(np.any((X < 1e-9) | (X > 0.01 - 1e-9), axis=1))
+    moves = lj.Displaced(nodes=jnp.asarray(outer), by=exact(mesh.points[outer])[0])
+    law = lj.laws.NeoHookean(mu=770.0, bulk=770.0 * ratio)
+    own = prepared(lj.Scene(mesh=mesh, law=law, displaced=(moves,), solve=lj.Solve(volumetric="mixed", tolerance=1e-9)))
+    result, state = simulate_part(own, initial_state(own), 1.0, 1)
+    V = box.number_of_nodes
+    u = np.asarray(result.check().positions[-1] - mesh.points - exact(mesh.points)[0])[:V]
+    # The memory is the part of K (J - 1) that the pressures carry.
+    p = np.asarray(state.memories[1])[:V] / (770.0 * (1 - mixed._PART[order] / ratio))
+    rule, tets = basis(3), np.asarray(box.tetrahedra)
+    at = np.einsum("vq,evi->qei", rule.L, np.asarray(box.points)[tets])
+    shown = np.einsum("vq,ev->qe", rule.L, p[tets])
+    off = shown - np.asarray(exact(jnp.asarray(at.reshape(-1, 3)))[1]).reshape(shown.shape)
+    # K times the volume that the interpolated motion of the surface encloses too much is a constant pressure.
+    weights = rule.weights / rule.weights.sum()
+    off = off - weights @ off.mean(axis=1)
+    return float(np.sqrt(np.mean(u**2))), float(np.sqrt(weights @ np.mean(off**2, axis=1)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [10.0, 1e3])
+@pytest.mark.parametrize(("order", "of_pressures", "cells"), [(1, 1.5, (6, 12)), (2, 2.0, (4, 8))])
+def test_observed_orders_of_pressures(order, of_pressures, cells, ratio, verified):
+    (u1, p1), (u2, p2) = (_pressure_error(order, n, ratio) for n in cells)
+    motion, pressure = np.log2(u1 / u2), np.log2(p1 / p2)
+    verified(f"smooth pressure, mixed elements of order {order}, K/mu = {ratio:g}", "analytic", p2, p1, order=pressure)
+    # Stabilised linear pressures: between 1, which is proven, and 2, which they reach on regular meshes.
+    assert motion > order + 0.75 and pressure > of_pressures - 0.25, (motion, pressure)
 
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])

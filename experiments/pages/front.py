@@ -36,10 +36,9 @@ def cheapest(rows: list[dict[str, Any]], target: float) -> dict[str, Any] | None
 
 def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
     """Rows with `error` and `run_s` of every choice, and the name of a row."""
-    fig5, liver, known, cube, ways = load("fig5_dma", "liver_choices", "known_answers", "precision", "fit_methods")
+    fig5, liver, cube, ways = load("fig5_dma", "liver_choices", "precision", "fit_methods")
     steps = [r | {"error": r["error"]["mean"]} for r in fig5["steps"]]
     meshes = [r | {"error": r[kind]["mean"], "kind": kind} for r in fig5["mesh"] for kind in ("raw", "corrected")]
-    cook = [r | {"error": abs(r["rise_mm"] / 14.74 - 1)} for r in known["cook"]]
 
     def of_liver(title: str) -> list[dict]:
         return [r | {"name": name} for name, rows in liver[title].items() for r in rows]
@@ -71,7 +70,12 @@ def questions() -> dict[str, tuple[list[dict], Callable[[dict], str]]]:
             cube["cube"],
             lambda r: f"{r['precision']}, {r['tolerance']:.0e}",
         ),
-        "Cook's membrane: mesh": (cook, lambda r: f"{r['tetrahedra']:,} tetrahedra"),
+        "Cook's membrane, K/mu = 3: elements": (elements.rows_of("Cook's membrane", 3.0), lambda r: r["name"]),
+        "the same, K/mu = 1e4": (elements.rows_of("Cook's membrane", 1e4), lambda r: r["name"]),
+        "a beam under a following pressure (Land): elements": (
+            elements.rows_of("Land's beam", None),
+            lambda r: r["name"],
+        ),
     }
 
 
