@@ -2,7 +2,7 @@
 
 Strains are of a thousandth, since the equation is of small strains. Near incompressibility the contact is four times as
 hard as by default, since what it leaves of the depth counts there; the linear systems are factorised, for run and
-estimate. Layers of any thickness have as many elements: one program serves all of a shape.
+estimate. Layers of nearly any thickness have as many elements: one program serves all of a shape.
 """
 
 import time
@@ -28,8 +28,8 @@ FORMS = {
     3.0: {"volumetric": "element", "linear_solver": "cg"},
     1e3: {"volumetric": "mixed", "linear_solver": "direct"},
 }
-#: Rings within the contact and outside of it, layers.
-CELLS = (6, 8, 8)
+#: Rings within the contact and outside of it, layers; finer where a thick layer meets the sharp edge of a punch.
+CELLS, FINER = (6, 8, 8), (8, 12, 12)
 
 
 def growing(first: float, length: float, n: int) -> np.ndarray:
@@ -44,7 +44,7 @@ def growing(first: float, length: float, n: int) -> np.ndarray:
 def layer(shape: str, thickness: float) -> tuple[cylinders.Sector, int]:
     """A sector of the layer, over the contact's radius, fine at its edge and on a cone's tip; rings that may touch."""
     edge = {"sphere": 0.12, "cone": 0.12, "punch": 0.02}[shape] * A
-    rings, around, layers = CELLS
+    rings, around, layers = FINER if shape == "punch" and thickness > 3 else CELLS
     inside = np.append(0.0, A - growing(edge, A, rings)[-2::-1])
     if shape == "cone":
         # As fine at the tip, where the pressure has no bound.
@@ -107,20 +107,11 @@ def carried(scene: lj.Scene, x, reactions):
     return jnp.sum(reactions[-1, scene.mesh.node_sets["bottom"], 2])
 
 
-#: K/mu, shape, thicknesses. The punch on a layer of 10 radii is 1.5 % off with so few elements; cones near
-#: incompressibility are not known to be followed on every layer.
-CASES = [
-    (3.0, "sphere", (0.5, 1.0, 3.0, 10.0)),
-    (3.0, "cone", (0.5, 1.0, 3.0, 10.0)),
-    (3.0, "punch", (0.5, 1.0, 3.0)),
-    (1e3, "sphere", (0.5, 1.0, 3.0, 10.0)),
-    (1e3, "cone", (3.0,)),
-    (1e3, "punch", (0.5, 1.0, 3.0)),
-]
+CASES = [(ratio, shape, t) for ratio in FORMS for shape in ("sphere", "cone", "punch") for t in (0.5, 1.0, 3.0, 10.0)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ratio", "shape", "thickness"), [(r, s, t) for r, s, every in CASES for t in every])
+@pytest.mark.parametrize(("ratio", "shape", "thickness"), CASES)
 def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thickness, verified):
     """Within 1 %, and the bar of the mesh's estimate covers the rest; K/mu = 1000 is a Poisson's ratio of 0.4995."""
     scene, parts, depth, exact = pressed(shape, ratio, thickness)

@@ -5,6 +5,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.core import names
+from liverjax.core.did_you_mean import hint
 from liverjax.core.files import whole
 
 LAW = lj.laws.Sum(
@@ -39,6 +40,18 @@ def test_names_that_lead_nowhere_are_refused(name, sentence):
     with pytest.raises(lj.InputError) as error:
         names.get(LAW, name, "no")
     assert str(error.value) == sentence
+
+
+@pytest.mark.parametrize(
+    "word, known, sentence",
+    [
+        ("points", ("line", "unit", "radius"), "use one of line, unit, radius"),
+        ("neo", ("ogden", "neo_hookean"), "did you mean neo_hookean?"),
+        ("frictoin", ("force", "friction"), "did you mean friction?"),
+    ],
+)
+def test_only_a_near_word_is_hinted_at(word, known, sentence):
+    assert hint(word, known) == sentence
 
 
 def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):

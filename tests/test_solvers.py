@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from liverjax.core import status
 from liverjax.solvers import newton, step_cutting
@@ -218,3 +219,24 @@ def test_a_step_that_fails_in_one_go_is_followed_in_parts():
     assert cuts[0] == cuts[1] >= 3
     q, s, _ = jax.jit(lambda q: step_cutting.solve(method, q, options._replace(max_cuts=2)))(jnp.ones(1))
     assert s.status != status.CONVERGED and np.isfinite(q)
+
+
+@pytest.mark.parametrize("kinks", [True, False])
+def test_where_springs_come_to_act_a_direction_halved_in_vain_is_taken_whole(kinks):
+    """Two stiff springs that only press: the second acts from a thousandth of the way on, and |r| rises."""
+    n = jnp.array([[2.0, 1.0], [0.1, -1.0]])
+    gap, k, rest = jnp.array([0.0, 1e-4 - 1.0]), jnp.array([1e3, 1e7]), jnp.array([0.0, -1.0])
+    method = Problem(
+        residual=lambda q, s: (q - rest + n.T @ (k * jnp.minimum(gap + n @ q, 0.0)), k[0], None),
+        tangent=lambda q, s, by, near: jnp.eye(2) + n.T @ jnp.diag(jnp.where(gap + n @ q < 0, k, 0.0)) @ n,
+        solve=lambda K, b, tolerance, most: (jnp.linalg.solve(K, b), jnp.ones((), jnp.int32), jnp.array(True)),
+        preconditioner=lambda K: lambda r: r,
+        moved=False,
+        kinks=kinks,
+    )
+    start = jnp.array([1.0, -1.0])
+    q, s, _ = jax.jit(lambda q: step_cutting.solve(method, q, StepOptions(tolerance=1e-10)))(start)
+    # Both press at the end. Parts of the step find it too, with many more solves.
+    both = np.linalg.solve(np.eye(2) + n.T @ (k[:, None] * n), rest - n.T @ (k * gap))
+    assert s.status == status.CONVERGED and np.allclose(q, both, rtol=1e-8)
+    assert (s.cuts == 0) == kinks == (s.iterations <= 4)

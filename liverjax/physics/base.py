@@ -166,6 +166,8 @@ class NodalForce:
     everywhere: ClassVar[bool] = False
     #: Whether the force has an energy; one that follows the body has none, and its stiffness is not symmetric.
     conservative: bool = True
+    #: Whether the force has kinks, as where a surface comes to touch.
+    kinked: ClassVar[bool] = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Gradient of the energy (V, 3) [N] at positions x (V, 3) [m], at part s of the step."""

@@ -63,6 +63,7 @@ def problem_of(e: Equations) -> Problem:
         symmetric=e.conservative,
         moved=len(e.scene.displaced) > 0 or e.scene.solve.kind == "static",
         roundoff=e.roundoff,
+        kinks=any(a.kinked for a in e.nodal),
         beside=_flowing(e),
         potential=potential,
     )

@@ -422,7 +422,9 @@ def solve(
     """Solve K dq = b; return dq, the iterations (0 for a factorisation), and whether K seems to be positive."""
     if e.scene.solve.linear_solver == "direct":
         dq = factorised_solution(e, K, b)
-        return dq, jnp.zeros((), jnp.int32), jnp.vdot(dq, b) >= 0
+        # With unknown pressures the matrix has negative eigenvalues anyway.
+        positive = jnp.vdot(dq, b) >= 0 if e.mixed is None else jnp.all(jnp.isfinite(dq))
+        return dq, jnp.zeros((), jnp.int32), positive
     # A block-triangular preconditioner is not symmetric either.
     method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)

@@ -91,6 +91,8 @@ class Problem(NamedTuple):
     #: |r| that the digits of q leave.
     roundoff: Any = 0.0
     beside: Beside | None = None
+    #: Whether r has kinks, as where a surface comes to touch.
+    kinks: bool = False
     #: What a step that cannot be followed is minimised with; None: it is not.
     potential: "Potential | None" = None
 

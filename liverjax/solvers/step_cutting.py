@@ -32,6 +32,10 @@ from liverjax.solvers.problem import (
 #: forces; measured: 1e-4), or so many times what rounding positions does, is at roundoff: shorter steps do not help.
 _PRECISIONS, _ROUNDINGS = 4096, 8
 
+#: Where the residual has kinks, a direction that is halved in vain is taken whole, so often a part: beyond a kink the
+#: tangent is another.
+_LEAPS = 8
+
 #: A guess with elements of less than this part of their volume is not begun with: it may lead to a folded shape.
 _FLAT = 0.1
 
@@ -70,6 +74,7 @@ class _Point(NamedTuple):
     first: jax.Array  # the next evaluation is the first of a part
     iterations: jax.Array  # of the part
     halvings: jax.Array
+    leaps: jax.Array  # directions of the part that were taken whole though |r| did not fall
     total: jax.Array
     linear: jax.Array
     cuts: jax.Array
@@ -303,6 +308,7 @@ def _first_point(
         first=jnp.array(no),
         iterations=none,
         halvings=none,
+        leaps=none,
         total=none,
         linear=none,
         cuts=none,
@@ -324,12 +330,13 @@ class _Verdict(NamedTuple):
     launch_now: jax.Array  # a new part begins at this very point
     go_on: jax.Array  # a direction is wanted
     halvings: jax.Array
+    leap: jax.Array  # the last direction is taken whole, whatever |r| is there
     cuts: jax.Array
     done: jax.Array
 
 
 def _judge(
-    c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, roundoff: Number, options: StepOptions
+    c: _Point, s: jax.Array, size: jax.Array, relative: jax.Array, problem: Problem, options: StepOptions
 ) -> _Verdict:
     finite = jnp.isfinite(size) & jnp.isfinite(relative)
     # The first point of a part need not be better, if its direction was that of a tangent made there.
@@ -340,9 +347,11 @@ def _judge(
     # A direction of an earlier tangent that leads nowhere is not halved: the tangent is made anew first.
     remake = ~better & ~c.launch & c.stale
     halvings = jnp.where(better | c.launch | remake, 0, c.halvings + 1)
-    spent = (c.iterations >= options.max_iterations) | (halvings > options.max_halvings)
+    small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= _ROUNDINGS * problem.roundoff)
+    leap = (halvings > options.max_halvings) & (c.leaps < _LEAPS) & ~small & problem.kinks
+    spent = (c.iterations >= options.max_iterations) | ((halvings > options.max_halvings) & ~leap)
     failed = ~c.launch & ~converged & ~remake & (spent | (c.first & ~finite))
-    small = (c.relative <= _PRECISIONS * float(jnp.finfo(size.dtype).eps)) | (c.size <= _ROUNDINGS * roundoff)
+    halvings = jnp.where(leap, 0, halvings)
     exhausted = failed & ~c.first & (s >= 1) & small
     lost = c.guessing & (failed | (c.launch & ~finite)) & ~exhausted
     cuts = c.cuts + (failed & ~lost & ~exhausted)
@@ -360,6 +369,7 @@ def _judge(
         launch_now=launch_now,
         go_on=(launch_now | better) & ~done & ~failed,
         halvings=halvings,
+        leap=leap & ~failed,
         cuts=cuts,
         done=done,
     )
@@ -374,7 +384,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     r = r - (1 - s) * unbalanced
     size = jnp.linalg.norm(r)
     relative = size / jnp.where(force > 0, force, 1.0)
-    v = _judge(c, s, size, relative, problem.roundoff, options)
+    v = _judge(c, s, size, relative, problem, options)
     longer = jnp.minimum(2 * c.ds, 1 - s)
     longer = jnp.where(1 - s - longer < 1e-9, 1 - s, longer)
     ds = jnp.where(v.converged, longer, jnp.where(v.failed & ~v.lost, 0.5 * c.ds, c.ds))
@@ -402,7 +412,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         stale=jnp.where(v.go_on, ~renew, c.stale),
         remake=v.remake,
         dq=jnp.where(v.go_on, dq, c.dq),
-        t=jnp.where(v.go_on, 1.0, 0.5 * c.t),
+        t=jnp.where(v.go_on | v.leap, 1.0, 0.5 * c.t),
         s=jnp.where(v.launch_now, s + ds, s),
         q_begin=jnp.where(v.lost, start, jnp.where(v.launch_now, trial, c.q_begin)),
         unbalanced=unbalanced,
@@ -410,9 +420,10 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         s_begin=jnp.where(v.launch_now, s, c.s_begin),
         ds=ds,
         launch=v.failed | v.lost,
-        first=v.launch_now,
+        first=v.launch_now | v.leap,
         iterations=jnp.where(v.launch_now, 1, c.iterations + v.better),
         halvings=v.halvings,
+        leaps=jnp.where(v.launch_now, 0, c.leaps + v.leap),
         total=c.total + (v.go_on & ~v.arrived),
         linear=c.linear + linear,
         cuts=v.cuts,

@@ -161,6 +161,8 @@ class Touching(NodalForce):
     obstacle: Obstacle = param("1", "shape and stiffness")
     moved: jax.Array = param("m", "its displacement at the beginning and at the end (2, 3)")
 
+    kinked: ClassVar[bool] = True
+
     def now(self, s: Number) -> jax.Array:
         """Its displacement (3,) [m] at part s of the step."""
         return self.moved[0] + s * (self.moved[1] - self.moved[0])
