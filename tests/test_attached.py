@@ -227,6 +227,10 @@ def test_a_vessel_stiffens_as_one_of_elements(verified):
         ({"radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "vessel.0 needs line"),
         ({"line": [[0, 0, 0]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}}, "two points or more"),
         (
+            {"line": [[0, 0, 0]] * 2, "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
+            "a point twice in a row",
+        ),
+        (
             {"line": [[0, 0, 1], [0, 0, 2]], "radius": 1e-3, "law": {"name": "neo_hookean", "mu": 1e5}},
             "outside the body",
         ),

@@ -230,6 +230,11 @@ SCENE = {
         ({"shape": "plane", "axis": [0, 0, 0], "position": [0, 0, -1]}, "must be of length 1"),
         ({"shape": "cone", "half_angle": 95.0, "axis": [0, 0, 1], "position": [0, 0, 1]}, "must be below 90"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0]}, "must be three numbers"),
+        ({"position": [0, 0, 1]}, "is without shape: give plane, sphere"),
+        ({"shape": "sphere", "radius": [0.1, 0.2], "position": [0, 0, 1]}, "must be one number"),
+        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "friction": [0.1]}, "must be one number"),
+        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "radius": 0.1}, "which has no radius"),
+        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "where": 3}, "is no place: write where"),
     ],
 )
 def test_bad_obstacles_are_one_sentence(table, words):

@@ -154,8 +154,8 @@ def test_scene_files_press_an_obstacle():
         ({"force": [0, 0, 1.0]}, "presses it past the body"),
         ({"force": [0, 0, 0]}, "not all 0"),
         ({"force": [0, 1]}, "must be three numbers"),
-        ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has"),
-        ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has"),
+        ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has force beside by: leave one"),
+        ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has force beside friction: leave one"),
         ({"history": [[0, 0, 0, 1]]}, "history"),
     ],
 )

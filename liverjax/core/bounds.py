@@ -87,7 +87,7 @@ def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -
     unit, typical = metadata.get("unit", "1"), metadata.get("typical")
     if not np.isfinite(numbers).all():
         raise InputError(
-            f"{_shown(where, value, numbers, ~np.isfinite(numbers))} is not finite: give a number in {unit}"
+            f"{_shown(where, value, numbers, ~np.isfinite(numbers))} is not finite: give a number{_in(unit)}"
         )
     if metadata.get("nonzero") and np.any(numbers == 0):
         raise InputError(f"{_shown(where, value, numbers, numbers == 0)} must not be 0: give another exponent")
@@ -111,7 +111,12 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves]) if leaves else np.empty(0)
     except (TypeError, ValueError):
         unit = metadata.get("unit", "1")
-        raise InputError(f"{where} = {value!r} is not a number: give a value in {unit}") from None
+        raise InputError(f"{where} = {value!r} is not a number: give a value{_in(unit)}") from None
+
+
+def _in(unit: str) -> str:
+    """The unit in words; nothing for a number without one."""
+    return "" if unit == "1" else f" in {unit}"
 
 
 def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> str:

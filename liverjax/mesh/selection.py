@@ -1,5 +1,7 @@
 """Parts of a mesh: nodes chosen by place or by name, triangles of its surface."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from liverjax.core.did_you_mean import hint
@@ -31,11 +33,13 @@ def select(
             there = ", ".join(mesh.node_sets) or "none"
             raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
         return np.asarray(mesh.node_sets[set])
+    if not isinstance(where, Mapping):
+        raise InputError(f"{name} = {where!r} is no place: write where = {{z_max = 0.0}}")
     points = np.asarray(mesh.points)
     tolerance = 1e-9 * np.linalg.norm(np.ptp(points, axis=0))
     inside = np.ones(len(points), dtype=bool)
     known = [f"{a}_{end}" for a in AXES for end in ("min", "max")]
-    for key, bound in (where or {}).items():
+    for key, bound in where.items():
         if key not in known:
             raise InputError(f"{name}: {key!r} is not known: {hint(key, known)}")
         if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not np.isfinite(bound):

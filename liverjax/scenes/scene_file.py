@@ -136,10 +136,19 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
         for k, table in enumerate(_tables(content, section)):
             name, own = f"{section}.{k}", set(table) - {"where", "set"}
             kinds = [p for p in NAMED if p.section == section and own and own <= set(p.keys)]
+            if own and not kinds:
+                raise InputError(_of_two_kinds(name, own, [set(p.keys) for p in NAMED if p.section == section]))
             if not kinds:
                 known = " or ".join(", ".join(p.keys[2:]) for p in NAMED if p.section == section)
-                raise InputError(f"{name} has {', '.join(sorted(own)) or 'a place alone'}: give {known}")
+                raise InputError(f"{name} has a place alone: give {known}")
             yield kinds[0].read(mesh, table, name)
+
+
+def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
+    """A sentence on keys that are known but do not go together."""
+    first = min((given - keys for keys in kinds), key=len)
+    other = min((given - keys for keys in kinds if first <= keys), key=len, default=given)
+    return f"{name} has {', '.join(sorted(first))} beside {', '.join(sorted(other))}: leave one of them out"
 
 
 def _with_paths(content: object, folder: Path) -> Any:

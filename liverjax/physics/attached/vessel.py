@@ -64,6 +64,8 @@ class Vessel(Physics):
             line, radius = np.empty(0), np.empty(0)
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
             raise InputError(f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each")
+        if not np.all(np.isfinite(line)) or not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
+            raise InputError(f"{name} line has a point twice in a row, or one that is not finite: mend the line")
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:

@@ -69,12 +69,18 @@ class Obstacle(Physics):
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
         """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
-        shape = table.get("shape")
+        if "shape" not in table:
+            raise InputError(f"{name} is without shape: give {', '.join(SHAPES)}")
+        shape = table["shape"]
         if shape not in SHAPES:
             raise InputError(f"{name} shape = {shape!r} is not known: {hint(str(shape), SHAPES)}")
         for key in ("position", *SHAPES[shape]):
             if key not in table:
                 raise InputError(f"{name} is a {shape} without {key}: give it")
+        own = (*SHAPES[shape], "radius") if shape == "cone" else SHAPES[shape]
+        for key in ("axis", "radius", "half_angle"):
+            if key in table and key not in own:
+                raise InputError(f"{name} is a {shape}, which has no {key}: leave it out")
         whole = "where" not in table and "set" not in table
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         triangles = selection.boundary_triangles(mesh, nodes)
@@ -93,6 +99,9 @@ class Obstacle(Physics):
         numbers = np.asarray(self.triangles)
         if not numbers.size or numbers.max() >= mesh.number_of_nodes:
             raise InputError(f"{name} names no triangle or a node beyond {mesh.number_of_nodes - 1}: give some")
+        for key in ("radius", "half_angle", "friction"):
+            if np.ndim(getattr(self, key, 0.0)):
+                raise InputError(f"{name}.{key} = {getattr(self, key)} must be one number: give one")
         if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
             raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
         if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):
