@@ -199,7 +199,7 @@ def through_torsion(
     if isinstance(start.solution.u, np.ndarray):  # what follows runs where the closed form did
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
-    worst = int(np.max(m.statistics.status))
+    worst = int(np.asarray(m.statistics.status).max())
     found = found._replace(converged=bool(found.converged) and worst == status.CONVERGED)
     details = _simulation_details(simulation, rig, law, m) | {"optimizer": optimizer}
     if rig.held is not None:
@@ -223,21 +223,25 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     a compressed sample without a mesh are extrapolated from a finer mesh.
     """
     law, omega, scales = data
-    scaled, prony = law_and_prony(fit.kind.maxwell(jnp.asarray(fit.solution.u)), law, simulation)
+    scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
     if simulation.precompression:
         meshless, exact = _of_finer_mesh(fit, scaled, prony, omega, simulation)
     else:
-        meshless = np.asarray(torsion.linear_moduli(scaled, prony, omega, simulation.steps))
-        exact = np.asarray(torsion.linear_moduli(scaled, prony, omega, None))
+        program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega)
+        meshless, exact = (np.asarray(G) for G in program(scaled, prony, omega))
     natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
-    found = fit.solution._replace(u=jnp.asarray(fit.solution.u))
 
     def moved(missing: np.ndarray) -> np.ndarray:
-        return mesh_bias(found, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
+        return mesh_bias(fit.solution, natural_of, np.concatenate([missing.real, missing.imag]) / scales)
 
     return fit.uncertainty._replace(
         mesh_bias=moved(meshless - (fit.storage + 1j * fit.loss)), time_step_bias=moved(exact - meshless)
     )
+
+
+def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
+    """Complex moduli (n,) without a mesh: by the recursion, and in continuous time."""
+    return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
 #: Length of a cell of the finer mesh over that of the mesh, for the extrapolation.
@@ -274,16 +278,16 @@ def _simulation_details(
         "density_kg_m3": simulation.density,
         "nodes": rig.mesh.number_of_nodes,
         "elements": rig.mesh.number_of_elements,
-        "geometry_factor": float(m.bias[0].real if whole else torsion.geometry_factor(rig, law)),
+        "geometry_factor": float(np.asarray(m.bias)[0].real if whole else torsion.geometry_factor(rig, law)),
         "steps_per_cycle": simulation.steps,
         "scheme": simulation.scheme,
         "part": simulation.part,
         "precompression_strain": simulation.precompression,
         "rim_strain": simulation.strain,
-        "newton_iterations": int(np.max(m.statistics.iterations)),
-        "newton_residual": float(np.max(m.statistics.residual)),
-        "newton_status": status.advice(np.max(m.statistics.status)),
-        "transient": float(np.max(m.defect)),
+        "newton_iterations": int(np.asarray(m.statistics.iterations).max()),
+        "newton_residual": float(np.asarray(m.statistics.residual).max()),
+        "newton_status": status.advice(np.asarray(m.statistics.status).max()),
+        "transient": float(np.asarray(m.defect).max()),
     }
 
 

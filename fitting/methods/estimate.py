@@ -66,10 +66,7 @@ def estimated(
     if effective is not None:
         r = r[:components]
     noise = noise_factor(r, components - (len(u) if effective is None else effective), deviations_given)
-    if isinstance(found.u, np.ndarray):
-        values, to_natural = host.with_jacobian(natural_of, found.u)
-    else:
-        values, to_natural = np.asarray(natural_of(found.u)), np.asarray(jax.jacfwd(natural_of)(found.u))
+    values, to_natural = _with_slope(natural_of, found.u)
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
     # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
@@ -86,6 +83,13 @@ def estimated(
         iterations=int(found.iterations),
         converged=bool(found.converged),
     )
+
+
+def _with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
+    """The reported numbers (P,) and their derivative by u, where u is: in NumPy nothing is compiled."""
+    if isinstance(u, np.ndarray):
+        return host.with_jacobian(natural_of, u)
+    return np.asarray(natural_of(u)), np.asarray(jax.jacfwd(natural_of)(u))
 
 
 def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) -> float:
@@ -134,7 +138,7 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
     It is of first order. It is good if the missing part is below a quarter and the numbers are not nearly dependent.
     Subtract it once to correct.
     """
-    J, to_natural = np.asarray(found.jacobian), np.asarray(jax.jacfwd(natural_of)(found.u))
+    J, (_, to_natural) = np.asarray(found.jacobian), _with_slope(natural_of, found.u)
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
         return np.full(len(to_natural), np.nan)
     return to_natural @ (np.linalg.pinv(J) @ missing)

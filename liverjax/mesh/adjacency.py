@@ -117,7 +117,7 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
     low, high = (xp.stack([f(m, axis=0) if len(m) else xp.zeros(3) for m in members]) for f in (xp.min, xp.max))
     widest = xp.max(high - low, axis=1)
     half = xp.where(widest > 0, widest / 2, 1.0)
-    place = (points - (low + high)[patch] / 2) / half[patch][:, None]
+    place = (given - (low + high)[patch] / 2) / half[patch][:, None]
     return jnp.asarray(xp.concatenate([xp.ones_like(place[:, :1]), place], axis=1)), jnp.asarray(xp.mean(widest))
 
 
