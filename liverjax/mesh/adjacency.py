@@ -81,17 +81,22 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
     upward = rows < columns
     slots[edge[upward]] = slot[upward] * number_of_nodes + rows[upward]
     return Pattern(
-        edges=jnp.asarray(np.stack([low, high]), jnp.int32),
-        element_edges=jnp.asarray(inverse.reshape(both.shape[:2]), jnp.int32),
-        row_nodes=jnp.asarray(row_nodes, jnp.int32),
-        row_edges=jnp.asarray(row_edges, jnp.int32),
-        edge_slots=jnp.asarray(slots, jnp.int32),
+        edges=node_numbers(np.stack([low, high])),
+        element_edges=node_numbers(inverse.reshape(both.shape[:2])),
+        row_nodes=node_numbers(row_nodes),
+        row_edges=node_numbers(row_edges),
+        edge_slots=node_numbers(slots),
         patches=jnp.asarray(near),
         patch_functions=functions,
         patch_width=widest,
         clusters=None if traced else vertex_clusters(np.asarray(points), np.stack([low, high])),
         number_of_patches=int(near.max(initial=0)) + 1,
     )
+
+
+def node_numbers(of: Any) -> jax.Array:
+    """A copy as 32-bit integers; NumPy converts it, for JAX would compile a program for each shape."""
+    return jax.device_put(np.asarray(of).astype(np.int32))
 
 
 def patches(points: np.ndarray) -> np.ndarray:
@@ -191,8 +196,8 @@ def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, 
     one, other = one[inside], other[inside]
     places = (number[group[one]] * M + place[one]) * M + place[other]
     return Clusters(
-        nodes=jnp.asarray(nodes, jnp.int32),
+        nodes=node_numbers(nodes),
         there=jnp.asarray(there, float),
-        places=jnp.asarray(places, jnp.int32),
-        sources=tuple(jnp.asarray(s[inside], jnp.int32) for s in sources),
+        places=node_numbers(places),
+        sources=tuple(node_numbers(s[inside]) for s in sources),
     )

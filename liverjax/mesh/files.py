@@ -9,12 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
-from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import quadratic
 from liverjax.mesh.tetrahedra import UNITS, TetMesh, check_mesh, tet_mesh
 
@@ -106,7 +105,7 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
             stacklevel=3,
         )
     sets = {k: new[nodes][new[nodes] >= 0] for k, nodes in node_sets.items()}
-    return replace(mesh, node_sets={k: jnp.asarray(np.unique(v), jnp.int32) for k, v in sets.items()})
+    return replace(mesh, node_sets={k: node_numbers(np.unique(v)) for k, v in sets.items()})
 
 
 #: What the beginning of a file says that meshio does not read -> what it is, and the remedy.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import Indices, replace
-from liverjax.mesh.adjacency import PAIRS, Clusters, function_clusters
+from liverjax.mesh.adjacency import PAIRS, Clusters, function_clusters, node_numbers
 from liverjax.mesh.basis import FACES
 from liverjax.mesh.tetrahedra import TetMesh
 
@@ -20,7 +20,7 @@ def quadratic(mesh: TetMesh) -> TetMesh:
         return mesh
     low, high = mesh.pattern.edges
     points = jnp.concatenate([mesh.points, 0.5 * (mesh.points[low] + mesh.points[high])])
-    sets = {name: jnp.asarray(of_faces(mesh, np.asarray(nodes)), jnp.int32) for name, nodes in mesh.node_sets.items()}
+    sets = {name: node_numbers(of_faces(mesh, np.asarray(nodes))) for name, nodes in mesh.node_sets.items()}
     made = replace(mesh, points=points, node_sets=sets, order=2)
     return replace(made, clusters=_all_clusters(made))
 
@@ -46,7 +46,7 @@ def cubic(mesh: TetMesh) -> TetMesh:
     _, number = np.unique(triples, axis=0, return_inverse=True)
     more = mesh.pattern.edges.shape[1] + int(number.max()) + 1
     points = jnp.concatenate([mesh.points, jnp.zeros((more, 3), mesh.points.dtype)])
-    made = replace(mesh, points=points, faces=jnp.asarray(number.reshape(4, -1), jnp.int32), order=3)
+    made = replace(mesh, points=points, faces=node_numbers(number.reshape(4, -1)), order=3)
     return replace(made, clusters=_all_clusters(made))
 
 
@@ -82,7 +82,7 @@ def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
     if mesh.order < 3:
         return triangles
     vertices = np.sort(np.asarray(triangles), axis=1)
-    return jnp.asarray(np.column_stack([vertices, face_numbers(mesh, vertices)]), jnp.int32)
+    return node_numbers(np.column_stack([vertices, face_numbers(mesh, vertices)]))
 
 
 def _code(triples: np.ndarray, V: int) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Numbers, param, static, struct
-from liverjax.mesh.adjacency import PAIRS, Pattern, pattern
+from liverjax.mesh.adjacency import PAIRS, Pattern, node_numbers, pattern
 from liverjax.mesh.basis import basis
 from liverjax.tensors.matrices import stored
 from liverjax.tensors.places import given, taken
@@ -149,11 +149,9 @@ def tet_mesh(
     # Copies: asarray may alias the caller's NumPy arrays, and the mesh would change with them.
     points = jnp.array(points, dtype=float)
     neighbours = pattern(tetrahedra, points)
-    tetrahedra = jnp.array(tetrahedra, dtype=jnp.int32)
+    tetrahedra = node_numbers(tetrahedra)
     shape_vectors, volumes = _geometry(points, tetrahedra)
-    nodes, elements = (
-        {k: jnp.array(v, dtype=jnp.int32) for k, v in (sets or {}).items()} for sets in (node_sets, element_sets)
-    )
+    nodes, elements = ({k: node_numbers(v) for k, v in (sets or {}).items()} for sets in (node_sets, element_sets))
     return TetMesh(
         points=points,
         tetrahedra=tetrahedra,

@@ -9,6 +9,7 @@ import numpy as np
 
 from liverjax.core.struct import Indices, replace
 from liverjax.mesh import promotion
+from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.loads import Traction
 from liverjax.physics.prescribed import Displaced, Fixed
@@ -24,7 +25,7 @@ def _quadratic_mesh(scene: Scene) -> Scene:
     mesh = promotion.quadratic(scene.mesh)
 
     def more(nodes: Indices) -> jax.Array:
-        return jnp.asarray(promotion.of_faces(scene.mesh, np.asarray(nodes)), jnp.int32)
+        return node_numbers(promotion.of_faces(scene.mesh, np.asarray(nodes)))
 
     body = scene.body
     if body is not None and jnp.ndim(body.density):
@@ -51,7 +52,7 @@ def _cubic(scene: Scene) -> Scene:
     mesh = promotion.cubic(scene.mesh)
 
     def more(nodes: Indices) -> jax.Array:
-        return jnp.asarray(promotion.with_functions(mesh, np.asarray(nodes)), jnp.int32)
+        return node_numbers(promotion.with_functions(mesh, np.asarray(nodes)))
 
     # The unknowns of the new functions are no positions: where their nodes are moved, they stay 0.
     still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
@@ -74,4 +75,4 @@ def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
     """Triangles with the number of their face, whose function takes a part of the load."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
-    return replace(load, triangles=jnp.asarray(np.column_stack([triangles, faces]), jnp.int32))
+    return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

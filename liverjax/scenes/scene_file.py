@@ -17,6 +17,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices
 from liverjax.laws import Law
 from liverjax.mesh import shapes
+from liverjax.mesh.adjacency import node_numbers
 from liverjax.mesh.files import read_mesh
 from liverjax.mesh.promotion import quadratic
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
@@ -268,7 +269,7 @@ def _region(mesh: TetMesh, k: int, table: dict) -> Region:
         raise InputError(f"{name} needs the numbers that differ there: write law = {{mu = 2000.0}}")
     elements = regions.select_elements(mesh, where, table.get("set"), name)
     return Region(
-        elements=jnp.asarray(elements, jnp.int32),
+        elements=node_numbers(elements),
         law=_law_of_region(name, given),
         viscosity={key: jnp.asarray(_numbers(f"{name} viscosity.{key}", v)) for key, v in viscous.items()} or None,
         porosity={key: _number(f"{name} porosity.{key}", v) for key, v in porous.items()} or None,
@@ -347,7 +348,7 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
     if not len(triangles):
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
     flux = _number(f"{name} flux", table["flux"])
-    return Inlet(triangles=jnp.asarray(triangles, jnp.int32), flux=flux, **times)
+    return Inlet(triangles=node_numbers(triangles), flux=flux, **times)
 
 
 def _drained(mesh: TetMesh, given: Any) -> jax.Array:
@@ -383,7 +384,7 @@ def _nodes(mesh: TetMesh, name: str, table: dict) -> jax.Array:
     where = table.get("where")
     if where is not None and not isinstance(where, dict):
         raise InputError(f"{name} where = {where!r} must be a table: write where = {{z_max = 0.0}}")
-    return jnp.asarray(boundary.select(mesh, where, table.get("set"), f"{name} where"), jnp.int32)
+    return node_numbers(boundary.select(mesh, where, table.get("set"), f"{name} where"))
 
 
 def _axes(name: str, table: dict) -> str:
@@ -417,7 +418,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     triangles: Indices = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
     if len(triangles) == 0:
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
-    triangles = jnp.asarray(triangles, jnp.int32)
+    triangles = node_numbers(triangles)
     if "pressure" in table:
         return Traction(triangles=triangles, pressure=_number(f"{name} pressure", table["pressure"]), **given)
     value = None if vectors else jnp.asarray(_numbers(f"{name} value", table["value"], 3))
