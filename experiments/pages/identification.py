@@ -23,6 +23,19 @@ def precision() -> str:
     return "\n".join(rows)
 
 
+def jax_releases() -> str:
+    """The same programs with different releases of jax."""
+    (data,) = load("jax_releases")
+    head = "| jax | torsion: transposes written, compiled; copies | run | compile | complete liver | compile |"
+    rows = [head, "|---" * 6 + "|"]
+    for r in data["rows"]:
+        t, liver = r["torsion"], r["liver"]
+        size = f"{t['written_transposes']}, {t['compiled_transpose']}; {t['compiled_copy']}"
+        times = f"{short(t['run_s'])} s | {t['compile_s']:.2g} s | {liver['steps_per_s']:.3g} steps/s"
+        rows.append(f"| {r['jax']} | {size} | {times} | {liver['compile_s']:.2g} s |")
+    return "\n".join(rows)
+
+
 def gradients() -> str:
     """Every row of the cost of a gradient."""
     (data,) = load("gradient_cost")
@@ -120,4 +133,4 @@ def plate_came_out() -> str:
     )
 
 
-PARTS = {"precision": precision, "gradients": gradients, "lesion": lesion}
+PARTS = {"precision": precision, "jax_releases": jax_releases, "gradients": gradients, "lesion": lesion}

@@ -181,6 +181,13 @@ def _precision() -> str:
     )
 
 
+def _jax_releases() -> str:
+    (data,) = load("jax_releases")
+    times = ", ".join(f"{r['jax']} {r['torsion']['run_s']:.2g} s" for r in data["rows"])
+    compiled = {r["torsion"]["compiled_transpose"] for r in data["rows"]}
+    return f"torsion program by release: {times}; transposes in it: {' to '.join(str(n) for n in sorted(compiled))}"
+
+
 def _methods() -> str:
     (data,) = load("fit_methods")
     found = {r["name"]: r for r in data["exact"]}
@@ -374,6 +381,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     ),
     "scaling": ("time and memory from 1,000 to 1,000,000 tetrahedra", _scaling, ""),
     "precision": ("float32 beside float64", _precision, ""),
+    "jax_releases": ("the same programs with different releases of jax", _jax_releases, ""),
     "gradient_cost": ("what does a gradient through a run cost, by steps and what is stored?", _gradient, ""),
     "lesion": ("a stiff lesion found from noisy surface displacements (synthetic, data of a finer mesh)", _lesion, ""),
     "creep_and_sweep": ("how much narrower do intervals become with several tests (synthetic)?", _creep, ""),

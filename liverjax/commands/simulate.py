@@ -112,14 +112,14 @@ def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
 
 
 def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
-    import jax.numpy as jnp
-
+    from liverjax.core.compiled import compiled
     from liverjax.core.struct import replace
-    from liverjax.simulation.mesh_error import mesh_error_of
+    from liverjax.simulation.mesh_error import estimated_error, richer
     from liverjax.simulation.run import prepared
 
-    whole = mesh_error_of(prepared(scene), jnp.asarray(result.positions), jnp.asarray(result.reactions))
-    return replace(result, mesh_error=whole)
+    scene = prepared(scene)
+    arguments = (scene, richer(scene), result.positions, result.reactions)
+    return replace(result, mesh_error=compiled(estimated_error, *arguments)(*arguments))
 
 
 def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: dict) -> None:

@@ -89,6 +89,15 @@ def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> M
             f"result.positions has {positions.shape[1]} nodes, the scene {scene.mesh.number_of_nodes}: give the scene "
             "of the run"
         )
+    return estimated_error(scene, richer(scene), positions, reactions)
+
+
+def richer(scene: Scene) -> Scene:
+    """The scene with the next richer elements, as its error is estimated.
+
+    Raises:
+        InputError: as of `mesh_error_of`.
+    """
     refuse(scene)
     rich = enriched(scene)
     # Linear elements lock: their error is that against elements which do not.
@@ -99,8 +108,7 @@ def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> M
     solve = replace(rich.solve, linear_solver=linear, robust="off", volumetric=volumetric)
     sponge = None if rich.porosity is None else sponge_at_points(rich.porosity, rich.mesh)
     rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, solve=solve)
-    rich = replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
-    return _estimate(scene, rich, positions, reactions)
+    return replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
 
 
 def refuse(scene: Scene) -> None:
@@ -114,7 +122,8 @@ def refuse(scene: Scene) -> None:
 
 
 @jax.jit
-def _estimate(scene: Scene, rich: Scene, x: jax.Array, reactions: jax.Array) -> MeshError:
+def estimated_error(scene: Scene, rich: Scene, x: jax.Array, reactions: jax.Array) -> MeshError:
+    """The estimate from positions and reactions (T, V, 3) of the run, with the scene of `richer`."""
     sizes = force_sizes(rich)
     numbers = jnp.arange(1, len(x) + 1, dtype=x.dtype)
     advance = partial(_step, scene, rich, sizes)
