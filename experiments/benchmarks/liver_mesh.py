@@ -4,7 +4,7 @@ The phantom hangs under 2 m/s^2 (hyperelastic). Its 5,351 tetrahedra are cut int
 steps, and once in one: both must end at the same place, if the answers are one branch.
 
 Under a quarter of that load, 0.5 m/s^2, its quadratic meshes are refined at the edges of its clamps alone, where the
-strain has no bound: each refinement leaves about two fifths of what the one before added.
+strain has no bound: each refinement adds two to three fifths of what the one before added.
 
 ``python -m experiments liver_mesh`` (15 minutes) writes results/liver_mesh.json;
 ``python -m experiments.benchmarks.liver_mesh clamps`` runs the second part again.

@@ -33,6 +33,15 @@ def meshes() -> str:
         theirs = -1e3 * r["mazier_y_m"]
         body = "silicone cantilever" + (", volumes at the nodes" if r["volumetric"] == "nodal" else "")
         row(body, r, -1e3 * r["tip_m"][0], f"{theirs:.1f} mm, Mazier et al. 2021 on as many; measured 116", theirs)
+    for r in known.get("cantilever, quadratic", []):
+        said = f"{-1e3 * (r['tip_m'][0] + r['change_m']):.4g} mm with its own estimate; measured 116"
+        row(
+            "silicone cantilever, quadratic mixed",
+            r,
+            -1e3 * r["tip_m"][0],
+            said,
+            -1e3 * (r["tip_m"][0] + r["change_m"]),
+        )
     land = known["land"]
     ratio = (land[-1]["cells"] / land[-2]["cells"]) ** 2
     limit = land[-1]["end_mm"] + (land[-1]["end_mm"] - land[-2]["end_mm"]) / (ratio - 1)
