@@ -2,12 +2,12 @@
 
 The phantom is held at its vena cava and its suspensory ligament and lies on its back. Its weight is a fifth of gravity
 as in Fig. 6. What each part changes in the displacement of the tip (the node that moves most by itself) is told beside
-the run time and the mesh's error; quadratic elements on the same mesh stand beside it. The motion of
-four models, with and without viscosity and fluid, is run with all parts and without: the tip's peak and the fluid's
-pressure. The complete model asks for the mesh's estimate, whose linear solve fails in some steps: why is not shown. It
-can be run with quadratic elements as well (``finer``). The
-capsule's numbers (8 MPa, 50 um) are in the range of the literature; those of ligaments, vessels and plane are chosen:
-no measurement of one liver has them all.
+the run time and the mesh's error; quadratic elements on the same mesh stand beside it. The motion of four models, with
+and without viscosity and fluid, is run with all parts and without: the tip's peak and the fluid's pressure. The
+complete model asks for the mesh's estimate, whose linear solve fails in some steps: a capsule that is pressed together
+wrinkles between the vertices, as quadratic functions can. It can be run with quadratic elements as well (``finer``).
+The capsule's numbers (8 MPa, 50 um) are in the range of the literature; those of ligaments, vessels and plane are
+chosen: no measurement of one liver has them all.
 
 ``python -m experiments liver_in_place`` (20 minutes) writes results/liver_in_place.json. ``python -m
 experiments.chapter.liver_in_place motion`` (or ``rest``, ``unloaded``, ``finer``) makes that part again and leaves the
