@@ -11,6 +11,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.laws.base import Law
+from liverjax.mesh.tetrahedra import with_points
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -90,6 +91,30 @@ def test_a_torsional_wave(verified):
     error = np.abs(found - exact).max() / np.abs(exact).max()
     assert error < 0.02  # eight elements a wave
     verified("torsional wave, viscoelastic, 2 mm quadratic elements", "closed form", error, 0.02)
+
+
+@pytest.mark.slow
+def test_a_torsional_wave_with_a_rounder_section(verified):
+    """13 elements a wave along the axis, 38 sides of the section: it is the polygon that moves along the axis."""
+    errors = []
+    for h in (0.0013, 0.00065):
+        short = lj.shapes.cylinder(0.004, 0.01 * h / 0.0013, h)
+        mesh = lj.quadratic(with_points(short, short.points * jnp.array([[1.0, 1.0, 0.0013 / h]])))
+        low, points = np.asarray(mesh.node_sets["bottom"]), np.asarray(mesh.points)
+        turn = 1e-4 / 0.004 * np.stack([-points[:, 1], points[:, 0], 0 * points[:, 0]], axis=1)
+        scene = lj.Scene(
+            mesh=mesh,
+            law=lj.laws.NeoHookean(mu=MU, bulk=10 * MU),
+            viscosity=PRONY,
+            body=lj.Body(density=DENSITY),
+            displaced=(lj.Displaced(nodes=jnp.asarray(low), by=jnp.asarray(turn[low])),),
+        )
+        found = np.asarray(lj.harmonic(scene, FREQUENCIES).check().displacement)
+        exact = turn[None] * (standing(points[:, 2], modulus(), 0.01) / 1e-4)[:, :, None]
+        errors.append(float(np.abs(found - exact).max() / np.abs(exact).max()))
+    order = float(np.log2(errors[0] / errors[1]))  # by the sides of the section alone
+    assert errors[1] < 1e-3 and order > 1.5, errors
+    verified("torsional wave, 13 quadratic elements a wave, 38 sides", "closed form", errors[1], 1e-3, order)
 
 
 def around_a_sphere(X: np.ndarray, G: complex, K: complex, omega: float, radius: float) -> np.ndarray:
@@ -182,6 +207,43 @@ def test_about_a_stretched_state(part):
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
     # Without the state the answer is another one.
     assert np.abs(standing(np.asarray(scene.mesh.points)[:, 2], modulus()) - exact).max() > 0.1 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("part", ["all", "isochoric"])
+def test_springpots_about_a_stretched_state(part):
+    """Spring, springpot and limit beside each other in the stretched slab: all numbers by mpmath from the energy."""
+    mpmath = pytest.importorskip("mpmath")
+    own = lj.SpringpotSeries(
+        times=jnp.array([0.0125]), exponents=jnp.array([0.2]), limits=jnp.array([4.0]), spring=0.6, part=part
+    )
+    scene = replace(slab(30, 2), viscosity=None, springpots=own)
+
+    def energy(shear, kept):  # F = diag(1, 1, 1.2) with F_xz = shear; without the volume's part if it is not kept
+        def of(stretch):
+            J, trace = stretch, 2 + stretch**2 + shear**2
+            volume = 5 * MU * (J - 1) ** 2 if kept else 0  # half of 10 MU
+            return mpmath.mpf(MU) / 2 * (J ** mpmath.mpf("-0.666666666666666666666") * trace - 3) + volume
+
+        return of
+
+    def of(kept):  # d2W/dF_xz^2 and S_zz
+        A = mpmath.diff(lambda shear: energy(shear, kept)(mpmath.mpf("1.2")), 0, 2)
+        return A, mpmath.diff(energy(mpmath.mpf(0), kept), mpmath.mpf("1.2")) / mpmath.mpf("1.2")
+
+    (A, S), (whole, _) = of(part == "all"), of(True)
+    C = []
+    for hertz in FREQUENCIES:
+        springpot = (2j * mpmath.pi * hertz * mpmath.mpf("0.0125")) ** mpmath.mpf("-0.2")
+        m = mpmath.mpf("0.6") + 1 / (springpot + mpmath.mpf("0.25"))
+        C.append(complex(m * (A - S) + mpmath.mpf("0.6") * S + whole - A))
+    found = np.asarray(lj.harmonic(scene, FREQUENCIES, about=stretched(scene, 1.2)).check().displacement[:, :, 0])
+    z = np.asarray(scene.mesh.points)[:, 2]
+    exact = standing(z, np.array(C))
+    assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
+    # Were the stress of the state that of the law, or none, the answer would be another one.
+    for wrong in (1.0, 0.0):
+        moved = standing(z, np.array(C) + (wrong - 0.6) * float(S))
+        assert np.abs(moved - exact).max() > 1e-2 * np.abs(exact).max()
 
 
 @pytest.mark.slow

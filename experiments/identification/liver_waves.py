@@ -128,9 +128,6 @@ def main() -> None:
     begin = time.perf_counter()
     found = elastography.regions_of(organ)
     by_regions = time.perf_counter() - begin
-    print(
-        {"regions": found.parts.modulus[0], "sd": found.parts.standard_errors[0], "edges": found.by_edges}, flush=True
-    )
     drawn = stiffness_map.map_of(elastography.problem_of_map(organ, found, 4 * VOXEL))
     usual = direct_inversion.invert(organ.field, DENSITY)
     G, known = waves_report.at_voxels(organ, drawn.modulus[0]), np.isfinite(waves_report.at_voxels(organ, drawn.sd))
@@ -150,8 +147,10 @@ def main() -> None:
                 "name": name,
                 "true_Pa": [true.real, true.imag],
                 "regions_Pa": [float(v) for v in (found.parts.modulus[0, k].real, found.parts.modulus[0, k].imag)],
-                "standard_error_Pa": float(found.parts.standard_errors[0, k]),
-                "moved_by_edges_Pa": float(found.by_edges[0, k].real),
+                "standard_error_Pa": [
+                    float(v) for v in (found.parts.standard_errors[0, k].real, found.parts.standard_errors[0, k].imag)
+                ],
+                "edges_farther_out_voxels": float(found.parts.farther[0, k]),
                 "map_median_Pa": [float(np.median(G[place].real)), float(np.median(G[place].imag))],
                 "direct_median_Pa": _median(usual[0].real[place]),
             }

@@ -438,7 +438,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         "",
     ),
     "elastography": (
-        "four stiff cylinders in a plate, from its waves (synthetic, data of another mesh): how far off, how sure?",
+        "four stiff cylinders in a plate, from its waves (synthetic, exact series): how far off, how sure?",
         identification.plate_came_out,
         "names elastography as a way to measure the liver in a patient",
     ),

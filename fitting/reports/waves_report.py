@@ -47,7 +47,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "spacing_m": organ.field.spacing.tolist(),
         "voxels": int(organ.body.mesh.number_of_nodes),
         "elements": int(organ.body.mesh.number_of_elements),
-        "whole": _of_regions(organ, found.whole, found.mesh_bias, None)[0],
+        "whole": _of_regions(organ, found.whole, found.mesh_bias)[0],
         "regions": _by_label(organ, found),
         "direct_inversion": _direct(organ, found, usual),
         "map": None if drawn is None else _of_map(drawn),
@@ -64,26 +64,25 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     return content
 
 
-def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarray | None) -> list[Content]:
-    """One dictionary a region, lists over the frequencies. Errors contain noise, the error of the elements and that of
-    the edges."""
+def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[Content]:
+    """One dictionary a region, lists over the frequencies. Errors contain noise, what the place of the edges leaves
+    open, and the error of the elements."""
     omega, rows = organ.waves.omega, []
     for r in range(found.modulus.shape[1]):
         G, e = found.modulus[:, r], found.standard_errors[:, r]
         c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
-        moved = np.zeros(len(G), complex) if edges is None else edges[:, r]
-        whole = [np.sqrt(e**2 + b**2 + (0.5 * m) ** 2) for b, m in _complex_parts(G * bias, moved)]
+        missed = G * bias
         rows.append(
             {
                 "storage_Pa": G.real.tolist(),
                 "loss_Pa": G.imag.tolist(),
-                "error_storage_Pa": whole[0].tolist(),
-                "error_loss_Pa": whole[1].tolist(),
-                "standard_error_Pa": e.tolist(),
-                "moved_by_edges_storage_Pa": moved.real.tolist(),
-                "moved_by_edges_loss_Pa": moved.imag.tolist(),
-                "mesh_bias_storage_Pa": (G * bias).real.tolist(),
-                "mesh_bias_loss_Pa": (G * bias).imag.tolist(),
+                "error_storage_Pa": np.hypot(e.real, missed.real).tolist(),
+                "error_loss_Pa": np.hypot(e.imag, missed.imag).tolist(),
+                "standard_error_storage_Pa": e.real.tolist(),
+                "standard_error_loss_Pa": e.imag.tolist(),
+                "edges_farther_out_voxels": found.farther[:, r].tolist(),
+                "mesh_bias_storage_Pa": missed.real.tolist(),
+                "mesh_bias_loss_Pa": missed.imag.tolist(),
                 "phase_velocity_m_s": c.tolist(),
                 "attenuation_1_m": alpha.tolist(),
                 "voxels_a_wave": (2 * np.pi * c / omega / organ.field.spacing.max()).tolist(),
@@ -94,11 +93,6 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray, edges: np.ndarra
             }
         )
     return rows
-
-
-def _complex_parts(*values: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Lists of the real parts and of the imaginary parts of all numbers."""
-    return [v.real for v in values], [v.imag for v in values]
 
 
 def _springpots(sweeps: dict[str, Path]) -> Content | None:
@@ -146,7 +140,7 @@ def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
 def _by_label(organ: Organ, found: Found) -> Content | None:
     if found.parts is None or found.labels is None:
         return None
-    rows = _of_regions(organ, found.parts, found.mesh_bias, found.by_edges)
+    rows = _of_regions(organ, found.parts, found.mesh_bias)
     return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
 
 
@@ -190,19 +184,22 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
                 f"{hertz:g} Hz: chi2 is {ratio:.3g} an equation with uniform {'regions' if found.parts else 'moduli'}: "
                 "the organ is less uniform, or the noise larger; the standard errors are enlarged by its root"
             )
-        bias, error = np.abs(found.mesh_bias[f]), each.standard_errors[f] / np.abs(each.modulus[f])
+        bias, error = np.abs(found.mesh_bias[f]), each.standard_errors[f].real / np.abs(each.modulus[f])
         if bias > error.min():
             told.append(
                 f"{hertz:g} Hz: the voxels themselves move the moduli by {100 * bias:.2g} % "
                 f"(standard error {100 * error.min():.2g} %): subtract mesh_bias, or measure smaller voxels"
             )
-    if found.parts is not None and found.by_edges is not None and found.labels is not None:
-        moved = np.abs(found.by_edges) > 2 * found.parts.standard_errors
-        if np.any(moved | ~np.isfinite(found.by_edges)):
-            names = ", ".join(str(label) for label, any_ in zip(found.labels, moved.any(axis=0), strict=True) if any_)
+    if found.parts is not None and found.labels is not None:
+        few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
+        for label in found.labels[few]:
+            told.append(f"region {label}: its standard error is larger than its modulus: it has too few voxels")
+        far = np.abs(found.parts.farther).max(axis=0) > 1
+        if far.any():
+            names = ", ".join(str(label) for label, beyond in zip(found.labels, far, strict=True) if beyond)
             told.append(
-                f"regions {names}: how elements on their edges are mixed moves the moduli by more than two standard "
-                "errors (moved_by_edges): the voxels are large for these regions"
+                f"regions {names}: the waves want their edges more than a voxel away from those of the labels "
+                "(edges_farther_out_voxels): look at the labels"
             )
     if drawn is not None and not drawn.reached and drawn.chi2 > TOO_FAR * drawn.components:
         told.append(

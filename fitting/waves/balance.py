@@ -103,9 +103,14 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
     balances = 2 * (len(inner) - B.shape[1])
     m = Matrices(A.relaxing, A.mass, unknowns, rows, pattern, places, entries, np.zeros((1, 1)), balances)
     shear = rows_of_balance(m, np.full(rows.shape[-1], TYPICAL + 0j), 0.0)
-    BB = _by_diagonals(B @ B.T)
-    part = np.sum(np.abs(shear.data) ** 2) / shear.shape[0]  # mean of the diagonal of C C^H
-    return m._replace(pressure=FREE * part / BB[0].mean() * BB)
+    B = freely(B, np.abs(shear.data))
+    return m._replace(pressure=by_diagonals(B @ B.T))
+
+
+def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
+    """Forces of pressures of the variance `FREE`, by those of 1 Pa and the entries of C of `TYPICAL`."""
+    part = np.sum(shear**2) / B.shape[0]  # mean of the diagonal of C C^H
+    return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
@@ -154,10 +159,25 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
         d: measured motion (3 V,) complex [m], x, y, z of a node together.
         sd: standard deviation of real and imaginary part of one component [m].
     """
-    C = rows_of_balance(m, G, omega)
+    return likeliest(rows_of_balance(m, G, omega), m.pressure, d, sd)
+
+
+def likeliest(
+    C: scipy.sparse.csr_array, B: np.ndarray, d: np.ndarray, sd: float, spread: np.ndarray | None = None
+) -> Balanced:
+    """The likeliest motion (U,) that C (I, U) balances.
+
+    Args:
+        C: rows of balance.
+        B: covariance of the forces of pressures, by diagonals.
+        d: what was measured (U,) [m]; 0 where nothing was.
+        sd: standard deviation of real and imaginary part of one component [m].
+        spread: variance of each unknown's difference from d (U,), over sd^2; None: 1.
+    """
     CH = C.conj().T.tocsr()
+    WCH = CH if spread is None else scipy.sparse.diags_array(spread) @ CH
     # Hermitian and positive: no pivots are needed, and an order for symmetric matrices keeps the factor small.
-    S, B = _by_diagonals(C @ CH), m.pressure
+    S = by_diagonals((C @ WCH).tocsr())
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
@@ -165,10 +185,10 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
     factor = scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
-    return Balanced(float(np.real(np.vdot(r, q))) / sd**2, d - CH @ q, q, factor)
+    return Balanced(float(np.real(np.vdot(r, q))) / sd**2, d - WCH @ q, q, factor)
 
 
-def _by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
+def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
     """The lower triangle of a Hermitian matrix as LAPACK has it, (bandwidth + 1, n)."""
     at = S.tocoo()
     below = at.row >= at.col

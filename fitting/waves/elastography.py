@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.waves import balance, regions, stiffness_map, voxels
+from fitting.waves import balance, edges, regions, stiffness_map, voxels
 from fitting.waves.balance import Matrices, gigabytes
 from fitting.waves.regions import MeasuredWaves, Regions
 from fitting.waves.voxels import VoxelBody
@@ -34,9 +34,6 @@ class Found(NamedTuple):
     labels: np.ndarray | None  # (R,) of the regions
     parts: Regions | None
     mesh_bias: np.ndarray  # (F,) complex: relative, of plane waves of the whole's modulus
-    by_edges: np.ndarray | None = (
-        None  # (F, R) complex [Pa]: change where elements of two regions have the arithmetic mean
-    )
 
 
 def body_of(field: WaveField) -> VoxelBody:
@@ -63,16 +60,23 @@ def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
 
 def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, cost: None) -> Found:
     """Moduli of the whole organ, and of its regions where labels are given."""
-    m, waves, elements = organ.matrices, organ.waves, organ.body.mesh.number_of_elements
+    m, waves, body = organ.matrices, organ.waves, organ.body
     start = regions.first_modulus(m, waves)
-    whole = regions.moduli_of_regions(m, waves, np.ones((elements, 1)), np.array([start]), progress)
+    whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress)
     bias = np.array([plane_wave_bias(G, w, organ) for G, w in zip(whole.modulus[:, 0], waves.omega, strict=True)])
-    if organ.field.labels is None:
+    labels = organ.field.labels
+    if labels is None:
         return Found(whole, None, None, bias)
-    known, shares = voxels.shares_of(organ.body, organ.field.labels)
-    parts = regions.moduli_of_regions(m, waves, shares, np.full(len(known), whole.modulus[0, 0]), progress)
-    moved = regions.moved_by_mixing(m, waves, shares, parts.modulus)
-    return Found(whole, known, parts, bias, moved)
+    known = np.unique(labels[tuple(body.voxel.T)])
+    each = [edges.places(labels, body, known, farther) for farther in (0.0, edges.FARTHER)]
+    matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
+    parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress)
+    return Found(whole, known, parts, bias)
+
+
+def _uniform(m: Matrices, body: VoxelBody, density: float) -> edges.RegionMatrices:
+    """The balance of one region."""
+    return edges.region_matrices(m, body, density, np.ones((1, body.mesh.number_of_nodes)))
 
 
 def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.Course:
@@ -84,12 +88,12 @@ def plane_wave_bias(G: complex, omega: float, organ: Organ) -> complex:
     """Relative error of the modulus that these elements find in plane waves without noise; a mean over directions."""
     spacing, density = organ.field.spacing, organ.density
     body = voxels.voxel_body(np.ones((7, 7, 7), bool), spacing)
-    m, X = balance.matrices(body, density), np.asarray(body.mesh.points)
+    uniform, X = _uniform(balance.matrices(body, density), body, density), np.asarray(body.mesh.points)
     k, total, weight = omega * np.sqrt(density / G), 0j, 0
     for along, across, count in DIRECTIONS:
         n, a = (np.array(v) / np.linalg.norm(v) for v in (along, across))
         d = (np.exp(-1j * k * (X @ n))[:, None] * a).ravel()
         waves = MeasuredWaves(np.array([omega]), d[None], np.array([1e-3]))
-        own = regions.moduli_of_regions(m, waves, np.ones((body.mesh.number_of_elements, 1)), np.array([G]))
+        own = regions.moduli_of_regions(uniform, waves, np.array([G]))
         total, weight = total + count * (own.modulus[0, 0] / G - 1), weight + count
     return total / weight

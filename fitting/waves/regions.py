@@ -8,11 +8,14 @@ import scipy.sparse
 
 from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
+from fitting.waves.edges import RegionMatrices
 
 #: Moduli [Pa] at which a search begins, and the loss over storage there.
 STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
 #: Iterations, and the step of a modulus over its standard error that is not worth to be made.
 ITERATIONS, ENOUGH = 20, 0.1
+#: Standard deviation of the place of an edge that labels give: as far as a voxel's rounding [voxels].
+EDGE = 1 / np.sqrt(12)
 
 
 class MeasuredWaves(NamedTuple):
@@ -27,7 +30,8 @@ class Regions(NamedTuple):
     """Moduli of R regions at F frequencies."""
 
     modulus: np.ndarray  # (F, R) complex [Pa]
-    covariance: np.ndarray  # (F, R, R) complex [Pa^2]: of real parts and of imaginary parts each, both the same
+    covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage of all regions, then loss
+    farther: np.ndarray  # (F, R) how far the edges lie outside those of the labels [voxels]
     chi2: np.ndarray  # (F,)
     components: int  # of one frequency
     iterations: np.ndarray  # (F,)
@@ -40,9 +44,19 @@ class Regions(NamedTuple):
 
     @property
     def standard_errors(self) -> np.ndarray:
-        """Standard errors of storage and of loss (F, R) [Pa]."""
-        variance = np.real(np.diagonal(self.covariance, axis1=1, axis2=2))
-        return self.noise_factor[:, None] * np.sqrt(variance)
+        """Standard errors of storage, and of loss as the imaginary part (F, R) [Pa]."""
+        sd = self.noise_factor[:, None] * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        R = self.modulus.shape[1]
+        return sd[:, :R] + 1j * sd[:, R:]
+
+
+class _State(NamedTuple):
+    """The likeliest motion at moduli (R,), with the gradient and the Gauss-Newton Hessian of chi^2 / 2."""
+
+    G: np.ndarray
+    here: Balanced
+    gradient: np.ndarray  # (2 R + R,): by storage, loss and edges
+    hessian: np.ndarray
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
@@ -57,82 +71,86 @@ def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
 
 
 def moduli_of_regions(
-    m: Matrices,
+    m: RegionMatrices,
     waves: MeasuredWaves,
-    shares: np.ndarray,
     start: np.ndarray,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
 ) -> Regions:
     """Moduli by Gauss-Newton, every frequency by itself.
 
+    The places of the edges are unknown too, with the deviation `EDGE` from those of the labels.
+
     Args:
-        m: `balance.matrices`.
+        m: `edges.region_matrices`.
         waves: what was measured.
-        shares: part of each element that is in each region (E, R); see `geometric`.
         start: complex modulus of each region (R,) [Pa], of the lowest frequency.
         progress: told of every iteration: its number, and chi^2 over the number of components.
     """
     found, G = [], np.asarray(start, complex)
     for f in range(len(waves.omega)):
-        found.append(_one_frequency(m, waves, f, shares, G, progress))
+        found.append(_one_frequency(m, waves, f, G, progress))
         G = found[-1][0]
-    G, covariance, chi2, iterations, converged = (np.array(each) for each in zip(*found, strict=True))
-    return Regions(G, covariance, chi2, m.balances, iterations, converged)
+    G, covariance, farther, chi2, iterations, converged = (np.array(each) for each in zip(*found, strict=True))
+    return Regions(G, covariance, farther, chi2, m.balances, iterations, converged)
 
 
-def geometric(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Moduli of elements (E,) from shares (E, R) and moduli of regions (R,) [Pa], and their derivatives (E, R).
-
-    They lie between springs in a row, the least that a mixture can have, and springs side by side, the most.
-    """
-    elements = np.exp(shares @ np.log(G))
-    return elements, elements[:, None] * shares / G
-
-
-def side_by_side(shares: np.ndarray, G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same as `geometric` with arithmetic means."""
-    return shares @ G, shares
-
-
-def moved_by_mixing(m: Matrices, waves: MeasuredWaves, shares: np.ndarray, modulus: np.ndarray) -> np.ndarray:
-    """Change of moduli (F, R) [Pa] if `side_by_side` took the place of `geometric`: one step of Gauss-Newton."""
-    out = np.empty_like(modulus)
-    for f, G in enumerate(modulus):
-        elements, by_regions = side_by_side(shares, G)
-        here = balance.balanced(m, elements, waves.omega[f], waves.motion[f], waves.sd[f])
-        out[f] = _gauss_newton(m, here, by_regions, waves.sd[f])[0]
-    return out
-
-
-def _one_frequency(m, waves, f, shares, G, progress):
-    """Modulus (R,), covariance (R, R), chi^2, iterations, and whether they ended by themselves."""
-    at = waves.omega[f], waves.motion[f], waves.sd[f]
-    elements, by_regions = geometric(shares, G)
-    here, converged, k = balance.balanced(m, elements, *at), False, 0
-    step, H = _gauss_newton(m, here, by_regions, waves.sd[f])
+def _one_frequency(m, waves, f, G, progress):
+    """Modulus (R,), covariance (2 R, 2 R), places of edges (R,), chi^2, iterations, and whether they ended."""
+    R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
+    now, converged, k = _state_of_regions(m, G, *at), False, 0
+    step, covariance = _gauss_newton(now)
     for k in range(1, ITERATIONS + 1):
-        part = min(1.0, 0.5 / max(np.max(np.abs(step / G)), 1e-300))  # a modulus changes by half of itself at most
+        both = step[:R] + 1j * step[R : 2 * R]
+        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # by half of itself at most
+        new = None
         for _ in range(8):
-            elements, by_regions = geometric(shares, G + part * step)
-            new = balance.balanced(m, elements, *at)
-            if new.chi2 <= here.chi2 * (1 + 1e-10):
-                break
+            if np.all((now.G + part * both).real > 0):
+                new = _state_of_regions(m, now.G + part * both, *at)
+                if _least(new) <= _least(now) * (1 + 1e-10):
+                    break
+                new = None
             part *= 0.5
-        else:
+        if new is None:
             break
-        G, here = G + part * step, new
-        progress(k, here.chi2 / m.balances)
-        step, H = _gauss_newton(m, here, by_regions, waves.sd[f])
-        converged = bool(np.all(np.abs(step) < ENOUGH * np.sqrt(np.real(np.diagonal(np.linalg.inv(H))))))
+        now = new
+        progress(k, now.here.chi2 / m.balances)
+        step, covariance = _gauss_newton(now)
+        converged = bool(np.all(np.abs(step[: 2 * R]) < ENOUGH * np.sqrt(np.diagonal(covariance)[: 2 * R])))
         if converged or part < 1e-2:
             break
-    return G, np.linalg.inv(H), here.chi2, k, converged
+    return now.G, covariance[: 2 * R, : 2 * R], step[2 * R :], now.here.chi2, k, converged
 
 
-def _gauss_newton(m: Matrices, here: Balanced, by_regions: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
-    """The step of Gauss-Newton (R,), and the Hessian (R, R) of chi^2 / 2, with derivatives (E, R) of the moduli."""
-    J = (balance.by_modulus(m, here.motion) @ scipy.sparse.csc_array(by_regions)).tocsc()
-    X = here.whitened(J)
-    H = X.conj().T @ X / sd**2
-    g = J.conj().T @ here.multipliers / sd**2
-    return -np.linalg.solve(H, g), H
+def _gauss_newton(now: _State) -> tuple[np.ndarray, np.ndarray]:
+    """Step (3 R,) of storage, loss and edges, and their covariance. Edges begin each time where the labels have them:
+    by their place the equations are nearly linear."""
+    H = now.hessian + _of_labels(len(now.G))
+    silent = np.diagonal(H) == 0  # a region without an element of its own
+    H[silent, silent] = 1.0
+    covariance = np.linalg.inv(H)
+    covariance[silent, silent] = np.inf
+    return -np.linalg.solve(H, now.gradient), covariance
+
+
+def _of_labels(R: int) -> np.ndarray:
+    """What the labels say of moduli and of edges."""
+    return np.diag(np.repeat([0.0, EDGE**-2], [2 * R, R]))
+
+
+def _least(now: _State) -> float:
+    """chi^2 with the best places of the edges at these moduli."""
+    R = len(now.G)
+    g, H = now.gradient[2 * R :], (now.hessian + _of_labels(R))[2 * R :, 2 * R :]
+    return float(now.here.chi2 - g @ np.linalg.solve(H, g))
+
+
+def _state_of_regions(m: RegionMatrices, G: np.ndarray, omega: float, motion: np.ndarray, sd: float) -> _State:
+    d = np.concatenate([motion, np.zeros(m.kinks)])
+    spread = np.ones(len(d))
+    spread[len(motion) :] = np.mean(np.abs(motion) ** 2) / sd**2
+    here = balance.likeliest(m.rows(G, omega), m.pressure, d, sd, spread)
+    J = m.by_moduli(here.motion)
+    J = np.concatenate([J, 1j * J, m.by_edges(here, G, omega)], axis=1)
+    X = here.whitened(scipy.sparse.csc_array(J))
+    H = np.real(X.conj().T @ X) / sd**2
+    return _State(G, here, np.real(J.conj().T @ here.multipliers) / sd**2, H)

@@ -105,11 +105,3 @@ def on_all_nodes(body: VoxelBody, corners: np.ndarray) -> np.ndarray:
     for middle, (i, j) in zip(nodes[4:], PAIRS, strict=True):
         values[middle] = 0.5 * (values[nodes[i]] + values[nodes[j]])
     return values
-
-
-def shares_of(body: VoxelBody, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The labels (R,) that are there, and the part (E, R) of each element's ten voxels that has each."""
-    own = labels[tuple(body.voxel.T)]
-    known, index = np.unique(own, return_inverse=True)
-    nodes = np.stack([np.asarray(n) for n in body.mesh.element_nodes])
-    return known, np.stack([np.mean(index[nodes] == k, axis=0) for k in range(len(known))], axis=1)

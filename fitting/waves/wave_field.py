@@ -239,7 +239,7 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
     U = np.where(
         mask[None, ..., None], field.displacement[(slice(None), *cut)].reshape(-1, *blocks, 3).mean((2, 4, 6)), np.nan
     )
-    labels = None if field.labels is None else field.labels[tuple(slice(stride // 2, k * stride, stride) for k in n)]
+    labels = None if field.labels is None else _most_frequent(field.labels[cut], stride, blocks)
     return field._replace(
         displacement=U,
         mask=mask,
@@ -248,3 +248,14 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
         origin=field.origin + 0.5 * (stride - 1) * field.spacing,
         noise=field.noise / stride**1.5,
     )
+
+
+def _most_frequent(labels: np.ndarray, stride: int, blocks: tuple[int, ...]) -> np.ndarray:
+    """The label that most voxels of a block have; where two are as frequent, lower and higher ones in turn."""
+    known = np.unique(labels)
+    turn = np.where(np.indices(blocks[::2]).sum(axis=0) % 2, 1.0, -1.0)
+    counts = [
+        (labels == label).reshape(blocks).sum(axis=(1, 3, 5)) + 0.5 * turn * k / len(known)
+        for k, label in enumerate(known)
+    ]
+    return np.asarray(known[np.argmax(counts, axis=0)])

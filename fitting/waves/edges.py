@@ -1,0 +1,362 @@
+"""Regions with edges inside the elements: there the motion kinks and the pressure jumps.
+
+Across an edge between two materials displacement and traction are continuous, strain and pressure are not. A quadratic
+element cannot kink. So it is too stiff, and the modulus of a region of few voxels comes out too low. Elements that an
+edge cuts have one more function L_i psi for each of their corners i, where L_i is the corner's linear function and
+
+    psi = sum_a N_a max_k s_k(x_a) - max_k sum_a N_a s_k(x_a).
+
+s_k is the smoothed place of region k. Psi is continuous, kinks at the edges and is zero at all nodes (extended finite
+elements: Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). Nodes keep the motion of their voxels; the
+amplitudes of the kinks are not measured. Every point has the modulus and the pressure of its own side.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+from scipy import ndimage
+
+from fitting.waves import balance
+from fitting.waves.balance import Matrices
+from fitting.waves.voxels import VoxelBody
+from liverjax.mesh.adjacency import PAIRS
+
+#: Standard deviation of the Gaussian that smooths the steps of labels [voxels].
+SMOOTHING = 1.0
+#: Parts of a voxel's side by which volumes are counted.
+FINE = 4
+#: Levels of halving of cut elements, in whose parts edges are planes; and elements at a time.
+HALVINGS, CHUNK = 3, 60
+#: How far edges are moved to see what their place does [voxels].
+FARTHER = 0.1
+
+
+class RegionMatrices(NamedTuple):
+    """Parts of the balance of R regions, with U unknowns: 3 V of the nodes, then those of kinks."""
+
+    stiffness: np.ndarray  # (R, N) entries of C by a shear modulus of 1 Pa of each region
+    mass: np.ndarray  # (N,) entries of C by -omega^2
+    pattern: scipy.sparse.csr_array  # (I, U): their places
+    forces: scipy.sparse.csr_array  # (I, P) of pressures, each with the same large variance
+    pressure: np.ndarray  # their covariance, as of `Matrices`
+    kinks: int  # unknowns that are not measured
+    near: np.ndarray  # (I,) region whose edge each row is nearest to, -1: none
+    farther: "RegionMatrices | None" = None  # the same with all edges farther out by `FARTHER`
+
+    @property
+    def balances(self) -> int:
+        """Real equations that chi^2 sums over."""
+        return 2 * (self.forces.shape[0] - int(np.sum(np.diff(self.forces.tocsc().indptr) > 0)) - self.kinks)
+
+    def rows(self, G: np.ndarray, omega: float) -> scipy.sparse.csr_array:
+        """C (I, U) of moduli (R,) [Pa] at an angular frequency [rad/s]."""
+        return self._filled(G @ self.stiffness - omega**2 * self.mass)
+
+    def by_moduli(self, u: np.ndarray) -> np.ndarray:
+        """Derivatives (I, R) of C u by the moduli."""
+        return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
+
+    def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
+        """Derivatives (I, R) of C u - B p by how far the edges of each region lie outwards [voxels]."""
+        out = np.zeros((len(self.near), len(self.stiffness)), complex)
+        if self.farther is not None:
+            p = self.forces.T @ here.multipliers
+            changed = (self.farther.rows(G, omega) - self.rows(G, omega)) @ here.motion
+            changed = changed - (self.farther.forces - self.forces) @ p
+            known = np.flatnonzero(self.near >= 0)
+            out[known, self.near[known]] = changed[known] / FARTHER
+        return out
+
+    def _filled(self, entries: np.ndarray) -> scipy.sparse.csr_array:
+        return scipy.sparse.csr_array((entries, self.pattern.indices, self.pattern.indptr), shape=self.pattern.shape)
+
+
+class _CutElements(NamedTuple):
+    """Some elements with n functions, or what of them lies in one region."""
+
+    region: np.ndarray  # (K,)
+    functions: np.ndarray  # (K, n) numbers of the functions
+    shear: np.ndarray  # (K, n, 3, n, 3) of a shear modulus of 1 Pa
+    mass: np.ndarray  # (K, n, n) of a density of 1
+    corners: np.ndarray  # (K, 4)
+    divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the corners' linear functions
+
+
+def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: float = 0.0) -> np.ndarray:
+    """Smoothed places s_k (R, V) of the labels `known` (R,) at the nodes.
+
+    Smoothed twice, so that curved edges stay nearly where they are, and shifted to the volume that the labels have.
+
+    Args:
+        labels: (nx, ny, nz).
+        body: its voxels hold labels; outside the nearest label goes on.
+        known: (R,).
+        farther: how far [voxels] the edges of all regions but the largest are moved outwards.
+    """
+    measured = np.zeros(labels.shape, bool)
+    measured[tuple(body.voxel.T)] = True
+    nearest = ndimage.distance_transform_edt(~measured, return_distances=False, return_indices=True)
+    whole = labels[tuple(nearest)]
+    s = np.array([_smoothed(whole == label) for label in known])
+    counts = [int(np.sum(whole == label)) for label in known]
+    largest, out = int(np.argmax(counts)), s.copy()
+    for k in range(len(known)):
+        if k != largest:
+            others = np.delete(s, k, axis=0).max(axis=0)
+            out[k] += _level(s[k] - others, whole == known[k], counts[k])
+            if farther:
+                slope = np.gradient(out[k])
+                out[k] = out[k] + farther * np.sqrt(sum(g**2 for g in slope))
+    return np.asarray(out[(slice(None), *body.voxel.T)])
+
+
+def _smoothed(place: np.ndarray) -> np.ndarray:
+    once = ndimage.gaussian_filter(place.astype(float), SMOOTHING, mode="nearest")
+    return 2 * once - ndimage.gaussian_filter(once, SMOOTHING, mode="nearest")
+
+
+def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
+    """What to add to a field so that it is positive in as much of the volume as the label has, near its voxels."""
+    reach = ndimage.find_objects(place.astype(int))[0]
+    box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
+    # Values within the voxels, linear between the centres.
+    inside = [np.clip(np.arange(n * FINE) / FINE + (0.5 / FINE - 0.5), 0, n - 1) for n in above[box].shape]
+    fine = ndimage.map_coordinates(above[box], np.meshgrid(*inside, indexing="ij"), order=1)
+    return -float(np.partition(fine.ravel(), -count * FINE**3)[-count * FINE**3])
+
+
+def region_matrices(
+    m: Matrices, body: VoxelBody, density: float, s: np.ndarray, farther: np.ndarray | None = None
+) -> RegionMatrices:
+    """The parts of the balance of regions.
+
+    Args:
+        m, body: `balance.matrices` and its elements.
+        density: [kg/m^3].
+        s: `places` (R, V).
+        farther: the same with edges that are `FARTHER` out.
+    """
+    nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
+    both = [s] if farther is None else [s, farther]
+    own = np.concatenate([each.argmax(axis=0)[nodes] for each in both])
+    cut = np.flatnonzero(np.any(own != own[0], axis=0))
+    kinked = np.unique(tets[cut])
+    parts = [_cut_parts(body, each, cut, kinked) if len(cut) else [] for each in both]
+    alive = _with_forces(parts[0] + parts[-1], len(kinked), body.mesh.number_of_nodes)
+    kinked = kinked[alive]
+    rows = _numbers_of_rows(body, kinked)
+    whole = _whole_parts(m, body, own[0], np.setdiff1d(np.arange(nodes.shape[1]), cut), density)
+    near = np.full(int(rows.max()) + 1, -1)
+    if len(s) > 1:
+        smaller = np.arange(len(s)) != np.bincount(s.argmax(axis=0), minlength=len(s)).argmax()
+        nearest = np.flatnonzero(smaller)[s[smaller].argmax(axis=0)]
+        at = np.concatenate([np.arange(body.mesh.number_of_nodes), kinked])
+        known = rows >= 0
+        near[rows[known]] = np.repeat(nearest[at], 3)[known]
+    found = []
+    for own_parts in parts:
+        each = [_renumbered(p, alive, body.mesh.number_of_nodes) for p in own_parts]
+        found.append(_all_together([whole, *each], rows, len(s), density)._replace(kinks=3 * len(kinked), near=near))
+    return found[0] if farther is None else found[0]._replace(farther=found[1])
+
+
+def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
+    """Numbers (10, E) of the nodes of the elements."""
+    return np.stack([np.asarray(n) for n in body.mesh.element_nodes])
+
+
+def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:
+    """Number of each unknown's row, -1 where there is none; slices of the longest side follow each other."""
+    inner, hidden = np.flatnonzero(body.inner), np.flatnonzero(body.inner[kinked])
+    voxel = np.concatenate([body.voxel[inner], body.voxel[kinked[hidden]]])
+    functions = np.concatenate([inner, len(body.inner) + hidden])
+    longest_last = np.argsort(np.ptp(body.voxel[inner], axis=0))
+    order = functions[np.lexsort(voxel[:, longest_last].T)]
+    rows = np.full(3 * (len(body.inner) + len(kinked)), -1)
+    rows[(3 * order[:, None] + np.arange(3)).ravel()] = np.arange(3 * len(order))
+    return rows
+
+
+def _whole_parts(m: Matrices, body: VoxelBody, region: np.ndarray, chosen: np.ndarray, density: float) -> _CutElements:
+    nodes = _nodes_of_elements(body)[:, chosen].T
+    grad, volume = _corner_gradients(body)[chosen], np.asarray(body.linear.volumes)[chosen]
+    lam, weight = _rule_of_four(), volume / 4
+    slopes = np.einsum("qal,elj->eqaj", _quadratic_functions(lam)[1], grad)
+    return _CutElements(
+        region[chosen],
+        nodes,
+        np.moveaxis(m.shear[..., chosen], -1, 0),
+        np.moveaxis(m.mass[..., chosen], -1, 0) / density,
+        np.asarray(body.linear.tetrahedra)[chosen],
+        np.einsum("e,qv,eqaj->eajv", weight, lam, slopes),
+    )
+
+
+def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarray) -> list[_CutElements]:
+    """What of every cut element lies in each region."""
+    corners = _equal_parts(HALVINGS)  # (Q, 4, 4)
+    lam = corners.mean(axis=1)
+    N, dN = _quadratic_functions(lam)
+    at_corners = _quadratic_functions(corners.reshape(-1, 4))[0]
+    nodes, tets, gradients = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra), _corner_gradients(body)
+    hidden = np.full(body.linear.number_of_nodes, -1)
+    hidden[kinked] = body.mesh.number_of_nodes + np.arange(len(kinked))
+    out: list[_CutElements] = []
+    for chunk in np.array_split(cut, -(-len(cut) // CHUNK)):
+        own, grad = s[:, nodes[:, chunk]], gradients[chunk]  # (R, 10, K)
+        there, highest = np.unique(own.argmax(axis=0)), own.max(axis=0)
+        at = np.einsum("rak,qa->rkq", own[there], at_corners).reshape(len(there), len(chunk), -1, 4)
+        plain = np.einsum("qal,klj->kqaj", dN, grad)
+        values = np.broadcast_to(N, (len(chunk), *N.shape))
+        functions = np.concatenate([nodes[:, chunk].T, hidden[tets[chunk]]], axis=1)
+        weights = _parts_by_region(at) * np.asarray(body.linear.volumes)[chunk, None] / len(lam)
+        for region, weight in zip(there, weights, strict=True):
+            # On its side psi is what the interpolation has too much.
+            above = highest - own[region]  # (10, K)
+            psi = np.einsum("ak,qa->kq", above, N)
+            slope = np.einsum("ak,kqaj->kqj", above, plain)
+            more = lam[:, :, None] * slope[:, :, None] + grad[:, None] * psi[:, :, None, None]
+            both = np.concatenate([values, lam * psi[..., None]], axis=2)
+            integrals = _integrals(both, np.concatenate([plain, more], axis=2), lam, weight)
+            out.append(_CutElements(np.full(len(chunk), region), functions, *integrals[:2], tets[chunk], integrals[2]))
+    return out
+
+
+def _parts_by_region(at: np.ndarray) -> np.ndarray:
+    """Parts (R, ...) of tetrahedra where each of R linear functions is the largest, by corner values (R, ..., 4)."""
+    if len(at) == 1:
+        return np.ones(at.shape[:-1])
+    out = []
+    for k in range(len(at)):
+        g = at[k] - np.delete(at, k, axis=0).max(axis=0)
+        # The formula has no value where two corners have the same; so far apart they are all alike to 1e-3.
+        g = g + 1e-3 * np.abs(g).max(axis=-1, keepdims=True) * np.array([0.0, 1.0, -1.5, 2.5]) + 1e-30
+        apart = g[..., :, None] - g[..., None, :] + np.where(np.eye(4, dtype=bool), 1.0, 0.0)
+        out.append(np.sum(np.maximum(g, 0) ** 3 / np.prod(apart, axis=-1), axis=-1))
+    shares = np.clip(np.array(out), 0.0, 1.0)
+    return np.asarray(shares / np.maximum(shares.sum(axis=0), 1e-300))
+
+
+def _integrals(
+    values: np.ndarray, gradients: np.ndarray, lam: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shear stiffness, mass and divergence of functions by their values (K, Q, n) and gradients (K, Q, n, 3)."""
+    K, Q, n = values.shape
+    flat = gradients.reshape(K, Q, 3 * n)
+    D = np.matmul(np.swapaxes(flat * weights[..., None], 1, 2), flat).reshape(K, n, 3, n, 3)
+    # Twice the deviator of the strain against the strain.
+    shear = np.einsum("ik,eajbj->eaibk", np.eye(3), D) + np.einsum("eakbi->eaibk", D) - 2 / 3 * D
+    mass = np.matmul(np.swapaxes(values * weights[..., None], 1, 2), values)
+    return shear, mass, np.einsum("kq,qv,kqaj->kajv", weights, lam, gradients, optimize=True)
+
+
+def _with_forces(parts: list[_CutElements], kinks: int, nodes: int) -> np.ndarray:
+    """Which kinks (kinks,) bool are there: an edge through a node alone makes none."""
+    size = np.zeros(kinks)
+    for p in parts:
+        np.add.at(size, p.functions[:, 10:] - nodes, np.einsum("eaibi->eab", p.shear)[:, range(10, 14), range(10, 14)])
+    return size > 1e-9 * size.max(initial=0.0)
+
+
+def _renumbered(p: _CutElements, alive: np.ndarray, nodes: int) -> _CutElements:
+    number = np.where(alive, np.cumsum(alive) - 1 + nodes, -1)
+    functions = p.functions.copy()
+    functions[:, 10:] = number[p.functions[:, 10:] - nodes]
+    return p._replace(functions=functions)
+
+
+def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: float) -> RegionMatrices:
+    """All parts together; rows (U,) of the unknowns."""
+    I, U = int(rows.max()) + 1, len(rows)
+    known, ends, at = _pattern(parts, rows)
+    stiffness, mass = np.zeros((R, len(known))), np.zeros(len(known))
+    for p, (inside, place) in zip(parts, at, strict=True):
+        region = np.broadcast_to(p.region[:, None, None, None, None], inside.shape)[inside]
+        values = p.shear[inside]
+        for r in np.unique(p.region):
+            stiffness[r] += np.bincount(place[region == r], values[region == r], len(known))
+        inertia = density * p.mass[:, :, None, :, None] * np.eye(3)[:, None, :]
+        mass += np.bincount(place, inertia[inside], len(known))
+    pattern = scipy.sparse.csr_array((np.zeros(len(known)), known % U, ends), shape=(I, U))
+    corners = 1 + max(int(p.corners.max()) for p in parts)
+    B = _pressure_columns(parts, rows, (I, corners * R), corners)
+    forces = balance.freely(B, balance.TYPICAL * stiffness.sum(axis=0))
+    return RegionMatrices(stiffness, mass, pattern, forces, balance.by_diagonals(forces @ forces.T), 0, np.zeros(0))
+
+
+def _pattern(
+    parts: list[_CutElements], rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """Keys of the entries in order, ends of the rows, and for each part which entries are there, and where."""
+    keys, insides, U = [], [], len(rows)
+    for p in parts:
+        unknowns, lines = _unknowns_and_rows(p, rows)
+        line, column = np.broadcast_arrays(lines[:, :, :, None, None], unknowns[:, None, None])
+        insides.append((line >= 0) & (column >= 0))
+        keys.append(line[insides[-1]] * U + column[insides[-1]])
+    known, at = np.unique(np.concatenate(keys), return_inverse=True)
+    counts = np.bincount(known // U, minlength=int(rows.max()) + 1)
+    places = np.split(at, np.cumsum([len(k) for k in keys])[:-1])
+    return known, np.concatenate([[0], np.cumsum(counts)]), list(zip(insides, places, strict=True))
+
+
+def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (K, n, 3) of the unknowns of functions, and of their rows; -1 where there is none."""
+    unknowns = np.where(p.functions[..., None] < 0, -1, 3 * p.functions[..., None] + np.arange(3))
+    return unknowns, np.where(unknowns < 0, -1, rows[unknowns])
+
+
+def _pressure_columns(
+    parts: list[_CutElements], rows: np.ndarray, shape: tuple[int, int], corners: int
+) -> scipy.sparse.csr_array:
+    """Forces (I, P R) of the pressures at corners, in each region by itself."""
+    lines, columns, values = [], [], []
+    for p in parts:
+        own = p.corners + corners * p.region[:, None]
+        line, column = np.broadcast_arrays(_unknowns_and_rows(p, rows)[1][..., None], own[:, None, None])
+        lines.append(line[line >= 0])
+        columns.append(column[line >= 0])
+        values.append(p.divergence[line >= 0])
+    at = np.concatenate(lines), np.concatenate(columns)
+    return scipy.sparse.coo_array((np.concatenate(values), at), shape=shape).tocsr()
+
+
+def _corner_gradients(body: VoxelBody) -> np.ndarray:
+    """Gradients (E, 4, 3) of the corners' linear functions."""
+    D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
+    return np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)
+
+
+def _quadratic_functions(lam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (Q, 10) of the quadratic functions, and derivatives (Q, 10, 4) by the barycentric coordinates (Q, 4)."""
+    values, slopes = [lam[:, i] * (2 * lam[:, i] - 1) for i in range(4)], np.zeros((len(lam), 10, 4))
+    slopes[:, range(4), range(4)] = 4 * lam - 1
+    for k, (i, j) in enumerate(PAIRS):
+        values.append(4 * lam[:, i] * lam[:, j])
+        slopes[:, 4 + k, i], slopes[:, 4 + k, j] = 4 * lam[:, j], 4 * lam[:, i]
+    return np.stack(values, axis=1), slopes
+
+
+def _rule_of_four() -> np.ndarray:
+    """Barycentric coordinates of the rule that is exact for quadratic functions."""
+    low = (5 - np.sqrt(5)) / 20
+    return low + (1 - 4 * low) * np.eye(4)
+
+
+def _equal_parts(halvings: int) -> np.ndarray:
+    """Barycentric corners (8^halvings, 4, 4) of equal parts of a tetrahedron."""
+    parts = [np.eye(4)]
+    for _ in range(halvings):
+        parts = [part for t in parts for part in _split_in_eight(t)]
+    return np.array(parts)
+
+
+def _split_in_eight(t: np.ndarray) -> list[np.ndarray]:
+    """The eight halves (4, 4) of a tetrahedron by its corners (4, 4)."""
+    middle = {pair: 0.5 * (t[pair[0]] + t[pair[1]]) for pair in PAIRS}
+    ab, ac, ad, bc, bd, cd = (middle[pair] for pair in PAIRS)
+    a, b, c, d = t
+    corners = ((a, ab, ac, ad), (ab, b, bc, bd), (ac, bc, c, cd), (ad, bd, cd, d))
+    inside = ((ab, ac, ad, bd), (ab, ac, bc, bd), (ac, ad, bd, cd), (ac, bc, bd, cd))
+    return [np.array(one) for one in (*corners, *inside)]

@@ -1,0 +1,157 @@
+"""Regions of measured waves: edges within the elements, against layers and cylinders in closed form."""
+
+import numpy as np
+import pytest
+
+from experiments.sources import cylinders_in_waves
+from fitting.reports import waves_report
+from fitting.waves import balance, edges, elastography, regions, voxels
+from fitting.waves.wave_field import WaveField
+
+pytestmark = pytest.mark.quick_to_compile
+
+DENSITY, SOFT, STIFF = 1000.0, 3000.0, 10000.0
+
+
+def beside_a_cylinder(radius, centre, spacing, hertz, noise=0.02, voxels_across=21, seed=0):
+    """Voxels of two plane shear waves that meet a stiff cylinder, with noise; 1 Pa s on both sides."""
+    shape = (voxels_across, voxels_across, 5)
+    X = np.stack(np.meshgrid(*[spacing * (np.arange(n) - (n - 1) / 2) for n in shape], indexing="ij"), axis=-1)
+    omega = 2 * np.pi * hertz
+    medium = cylinders_in_waves.Medium(SOFT + 1j * omega, STIFF + 1j * omega, omega, DENSITY)
+    flat = X[:, :, 0, :2].reshape(-1, 2)
+    u = cylinders_in_waves.motion(flat, [(centre, radius)], medium, [(0.0, 1e-5), (np.pi / 2, 1e-5)])
+    U = np.zeros((1, *shape, 3), complex)
+    U[..., :2] = u.reshape(*shape[:2], 1, 2)
+    sd = 0.02 * np.sqrt(np.mean(np.sum(np.abs(U) ** 2, axis=-1)) / 4)
+    rng = np.random.default_rng(seed)
+    U += noise / 0.02 * sd * (rng.normal(size=U.shape) + 1j * rng.normal(size=U.shape))
+    labels = 1 + (np.hypot(*np.moveaxis(X[..., :2] - np.array(centre), -1, 0)) < radius)
+    return WaveField(
+        np.array([hertz]), U, np.full(3, spacing), X[0, 0, 0], labels > 0, labels, np.array([sd]), "series"
+    )
+
+
+def organ_of(field):
+    return elastography.organ_of(field, elastography.body_of(field), DENSITY)
+
+
+def test_the_series_is_continuous_and_in_balance():
+    """By differences: -omega^2 rho u = div(stress), and so curl(u) obeys Helmholtz's equation on each side."""
+    omega, h = 2 * np.pi * 80.0, 2e-5
+    medium = cylinders_in_waves.Medium(SOFT + 300j, STIFF + 500j, omega, DENSITY)
+    cylinders = [((0.0, 0.0), 0.005), ((0.013, 0.002), 0.003)]
+    waves = [(0.3, 1.0), (2.0, 0.5j)]
+    for centre, G in (((0.001, 0.002), medium.inside), ((0.006, -0.007), medium.outside)):
+        grid = np.stack(np.meshgrid(*[h * np.arange(-2, 3)] * 2, indexing="ij"), axis=-1) + centre
+        u = cylinders_in_waves.motion(grid.reshape(-1, 2), cylinders, medium, waves).reshape(5, 5, 2)
+        dx, dy = np.gradient(u, h, axis=(0, 1))
+        assert abs(dx[2, 2, 0] + dy[2, 2, 1]) < 1e-4 * np.abs(dx).max()  # no change of volume
+        curl = dx[..., 1] - dy[..., 0]
+        around = curl[1, 2] + curl[3, 2] + curl[2, 1] + curl[2, 3] - 4 * curl[2, 2]
+        assert abs(around / h**2 * G / (DENSITY * omega**2 * curl[2, 2]) + 1) < 1e-3
+    ring = np.stack([np.cos(np.arange(7)), np.sin(np.arange(7))], axis=-1)
+    pair = [cylinders_in_waves.motion(r * ring, cylinders, medium, waves) for r in (0.005 - 1e-9, 0.005 + 1e-9)]
+    np.testing.assert_allclose(pair[0], pair[1], rtol=1e-5)
+
+
+def test_sheared_layers_are_in_balance():
+    """Simple shear across a plane edge anywhere in the elements: strain jumps, stress does not, no force is left."""
+    body = voxels.voxel_body(np.ones((7, 5, 5), bool), np.ones(3))
+    m = balance.matrices(body, DENSITY)
+    phi = np.asarray(body.mesh.points)[:, 0] - 3.3
+    found = edges.region_matrices(m, body, DENSITY, np.stack([-phi, phi]))
+    G = np.array([3000.0, 9000.0])
+    # u_y = c phi + d |phi| has the stress G_1 (c - d) = G_2 (c + d); kinks add their part with the other sign.
+    c, d = 2.0, -1.0
+    u = np.zeros((body.mesh.number_of_nodes, 3))
+    u[:, 1] = c * phi + d * np.abs(phi)
+    kinks = np.tile([0.0, -d, 0.0], found.kinks // 3)
+    forces, without = (found.rows(G, 0.0) @ np.concatenate([u.ravel(), part * kinks]) for part in (1, 0))
+    left, size = np.sort(np.abs(forces)), np.abs(without).max()
+    # The one inner corner has three rows of its kink. They are integrals over parts that are planes in an eighth of an
+    # element: what is left of them is of that order. All others are exact.
+    assert found.kinks > 3 and left[-4] < 1e-12 * size and left[-1] < size / 8
+
+
+def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
+    """chi^2 with edges a fiftieth of a voxel farther out, up to the second order that its Hessian has."""
+    monkeypatch.setattr(edges, "FARTHER", 0.02)
+    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
+    own = organ_of(field)
+    s = [edges.places(field.labels, own.body, np.array([1, 2]), farther) for farther in (0.0, edges.FARTHER)]
+    m = edges.region_matrices(own.matrices, own.body, DENSITY, *s)
+    at = np.array([3000 + 600j, 9000 + 600j]), own.waves.omega[0], own.waves.motion[0], own.waves.sd[0]
+    here = regions._state_of_regions(m, *at)
+    there = regions._state_of_regions(m.farther._replace(near=m.near, kinks=m.kinks), *at)
+    gradient, curvature = here.gradient[5], here.hessian[5, 5]
+    expected = edges.FARTHER * gradient + 0.5 * edges.FARTHER**2 * curvature
+    assert 0.5 * (there.here.chi2 - here.here.chi2) == pytest.approx(expected, rel=0.1)
+    assert here.gradient[4] == 0  # the surroundings have no edge of their own
+
+
+def test_smoothed_labels_keep_place_and_volume():
+    grid = np.stack(np.meshgrid(*[np.arange(15)] * 3, indexing="ij"), axis=-1)
+    labels = np.where(np.linalg.norm(grid - [7.2, 6.9, 7.0], axis=-1) < 3, 7, 2)
+    labels[:, :, :2] = 4
+    body = voxels.voxel_body(np.ones(labels.shape, bool), np.ones(3))
+    s = edges.places(labels, body, np.array([2, 4, 7]))
+    own = np.array([2, 4, 7])[s.argmax(axis=0)]
+    volume = np.sum(labels == 7)
+    assert abs(np.sum(own == 7) / volume - 1) < 0.1
+    assert np.linalg.norm(body.voxel[own == 7].mean(axis=0) - grid[labels == 7].mean(axis=0)) < 0.1
+    assert np.all((own == 4) == (labels[tuple(body.voxel.T)] == 4))  # a plane edge stays between its voxels
+    farther = edges.places(labels, body, np.array([2, 4, 7]), 0.5)
+    assert np.sum(farther.argmax(axis=0) == 2) > 1.2 * volume
+
+
+@pytest.mark.parametrize(
+    ("radius", "centre", "spacing"),
+    [
+        (0.005, (3e-4, -4e-4), 1e-3),
+        (0.005, (1.3e-3, 1e-4), 2e-3),
+        pytest.param(0.005, (8e-4, 1e-4), 1e-3, marks=pytest.mark.slow),
+        pytest.param(0.003, (3e-4, -4e-4), 1e-3, marks=pytest.mark.slow),
+        pytest.param(0.010, (3e-4, -4e-4), 2e-3, marks=pytest.mark.slow),
+    ],
+)
+def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, verified):
+    """2 % of noise, 2.5 to 5 voxels of radius: within 5 %, and within three standard errors."""
+    own = organ_of(beside_a_cylinder(radius, centre, spacing, 100.0))
+    found = elastography.regions_of(own).parts
+    off = found.modulus[0] - (np.array([SOFT, STIFF]) + 200j * np.pi)
+    e = found.standard_errors[0]
+    assert found.converged[0]
+    assert np.all(np.abs(off[1].real) < 3 * e[1].real) and np.all(np.abs(off[1].imag) < 3 * e[1].imag)
+    assert abs(off[0]) < 0.02 * SOFT
+    verified(
+        f"stiff cylinder of {radius / spacing:g} voxels in shear waves, 2 % noise",
+        "closed form",
+        abs(off[1].real) / STIFF,
+        0.05,
+    )
+
+
+def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
+    """Twelve measurements scatter as the standard errors say: their ratio has itself a deviation of a fifth."""
+    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, noise=0.0, voxels_across=13)
+    own = organ_of(field)
+    m = edges.region_matrices(own.matrices, own.body, DENSITY, edges.places(field.labels, own.body, np.array([1, 2])))
+    moduli, rng, start = [], np.random.default_rng(0), np.array([3000 + 600j, 9000 + 600j])
+    for _ in range(12):
+        noise = rng.normal(size=own.waves.motion.shape) + 1j * rng.normal(size=own.waves.motion.shape)
+        found = regions.moduli_of_regions(m, own.waves._replace(motion=own.waves.motion + field.noise * noise), start)
+        moduli.append(found.modulus[0, 1])
+    e = found.standard_errors[0, 1] / found.noise_factor[0]
+    assert 0.5 < np.std(np.real(moduli), ddof=1) / e.real < 1.6 and 0.5 < np.std(np.imag(moduli), ddof=1) / e.imag < 1.6
+
+
+def test_a_region_that_says_nothing_is_told():
+    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
+    labels = field.labels.copy()
+    labels[0, 0, 0] = 9  # at a corner, where no force is known
+    own = organ_of(field._replace(labels=labels))
+    found = elastography.regions_of(own)
+    assert np.all(np.isfinite(found.parts.modulus))
+    told = waves_report._cautions(own, found, None)
+    assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)
