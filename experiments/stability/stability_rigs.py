@@ -120,7 +120,8 @@ def _figure(rows: list[dict]) -> plt.Figure:
     for axis, test in zip(axes, TESTS, strict=True):
         for name, colour in zip(dict.fromkeys(r["mesh"] for r in rows), COLOURS, strict=False):
             for ratio, style in ((20.0, "-o"), (1e4, "--s")):
-                mine = [r for r in rows if (r["test"], r["mesh"], r["bulk_over_shear"]) == (test, name, ratio)]
+                own = [r for r in rows if (r["test"], r["mesh"], r["bulk_over_shear"]) == (test, name, ratio)]
+                mine = [r for r in own if r["code"] == status.NAMES[status.CONVERGED]]
                 axis.plot(
                     [r["run_s"] for r in mine],
                     [100 * abs(r["error"]) for r in mine],
@@ -132,7 +133,7 @@ def _figure(rows: list[dict]) -> plt.Figure:
         axis.set(xscale="log", yscale="log", xlabel="run time of a step [s]", title=test)
         plain_ticks(axis.yaxis)
     axes[0].set(ylabel="error of the reading [%]")
-    axes[2].legend(fontsize=6)
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=6, loc="outside right upper")
     return figure
 
 

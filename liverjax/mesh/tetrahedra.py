@@ -95,8 +95,8 @@ class TetMesh:
         (y_k - y_0) D_k.
         """
         if self.order == 1:
-            first, *others = [[taken(column, n) for column in columns] for n in self.element_nodes]
-            return [tuple(a - b for a, b in zip(corner, first, strict=True)) for corner in others]
+            corners = [taken(column, self.tetrahedra.T) for column in columns]
+            return [tuple(own[k] - own[0] for own in corners) for k in (1, 2, 3)]
         nodes = jnp.stack(self.element_nodes)
         values = self.oriented(jnp.stack([taken(column, nodes) for column in columns], axis=1))
         y = jnp.tensordot(self._slopes(), values, axes=(1, 0)).reshape(3, -1, *values.shape[1:])

@@ -37,24 +37,25 @@ def conjugate_gradients(
     goal = tolerance * jnp.linalg.norm(b)
 
     def go_on(c):
-        _, r, _, rz, k, positive = c
-        return (jnp.sqrt(jnp.vdot(r, r)) > goal) & (k < max_iterations) & positive & (rz > 0)
+        _, r, _, _, k, positive = c
+        return (jnp.sqrt(jnp.vdot(r, r)) > goal) & (k < max_iterations) & positive
 
     def step(c):
-        x, r, p, rz, k, _ = c
+        x, r, p, rz_before, k, _ = c
+        z = precondition(r)  # here alone, so that the program has it once
+        rz = jnp.vdot(r, z)
+        p = z + rz / rz_before * p
         Ap = matvec(p)
         curvature = jnp.vdot(p, Ap)
-        positive = curvature > 0
+        positive = (curvature > 0) & (rz > 0)
         alpha = jnp.where(positive, rz / jnp.where(positive, curvature, 1.0), 0.0)
-        x, r = x + alpha * p, r - alpha * Ap
-        z = precondition(r)
-        rz_new = jnp.vdot(r, z)
-        return x, r, z + rz_new / rz * p, rz_new, k + 1, positive
+        # What is not finite stays out of x.
+        return jnp.where(positive, x + alpha * p, x), r - alpha * Ap, p, rz, k + 1, positive
 
-    z = precondition(b)
-    start = (jnp.zeros_like(b), b, z, jnp.vdot(b, z), jnp.zeros((), jnp.int32), jnp.array(True))
-    x, _, _, rz, k, positive = jax.lax.while_loop(go_on, step, start)
-    return x, LinearStatistics(k, true_residual(matvec, b, x), positive & (rz >= 0))
+    zero = jnp.zeros_like(b)
+    start = (zero, b, zero, jnp.ones((), b.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
+    x, *_, k, positive = jax.lax.while_loop(go_on, step, start)
+    return x, LinearStatistics(k, true_residual(matvec, b, x), positive)
 
 
 def chebyshev(
