@@ -32,7 +32,11 @@ def system(kind: type) -> tuple[scipy.sparse.csr_array, list[multifrontal.Front]
 
 @pytest.mark.parametrize("kind", [float, complex])
 @pytest.mark.parametrize("single", [False, True])
-def test_against_a_dense_solution(kind, single):
+@pytest.mark.parametrize("together", [512, 7])
+def test_against_a_dense_solution(kind, single, together, monkeypatch):
+    """With groups eliminated at once, and by seven unknowns at a time."""
+    monkeypatch.setattr(multifrontal, "PIVOTS", together)
+    monkeypatch.setattr(multifrontal, "TILE", 2 * together)
     A, plan = system(kind)
     assert len(plan) > 8 and sorted(np.concatenate([front.own for front in plan])) == list(range(A.shape[0]))
     known = np.random.default_rng(2).normal(size=A.shape[0]).astype(kind)
@@ -41,6 +45,22 @@ def test_against_a_dense_solution(kind, single):
     dense = np.linalg.solve(A.toarray(), A @ known)
     # As far from the truth as a dense solution may be.
     assert np.linalg.norm(found - known) < 10 * np.linalg.norm(dense - known) + 1e-12 * np.linalg.norm(known)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_groups_whose_nodes_are_all_held(single, monkeypatch):
+    """They have no unknown of their own, and some no border: LAPACK refuses a matrix of no lines."""
+    monkeypatch.setattr(multifrontal, "LEAF", 8)
+    A, _ = system(complex)
+    box = lj.shapes.box((1.0, 1.0, 2.0), (5, 5, 10))
+    points = np.asarray(box.points)
+    keep = np.flatnonzero(np.repeat(points[:, 2] > 0.7, 2))
+    free = A[keep][:, keep].tocsr()
+    plan = multifrontal.fronts(free, multifrontal.dissected(np.asarray(box.tetrahedra).T, points), keep // 2)
+    assert any(len(front.own) == 0 for front in plan)
+    known = np.random.default_rng(2).normal(size=len(keep)) + 0j
+    _, error = multifrontal.refined_solution(multifrontal.factorised(free, plan, single), free @ known)
+    assert error < 1e-15
 
 
 def test_a_matrix_without_an_inverse_is_told():

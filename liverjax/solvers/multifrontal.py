@@ -2,11 +2,13 @@
 
 Nested dissection (George 1973, SIAM J. Numer. Anal. 10, 345): the elements are halved across their longest side again
 and again, and the nodes between two halves come after both. Each group of nodes is eliminated in a dense matrix of
-itself and its border (Duff and Reid 1983, ACM TOMS 9, 302), so nearly all work is LAPACK's, on all cores. Pivots are
-chosen within a group. Large matrices are factorised in single precision and solved with refinement: half the time and
-memory, and the same digits. Where that does not converge, double precision follows.
+itself and its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is
+products of matrices, on all cores. By symmetry the lower triangles are enough. Pivots are chosen within the unknowns
+that are eliminated together. Large matrices are factorised in single precision and solved with refinement: half the
+time and memory, and the same digits. Where that does not converge, double precision follows.
 """
 
+import itertools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Nodes of a group that is not halved any more; unknowns from which on single precision pays.
 LEAF, SINGLE_FROM = 40, 20_000
+#: Unknowns of a group that are eliminated together, and the side of the tiles of what they change.
+PIVOTS, TILE = 512, 512
 #: Steps of refinement, and the part of the terms of an equation that may be out of balance.
 STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
@@ -28,18 +32,27 @@ class Front(NamedTuple):
     children: list[int]  # groups before it whose rest it takes in
 
 
+class Eliminated(NamedTuple):
+    """Unknowns that were eliminated together: L U of their own matrix A, and X = A^-1 B of those that come after."""
+
+    own: np.ndarray  # (n,)
+    after: np.ndarray  # (m,)
+    lu: np.ndarray  # (n, n)
+    pivots: np.ndarray  # (n,)
+    X: np.ndarray  # (n, m)
+
+
 class Factor(NamedTuple):
-    """The result of an elimination: for every group L U of its own matrix A, and X = A^-1 B of its border."""
+    """The result of an elimination."""
 
     matrix: "scipy.sparse.csr_array"  # scaled
     scale: np.ndarray  # (N,)
-    fronts: list[Front]
-    eliminated: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    steps: list[Eliminated]
 
     @property
     def nbytes(self) -> int:
         """Memory."""
-        return self.matrix.data.nbytes + sum(lu.nbytes + X.nbytes for lu, _, X in self.eliminated)
+        return self.matrix.data.nbytes + sum(step.lu.nbytes + step.X.nbytes for step in self.steps)
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
@@ -68,11 +81,21 @@ def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray
                     children.append(halved(half, rest))
             nodes = between
         taken[nodes] = True
-        groups.append((nodes, children))
+        groups.append((_neighbours_together(nodes, points), children))
         return len(groups) - 1
 
     halved(np.arange(elements.shape[1]), np.unique(elements))
     return groups
+
+
+def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The nodes in an order in which those of a part of space follow each other."""
+    if len(nodes) <= 8:
+        return nodes
+    side = points[nodes, np.argmax(np.ptp(points[nodes], axis=0))]
+    order = np.argsort(side, kind="stable")
+    halves = nodes[order[: len(nodes) // 2]], nodes[order[len(nodes) // 2 :]]
+    return np.concatenate([_neighbours_together(half, points) for half in halves])
 
 
 def fronts(A: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray) -> list[Front]:
@@ -81,17 +104,17 @@ def fronts(A: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]
     ends = np.searchsorted(
         node[order], np.arange(max(node.max(initial=0), max(g.max(initial=0) for g, _ in groups)) + 2)
     )
+    none, found = np.zeros(0, int), []
+    each = [np.concatenate([order[ends[v] : ends[v + 1]] for v in nodes] or [none]) for nodes, _ in groups]
     when = np.empty(len(node), int)
-    found: list[Front] = []
-    for k, (nodes, _) in enumerate(groups):
-        for v in nodes:
-            when[order[ends[v] : ends[v + 1]]] = k
-    for k, (nodes, children) in enumerate(groups):
-        own = np.concatenate([order[ends[v] : ends[v + 1]] for v in nodes] or [np.zeros(0, int)])
+    order_of = np.concatenate(each)
+    when[order_of] = np.arange(len(node))
+    done = 0
+    for own, (_, children) in zip(each, groups, strict=True):
+        done += len(own)
         near = [A.indices[A.indptr[i] : A.indptr[i + 1]] for i in own] + [found[c].border for c in children]
-        border = np.unique(np.concatenate(near)) if near else np.zeros(0, int)
-        border = border[when[border] > k]
-        found.append(Front(own, border[np.argsort(when[border], kind="stable")], children))
+        later = np.unique(when[np.concatenate([none, *near])])
+        found.append(Front(own, order_of[later[later >= done]], children))
     return found
 
 
@@ -111,21 +134,19 @@ def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool) -> 
     kind = np.result_type(A.dtype, np.float32)
     if single:
         kind = np.dtype(np.complex64 if kind.kind == "c" else np.float32)
-    place, eliminated = np.full(A.shape[0], -1), []
+    place, steps = np.full(A.shape[0], -1), []
     rests: dict[int, np.ndarray] = {}
+    memory = np.empty(max((len(front.own) + len(front.border)) ** 2 for front in plan), kind)
     for k, front in enumerate(plan):
-        n = len(front.own)
-        F = _matrix_of_group(A, front, place, kind)
+        F, n = _matrix_of_group(A, front, place, memory), len(front.own)
         for c in front.children:
-            rest = rests.pop(c)
-            at = place[plan[c].border]
-            F[np.ix_(at, at)] += rest
+            if c in rests:  # a part of the body that nothing couples with the others has left nothing
+                _add(F, place[plan[c].border], rests.pop(c))
         place[front.own] = place[front.border] = -1
-        lu, pivots, X, rest = _without(F, n)
-        eliminated.append((lu, pivots, X))
+        steps += _eliminated(F, front)
         if len(front.border):
-            rests[k] = rest
-    return Factor(A, scale, plan, eliminated)
+            rests[k] = F[n:, n:].copy(order="F")
+    return Factor(A, scale, steps)
 
 
 def _scale(A: Any) -> np.ndarray:
@@ -140,36 +161,53 @@ def _scale(A: Any) -> np.ndarray:
     return scale
 
 
-def _matrix_of_group(A: Any, front: Front, place: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """The rows of A of the group itself, and their mirror image; `place` says where its unknowns and border are."""
+def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
+    """The columns of A of the group itself, on and below the diagonal; `place` says where its unknowns and border
+    are."""
     n, size = len(front.own), len(front.own) + len(front.border)
     place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
-    F = np.zeros((size, size), kind, order="F")
-    rows = A[front.own].tocoo()
-    column = place[rows.col]
-    here = column >= 0
-    F[rows.row[here], column[here]] = rows.data[here]
-    F[n:, :n] = F[:n, n:].T
+    F = memory[: size * size].reshape((size, size), order="F")
+    F[...] = 0
+    mirrored = A[front.own].tocoo()
+    row = place[mirrored.col]
+    below = row >= mirrored.row
+    F[row[below], mirrored.row[below]] = mirrored.data[below]
     return F
 
 
-def _without(F: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """L U and pivots of A, X = A^-1 B and D - B^T X of the matrix F = [[A, B], [B^T, D]] with A (n, n)."""
+def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
+    """Add a lower triangle to F at rising places `at`, of which many follow each other."""
+    ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1), len(at)]
+    runs = [(a, b, at[a]) for a, b in itertools.pairwise(ends) if a < b]
+    for k, (a, b, column) in enumerate(runs):
+        for c, d, row in runs[k:]:
+            F[row : row + d - c, column : column + b - a] += rest[c:d, a:b]
+
+
+def _eliminated(F: np.ndarray, front: Front) -> list[Eliminated]:
+    """Eliminate a group in its matrix F (n + m, n + m), whose lower triangle becomes that of what is left."""
     from scipy.linalg import get_lapack_funcs
 
     factor, solve = get_lapack_funcs(("getrf", "getrs"), (F,))
-    lu, pivots, info = factor(F[:n, :n])
-    if info != 0:
-        raise np.linalg.LinAlgError("singular")
-    B, rest = F[:n, n:], F[n:, n:]
-    X = solve(lu, pivots, B)[0] if B.shape[1] else B
-    m = B.shape[1]
-    step = max(256, -(-m // 4))
-    for j in range(0, m, step):  # what is left is symmetric: the blocks below the diagonal are enough
-        end = min(j + step, m)
-        rest[j:, j:end] -= B[:, j:].T @ X[:, j:end]
-        rest[j:end, end:] = rest[end:, j:end].T
-    return lu, pivots, X, rest.copy()
+    n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
+    for a in range(0, n, PIVOTS):
+        b = min(a + PIVOTS, n)
+        A = np.tril(F[a:b, a:b])
+        lu, pivots, info = factor(A + np.tril(A, -1).T)
+        if info != 0:
+            raise np.linalg.LinAlgError("singular")
+        B = F[b:, a:b].T
+        X = solve(lu, pivots, B)[0] if B.shape[1] else B.copy()
+        found.append(Eliminated(every[a:b], every[b:], lu, pivots, X))
+        _take_off(F[b:, b:], B, X)
+    return found
+
+
+def _take_off(rest: np.ndarray, B: np.ndarray, X: np.ndarray) -> None:
+    """Take B^T X, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile."""
+    for j in range(0, len(rest), TILE):
+        for i in range(j, len(rest), TILE):
+            rest[i : i + TILE, j : j + TILE] -= B[:, i : i + TILE].T @ X[:, j : j + TILE]
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
@@ -199,14 +237,14 @@ def _backward_error(size: Any, x: np.ndarray, b: np.ndarray, out: np.ndarray) ->
 def _once(factor: Factor, b: np.ndarray) -> np.ndarray:
     from scipy.linalg import get_lapack_funcs
 
-    y = b.astype(factor.eliminated[0][0].dtype)
-    (solve,) = get_lapack_funcs(("getrs",), (factor.eliminated[0][0],))
-    both = list(zip(factor.fronts, factor.eliminated, strict=True))
-    for front, (lu, pivots, X) in both:
-        own = y[front.own]
-        y[front.border] -= own @ X
-        if len(own):
-            y[front.own] = solve(lu, pivots, own)[0]
-    for front, (_, _, X) in reversed(both):
-        y[front.own] -= X @ y[front.border]
+    if not factor.steps:  # nothing is free
+        return b
+    y = b.astype(factor.steps[0].lu.dtype)
+    (solve,) = get_lapack_funcs(("getrs",), (factor.steps[0].lu,))
+    for own, after, lu, pivots, X in factor.steps:
+        near = y[own]
+        y[after] -= near @ X
+        y[own] = solve(lu, pivots, near)[0]
+    for own, after, _, _, X in reversed(factor.steps):
+        y[own] -= X @ y[after]
     return y
