@@ -15,6 +15,9 @@ if jax.__version__ in ("0.10.2", "0.11.0"):
     )
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
+if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) == 1:
+    # On one core JAX has one thread. A direct solve on the host would occupy it, and wait for it to copy the matrix.
+    os.environ.setdefault("NPROC", "2")
 
 from liverjax import laws
 from liverjax.core import addresses

@@ -1,5 +1,9 @@
 """Factorisation by nested dissection: against dense solutions, in both precisions, and kept for derivatives."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,3 +120,22 @@ def test_other_ways_where_the_first_fails(monkeypatch):
     for other in (single, pivoted):
         assert np.linalg.norm(other - double) < 1e-11 * np.linalg.norm(double)
         assert not np.array_equal(other, double)
+
+
+ONE_CORE = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import liverjax
+import jax, jax.numpy as jnp, numpy as np
+total = lambda a, b: np.asarray(a).sum() + np.asarray(b).sum()
+solve = jax.jit(lambda a: jax.pure_callback(total, jax.ShapeDtypeStruct((), a.dtype), 2 * a, a + 1))
+print([float(solve(jnp.ones(3_000_000) + k)) for k in range(40)][-1])
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no cores to choose")
+def test_a_solve_on_the_host_does_not_wait_for_itself_on_one_core():
+    """JAX has one thread there: it runs the solve and would have to copy what the solve waits for."""
+    env = {k: v for k, v in os.environ.items() if k != "NPROC"}
+    done = subprocess.run([sys.executable, "-c", ONE_CORE], env=env, capture_output=True, text=True, timeout=60)
+    assert float(done.stdout) == 3_000_000 * (2 * 40 + 41), done.stderr
