@@ -13,6 +13,13 @@ import liverjax as lj
 from liverjax.core import bounds
 from liverjax.core.struct import replace
 from liverjax.physics import porosity, viscosity
+from liverjax.physics.attached import vessel
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.attached.membrane import Membrane
+from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.porosity import Inlet
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import scene_checks
 
 pytestmark = pytest.mark.quick_to_compile
@@ -145,3 +152,100 @@ def test_bounds_cost_less_than_a_millisecond():
         scene_checks.check_bounds(SOUND)
         times.append(time.perf_counter() - begin)
     assert min(times) < 1e-3
+
+
+FINE = lj.quadratic(MESH)
+TOP = jnp.asarray(lj.boundary.boundary_triangles(FINE, FINE.node_sets["z_max"]))
+LAYER = lj.laws.NeoHookean(mu=1e4, bulk=1e5)
+BAR = vessel.along(FINE, np.array([[0.05, 0.05, 0.01], [0.05, 0.06, 0.09]]), 1e-3, LAYER)
+FIBRE = Ligament(
+    nodes=jnp.array([[7]]), weights=jnp.ones((1, 1)), to=jnp.array([0.1, 0.1, 0.2]), stiffness=1.0, rest_length=0.1
+)
+#: A triangle of three vertices of the mesh that is no face of an element; on quadratic ones its middles are not there.
+LOST = jnp.array([[1, 2, 4]])
+
+
+def _plate(**given) -> dict:
+    plane = Obstacle(triangles=TOP, position=jnp.array([0.0, 0.0, 0.2]), axis=jnp.array([0.0, 0.0, -1.0]))
+    return {"physics": (replace(plane, **given),)}
+
+
+def _spring(**given) -> dict:
+    return {"physics": (ElasticSupport(**given),)}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"fixed": (lj.Fixed(nodes=jnp.array([999])),)}, "fixed.0.nodes names no node or one beyond 26: renumber them"),
+        ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64: give whole"),
+        ({"fixed": (lj.Fixed(nodes=TOP),)}, "fixed.0.nodes has shape (2, 3): give whole node numbers (n,)"),
+        ({"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)}, "displaced.0.nodes names no node or"),
+        ({"traction": (lj.Traction(triangles=LOST, pressure=1.0),)}, "traction.0.triangles has [1, 2, 4], which is no"),
+        (
+            {"traction": (lj.Traction(triangles=TOP.ravel(), pressure=1.0),)},
+            "traction.0.triangles has shape (6,): give",
+        ),
+        (
+            {"porosity": replace(SOUND.porosity, drained=jnp.array([27]))},
+            "porosity.drained names no node or one beyond",
+        ),
+        (
+            {"porosity": replace(SOUND.porosity, inlet=(Inlet(nodes=jnp.array([99]), pressure=1.0),))},
+            "porosity.inlet.0.nodes names no node or one beyond 26",
+        ),
+        (
+            {"porosity": replace(SOUND.porosity, inlet=(Inlet(triangles=LOST, flux=1.0),))},
+            "porosity.inlet.0.triangles has [1, 2, 4], which is no face of an element",
+        ),
+        (_plate(triangles=LOST), "obstacle.0.triangles has [1, 2, 4], which is no face"),
+        (_plate(triangles=jnp.zeros((0, 3), int)), "obstacle.0.triangles names no node or one beyond 7"),
+        (_plate(position=jnp.zeros(2)), "obstacle.0.position has shape (2,): give shape (3,)"),
+        (_plate(by=jnp.array(0.1)), "obstacle.0.by has shape (): give shape (3,)"),
+        (_plate(stiffness=jnp.ones(3)), "obstacle.0.stiffness has shape (3,): give one number or shape (2,)"),
+        (
+            _plate(times=jnp.array([1.0, 0.0]), history=jnp.zeros((2, 3))),
+            "obstacle.0 history must have increasing times",
+        ),
+        (_spring(triangles=LOST, normal=1.0), "support.0.triangles has [1, 2, 4], which is no face of an element"),
+        (_spring(triangles=TOP, normal=jnp.ones(5)), "support.0.normal has shape (5,): give one number or shape (2,)"),
+        (
+            _spring(nodes=jnp.array([99]), stiffness=1.0),
+            "support.0.nodes names no node or one beyond 26: renumber them",
+        ),
+        (
+            _spring(triangles=TOP, normal=1.0, times=jnp.array([0.0, 1.0]), history=jnp.array([1.0, -1.0])),
+            "support.0 history = [1.0, -1.0] must be at least 0",
+        ),
+        ({"physics": (SlidingSupport(nodes=jnp.array([[0, 1]]), axis="z"),)}, "support.0.nodes has shape (1, 2): give"),
+        ({"physics": (SlidingSupport(nodes=jnp.array([0]), normal=jnp.ones(2)),)}, "support.0.normal has shape (2,)"),
+        (
+            {"physics": (Membrane(triangles=LOST, thickness=1e-5, law=LAYER),)},
+            "membrane.0.triangles has [1, 2, 4], whi",
+        ),
+        ({"physics": (Membrane(triangles=TOP, thickness=jnp.ones(3), law=LAYER),)}, "membrane.0.thickness has shape"),
+        (
+            {"physics": (replace(FIBRE, nodes=jnp.array([7])),)},
+            "ligament.0.nodes has shape (1,): give the nodes of each",
+        ),
+        (
+            {"physics": (replace(FIBRE, weights=jnp.ones((2, 1))),)},
+            "ligament.0.weights has shape (2, 1): give shape (1",
+        ),
+        ({"physics": (replace(FIBRE, to=jnp.ones(2)),)}, "ligament.0.to has shape (2,): give shape (3,)"),
+        ({"physics": (replace(BAR, enters=BAR.enters[:3]),)}, "vessel.0.enters has shape (3, "),
+        (
+            {"physics": (replace(BAR, radius=jnp.ones(99)),)},
+            "vessel.0.radius has shape (99,): give one number or shape",
+        ),
+    ],
+)
+def test_places_and_shapes_made_in_python_are_refused_in_one_sentence(change, sentence):
+    """On quadratic elements, where a triangle that is no face would take the middle of another edge, silently."""
+    scene = lj.Scene(
+        mesh=FINE, law=LAYER, fixed=(lj.Fixed(nodes=FINE.node_sets["z_min"]),), solve=lj.Solve(dt=0.1, steps=2)
+    )
+    lj.check_scene(replace(scene, physics=(BAR, FIBRE, *_plate()["physics"])))
+    with pytest.raises(lj.InputError, match="^" + re.escape(sentence)) as caught:
+        lj.check_scene(replace(scene, **change))
+    assert "\n" not in str(caught.value)

@@ -127,3 +127,14 @@ def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> st
     if isinstance(value, (tuple, list)):
         return f"{where} = {numbers.tolist()}"
     return f"{where} = {np.asarray(value).tolist() if np.ndim(value) else value}"
+
+
+def check_shape(where: str, value: object, *allowed: tuple[int, ...]) -> None:
+    """Refuse an array of another shape than one of those allowed, in one sentence; None passes.
+
+    Raises:
+        InputError: another shape.
+    """
+    if value is not None and np.shape(value) not in allowed:
+        words = " or ".join("one number" if shape == () else f"shape {shape}" for shape in allowed)
+        raise InputError(f"{where} has shape {np.shape(value)}: give {words}")

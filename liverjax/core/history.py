@@ -75,6 +75,8 @@ def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) 
     if len(count) != 1 or np.shape(history) not in allowed:
         shapes = " or ".join(map(str, allowed))
         raise InputError(f"{name} history has shape {np.shape(history)}, its times {count}: give {shapes}")
+    if not isinstance(times, jax.core.Tracer) and not (count[0] and np.all(np.diff(np.asarray(times)) > 0)):
+        raise InputError(f"{name} history must have increasing times: sort them")
 
 
 def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:

@@ -60,3 +60,40 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     outer = faces[np.sort(first[count == 1])]
     return outer if nodes is None else outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]
+
+
+def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
+    """Refuse what is no list of node numbers (n,) below a count; host side.
+
+    Raises:
+        InputError: one sentence that begins with `name`.
+    """
+    numbers = np.asarray(nodes)
+    if numbers.ndim != 1 or (numbers.size and numbers.dtype.kind not in "iu"):
+        found = f"shape {numbers.shape}" if numbers.ndim != 1 else f"numbers of type {numbers.dtype}"
+        raise InputError(f"{name} has {found}: give whole node numbers (n,)")
+    if numbers.size < least or (numbers.size and not 0 <= numbers.min() <= numbers.max() < count):
+        raise InputError(f"{name} names no node or one beyond {count - 1}: renumber them")
+
+
+def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
+    """Refuse triangles (m, 3) that are no faces of elements; host side.
+
+    Raises:
+        InputError: one sentence that begins with `name`.
+    """
+    numbers = np.asarray(triangles)
+    if numbers.ndim != 2 or numbers.shape[1] != 3:
+        raise InputError(f"{name} has shape {numbers.shape}: give three node numbers a triangle (m, 3)")
+    check_nodes(numbers.ravel(), mesh.number_of_vertices, name)
+    V, touched = mesh.number_of_vertices, np.zeros(mesh.number_of_vertices, bool)
+    touched[numbers] = True
+    tets = np.asarray(mesh.tetrahedra)
+    near = tets[touched[tets].sum(axis=1) >= 3]
+    faces = np.sort(np.concatenate([near[:, f] for f in ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))]), axis=1)
+    own = np.sort(numbers, axis=1)
+    code = np.array([V * V, V, 1])
+    lost = np.flatnonzero(~np.isin(own @ code, faces @ code))
+    if len(lost):
+        first = numbers[lost[0]].tolist()
+        raise InputError(f"{name} has {first}, which is no face of an element: take boundary_triangles of the mesh")

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core import history
+from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Number, Numbers, param, struct
 from liverjax.mesh import selection, surface
@@ -62,9 +62,15 @@ class ElasticSupport(Physics):
         history.check(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
-        numbers = np.asarray(self.nodes if self.triangles is None else self.triangles)
-        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
-            raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
+        if self.triangles is None:
+            selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
+            bounds.check_shape(f"{name}.stiffness", self.stiffness, (), np.shape(self.nodes))
+        else:
+            selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
+            for key in ("normal", "tangential"):
+                bounds.check_shape(f"{name}.{key}", getattr(self, key), (), (len(self.triangles),))
+        if self.history is not None and np.ndim(self.history) == 1:
+            bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs":
         """One symmetric block a node."""

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Numbers, param, replace, static, struct
 from liverjax.mesh import selection
@@ -39,9 +40,8 @@ class SlidingSupport(Physics):
 
     def check(self, mesh: TetMesh, name: str) -> None:
         """Refuse wrong node numbers and a missing direction."""
-        numbers = np.asarray(self.nodes)
-        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
-            raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
+        selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
+        bounds.check_shape(f"{name}.normal", self.normal, (3,))
         if self.axis not in ("", *selection.AXES):
             raise InputError(f"{name} axis = {self.axis!r} is not known: use x, y or z, or a normal")
         if not self.axis and (self.normal is None or abs(np.linalg.norm(np.asarray(self.normal)) - 1) > 1e-6):

@@ -7,6 +7,7 @@ import numpy as np
 from liverjax import laws
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
+from liverjax.mesh.selection import check_nodes, check_triangles
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import porosity, viscosity
 from liverjax.physics.base import Physics
@@ -115,9 +116,6 @@ def _body(body: Body, nodes: int) -> None:
 
 def _mixed(scene: Scene) -> None:
     name = "[solve] volumetric = 'mixed'"
-    if scene.solve.robust != "off" and scene.mesh.order > 1:
-        # Far from a solution the linear solves of quadratic ones do not end.
-        raise InputError(f"{name} with robust needs linear elements: take order = 1, or volumetric = 'nodal'")
     for law in laws_of(scene.law, scene.region):
         check_mixed_law(law, name)
 
@@ -173,6 +171,7 @@ def check_scene(scene: Scene) -> None:
     check_numbers(scene)
     check_mesh(scene.mesh)
     check_region_elements(scene)
+    _places(scene)
     for name, physics in _named_physics(scene):
         physics.check(scene.mesh, name)
         if scene.points_are != "loaded":
@@ -202,6 +201,25 @@ def check_scene(scene: Scene) -> None:
         )
     if solve.kind == "static" or scene.points_are == "loaded":
         _held(scene)
+
+
+def _places(scene: Scene) -> None:
+    """Refuse node numbers and triangles that are not in the mesh."""
+    mesh = scene.mesh
+    for kind in ("fixed", "displaced"):
+        for k, condition in enumerate(getattr(scene, kind)):
+            check_nodes(condition.nodes, mesh.number_of_nodes, f"{kind}.{k}.nodes", least=0)
+    for k, load in enumerate(scene.traction):
+        check_triangles(mesh, load.triangles, f"traction.{k}.triangles")
+    if scene.porosity is None:
+        return
+    if scene.porosity.drained is not None:
+        check_nodes(scene.porosity.drained, mesh.number_of_nodes, "porosity.drained")
+    for k, inlet in enumerate(scene.porosity.inlet):
+        if inlet.nodes is not None:
+            check_nodes(inlet.nodes, mesh.number_of_nodes, f"porosity.inlet.{k}.nodes")
+        else:
+            check_triangles(mesh, inlet.triangles, f"porosity.inlet.{k}.triangles")
 
 
 def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:

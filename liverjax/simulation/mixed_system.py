@@ -5,6 +5,7 @@ the fluid flows, so the matrix couples them. Where volume changes are averaged a
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,8 +18,12 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import darcy
 from liverjax.physics.darcy import Flow
 from liverjax.solvers import block_matrix, point_matrix
+from liverjax.solvers.krylov import chebyshev
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.matrices import Matrix, scale
+
+#: Of the polynomial that stands for the inverse of the pressures' matrix: it is right to 1 %.
+_DEGREE = 6
 
 
 def coupled(
@@ -93,6 +98,18 @@ def with_pressures(
     forces, outwards = point_matrix.product(mesh, A, motion), pulled(mesh, A, volume.unit * dp)
     balance = point_matrix.volume_changes(mesh, A, motion) - volume.compliance(mesh, volume.unit * dp)
     return tuple(f + p for f, p in zip(forces, outwards, strict=True)), volume.unit * balance
+
+
+def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    """Forces, columns (V,), of a motion with the unknown pressures that answer it, for quadratic elements.
+
+    The matrix of the pressures is inverted by a polynomial, so that this stays symmetric: over its diagonal it has
+    eigenvalues between 1/2 and 5/2 in tetrahedra (Wathen 1987).
+    """
+    changes = point_matrix.volume_changes(mesh, A, motion)
+    own, bounds = volume.diagonal(mesh), (0.5, 2.5)
+    p = chebyshev(partial(volume.compliance, mesh), changes, own, bounds, _DEGREE)
+    return block_matrix.sums(point_matrix.product(mesh, A, motion), point_matrix.pull(mesh, A, p))
 
 
 def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: jax.Array) -> tuple[jax.Array, ...]:

@@ -52,6 +52,7 @@ def problem_of(e: Equations) -> Problem:
             rest=_rest(e) if e.scene.solve.kind == "static" else None,
             settled=None if e.mixed is None else partial(settled, e),
             positions=None if e.mixed is None else 3 * e.mesh.number_of_nodes,
+            eliminates=tangent.eliminates_pressures(e),
         )
     return Problem(
         residual=partial(residual, e),

@@ -156,6 +156,8 @@ class Tangent(NamedTuple):
     follows: jax.Array | None  # 1 where these loads count, 0 in a tangent without negative eigenvalues
     attached: tuple[Attached | GivesWay, ...] = ()  # elements between nodes, not in the matrix
     pressures: Coarse | None = None  # of unknown pressures in thin cells
+    #: Whether `solve` eliminates unknown pressures first; None: it never does.
+    eliminates: jax.Array | None = None
 
 
 def tangent(
@@ -181,7 +183,8 @@ def tangent(
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
     # Loads that follow the body need to know where.
     where, part, follows = (None, None, None) if e.conservative else (x, s, _true(kind, x.dtype))
-    K = Tangent(matrix, inverse, below, slow, where, part, follows, more)
+    eliminates = ~_true(kind, bool) if kind != "true" and eliminates_pressures(e) else None
+    K = Tangent(matrix, inverse, below, slow, where, part, follows, more, eliminates=eliminates)
     if not _thin(e):
         return K
 
@@ -190,6 +193,16 @@ def tangent(
 
     own = slow_pressures() if near is None else jax.lax.cond(near[0], lambda: near[1].pressures, slow_pressures)
     return K._replace(pressures=own)
+
+
+def eliminates_pressures(e: Equations) -> bool:
+    """Whether a tangent without negative eigenvalues is solved with its unknown pressures eliminated.
+
+    Far from a solution pressures are as large as the bulk modulus, and so is the stiffness that they give. An iteration
+    for positions and pressures together, which goes by the shear modulus, does not end there; positions alone have a
+    positive matrix. The matrix of the pressures of linear elements has no simple inverse.
+    """
+    return e.mixed is not None and e.mesh.order > 1 and e.scene.solve.linear_solver != "direct"
 
 
 def _thin(e: Equations) -> bool:
@@ -292,6 +305,8 @@ def _of_points(e: Equations, pressure: jax.Array | None, x: jax.Array, s: Number
         if e.scene.solve.linear_solver == "direct":
             C = _of_kind(kind, lambda kind: e.mixed.matrix(mesh, determinant(F), kind != "true"))
             A = A._replace(pressures=C)
+        elif kind != "true":
+            bulk = (1 - _true(kind, F[0][0].dtype)) * e.mixed.rest / mesh.weights
     own = point_matrix.levels(mesh, A, bulk)
     more = _attached(e, x, s, kind)
     near = _symmetric(e, more)
@@ -425,10 +440,34 @@ def solve(
         # With unknown pressures the matrix has negative eigenvalues anyway.
         positive = jnp.vdot(dq, b) >= 0 if e.mixed is None else jnp.all(jnp.isfinite(dq))
         return dq, jnp.zeros((), jnp.int32), positive
+    if K.eliminates is not None:
+        return _one_of_both(e, K, b, tolerance, max_iterations)
     # A block-triangular preconditioner is not symmetric either.
     method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
     return dq, s.iterations, s.positive
+
+
+def _one_of_both(
+    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`solve` where a flag tells if pressures are eliminated: the other way has nothing to do, so it ends at once."""
+    n, flag = 3 * e.mesh.number_of_nodes, K.eliminates
+    motions = _motions(e, K)
+
+    def apply(v: jax.Array) -> jax.Array:
+        motion = e.free.columns(block_matrix.columns(v))
+        force = mixed_system.without_pressures(e.mesh, e.mixed, K.matrix, motion)
+        return flat_free(e, with_nodal_products(e, K, motion, force))
+
+    def fine(r: jax.Array) -> jax.Array:
+        return flat_free(e, motions(block_matrix.columns(r)))
+
+    alone, s = conjugate_gradients(apply, jnp.where(flag, b[:n], 0.0), fine, tolerance, max_iterations)
+    load = jnp.where(flag, 0.0, b)
+    both, t = stabilised_biconjugate_gradients(product(e, K), load, preconditioner(e, K), tolerance, max_iterations)
+    dq = both + jnp.concatenate([alone, jnp.zeros_like(b[n:])])
+    return dq, s.iterations + t.iterations, jnp.where(flag, s.positive, t.positive)
 
 
 def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:

@@ -7,7 +7,8 @@ untangled as a stable neo-Hookean body of the same moduli, whose energy is finit
 there.
 
 Where pressures are unknowns of their own, the solution is a saddle of the energy of both. With the pressures that are
-best for the positions it is a minimum again: so the positions are what is varied, and the pressures follow.
+best for the positions it is a minimum again: so the positions are what is varied, and the pressures follow. In
+quadratic elements a tangent without negative eigenvalues has them eliminated: it is positive then.
 
 Forces without an energy, such as friction, are held constant during each iteration. So they have an energy for that
 iteration, whose gradient at its beginning is the residual.
@@ -128,7 +129,8 @@ def _descend(problem: Problem, options: StepOptions, c: _Descent) -> _Descent:
     goal = 0.3 * options.tolerance / jnp.maximum(c.relative, 1e-300)
     forcing = jnp.clip(jnp.minimum(LINEAR_TOLERANCE, jnp.sqrt(c.relative)), jnp.minimum(goal, 0.5), 0.5)
     if _potential(problem).settled is not None:
-        forcing = jnp.minimum(forcing, _WITH_PRESSURES)
+        loose = definite & _potential(problem).eliminates
+        forcing = jnp.where(loose, forcing, jnp.minimum(forcing, _WITH_PRESSURES))
     dq, linear, positive = problem.solve(K, -c.r, forcing, MOST_LINEAR_ITERATIONS)
     slope = jnp.vdot(c.r, dq)
     usable = jnp.isfinite(slope) & (slope < 0) & (positive | definite)

@@ -114,3 +114,5 @@ class Potential(NamedTuple):
     settled: Callable[[jax.Array], jax.Array] | None = None
     #: How many of the unknowns are positions; None: all.
     positions: int | None = None
+    #: Whether a solve with a definite tangent eliminates the pressures: its direction may be as loose as without any.
+    eliminates: bool = False

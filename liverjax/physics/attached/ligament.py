@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Array, Content, Indices, Number, Numbers, param, struct
 from liverjax.mesh import locate, selection
@@ -55,8 +56,11 @@ class Ligament(Physics):
     def check(self, mesh: TetMesh, name: str) -> None:
         """Refuse wrong node numbers, a wrong length at rest, and fibres without a direction."""
         numbers = np.asarray(self.nodes)
-        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
-            raise InputError(f"{name} names no node or one beyond {mesh.number_of_nodes - 1}: renumber them")
+        if numbers.ndim != 2:
+            raise InputError(f"{name}.nodes has shape {numbers.shape}: give the nodes of each fibre in a column (n, m)")
+        selection.check_nodes(numbers.ravel(), mesh.number_of_nodes, f"{name}.nodes")
+        bounds.check_shape(f"{name}.weights", self.weights, numbers.shape)
+        bounds.check_shape(f"{name}.to", self.to, (3,))
         if (self.pre_tension is None) == (self.rest_length is None):
             raise InputError(f"{name} needs either pre_tension in N or rest_length in m: give one of them")
         if np.any(np.asarray(self._lengths(mesh)) <= 0):

@@ -53,12 +53,10 @@ class Membrane(Physics):
 
     def check(self, mesh: TetMesh, name: str) -> None:
         """Refuse triangles that are not in the mesh, a wrong number of thicknesses, and a law with directions."""
-        numbers = np.asarray(self.triangles)
-        if not numbers.size or numbers.max() >= mesh.number_of_vertices:
-            raise InputError(f"{name} names no node or one beyond {mesh.number_of_vertices - 1}: renumber them")
-        if np.shape(self.thickness) not in ((), (len(numbers),)):
-            shape = np.shape(self.thickness)
-            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one a triangle {len(numbers)}")
+        selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
+        if np.shape(self.thickness) not in ((), (len(self.triangles),)):
+            shape, count = np.shape(self.thickness), len(self.triangles)
+            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one a triangle {count}")
         layers.check(self.law, name)
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Membrane":

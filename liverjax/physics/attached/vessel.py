@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Number, param, struct
 from liverjax.laws import layers
@@ -71,10 +72,14 @@ class Vessel(Physics):
     def check(self, mesh: TetMesh, name: str) -> None:
         """Refuse elements that are not in the mesh, a wall thicker than the radius, and a law with directions."""
         numbers = np.asarray(self.element)
-        if not numbers.size or numbers.max() >= mesh.number_of_elements:
+        if numbers.ndim != 1 or not numbers.size or numbers.max() >= mesh.number_of_elements:
             raise InputError(
                 f"{name} crosses no element, or names one beyond {mesh.number_of_elements - 1}: mend its line"
             )
+        for key in ("enters", "leaves"):
+            bounds.check_shape(f"{name}.{key}", getattr(self, key), (4, len(numbers)))
+        for key in ("radius", "wall"):
+            bounds.check_shape(f"{name}.{key}", getattr(self, key), (), (len(numbers),))
         if self.wall is not None and np.any(np.asarray(self.wall) > np.asarray(self.radius)):
             raise InputError(
                 f"{name}.wall = {self.wall} m is thicker than the radius: leave wall out for a full section"

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from liverjax.core import history
+from liverjax.core import bounds, history
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, static, struct
@@ -96,12 +96,13 @@ class Obstacle(Physics):
         """Refuse an unknown shape, numbers that make no shape, and triangles that are not in the mesh."""
         if self.shape not in SHAPES:
             raise InputError(f"{name} shape = {self.shape!r} is not known: use {', '.join(SHAPES)}")
-        numbers = np.asarray(self.triangles)
-        if not numbers.size or numbers.max() >= mesh.number_of_nodes:
-            raise InputError(f"{name} names no triangle or a node beyond {mesh.number_of_nodes - 1}: give some")
+        selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         for key in ("radius", "half_angle", "friction"):
             if np.ndim(getattr(self, key, 0.0)):
                 raise InputError(f"{name}.{key} = {getattr(self, key)} must be one number: give one")
+        for key in ("position", "axis", "by"):
+            bounds.check_shape(f"{name}.{key}", getattr(self, key), (3,))
+        bounds.check_shape(f"{name}.stiffness", self.stiffness, (), (len(self.triangles),))
         if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
             raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
         if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):

@@ -153,14 +153,18 @@ class Mixed(VolumeStress):
         shares = [mesh.volumes * ((4 * mean + p) / self.rest + (p - mean) / self.shear) / 20 for p in own]
         return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
 
-    def settled(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
-        """Pressures (V,) [Pa] that balance volume ratios J: those of a solution there."""
+    def diagonal(self, mesh: TetMesh) -> jax.Array:
+        """Of `compliance` (V,) [m^3/Pa]."""
         none = jnp.zeros_like(self.before)
         if mesh.order == 1:
             share = jnp.stack(4 * [mesh.volumes * (2 / self.rest + 0.75 / self.shear) / 20])
         else:
-            share = jnp.asarray(basis(mesh.order).L ** 2, J.dtype) @ (mesh.weights / self.rest)
-        diagonal = given(none, mesh.tetrahedra.T, share)
+            share = jnp.asarray(basis(mesh.order).L ** 2, none.dtype) @ (mesh.weights / self.rest)
+        return given(none, mesh.tetrahedra.T, share)
+
+    def settled(self, mesh: TetMesh, J: jax.Array) -> jax.Array:
+        """Pressures (V,) [Pa] that balance volume ratios J: those of a solution there."""
+        none, diagonal = jnp.zeros_like(self.before), self.diagonal(mesh)
 
         def solve(apply: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
             return jax.scipy.sparse.linalg.cg(apply, b, tol=1e-14, maxiter=1000, M=lambda r: r / diagonal)[0]
