@@ -129,7 +129,7 @@ def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> st
     return f"{where} = {np.asarray(value).tolist() if np.ndim(value) else value}"
 
 
-def check_shape(where: str, value: object, *allowed: tuple[int, ...]) -> None:
+def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
     """Refuse an array of another shape than one of those allowed, in one sentence; None passes.
 
     Raises:

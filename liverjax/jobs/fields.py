@@ -174,7 +174,7 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
     if scene.named("obstacle"):
         contact = obstacle_forces(scene, result)
         for k in range(len(contact.force)):
-            add(f"obstacle.{k}", -np.asarray(contact.force[k]), "N")
+            add(f"obstacle.{k}", 0.0 - np.asarray(contact.force[k]), "N")
             add(f"obstacle.{k}", contact.displacement[k], "m")
             names.append(f"obstacle.{k}.depth_m")
             columns.append(np.asarray(contact.depth[k]))

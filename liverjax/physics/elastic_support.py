@@ -62,7 +62,7 @@ class ElasticSupport(Physics):
         history.check(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
-        if self.triangles is None:
+        if self.nodes is not None:
             selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
             bounds.check_shape(f"{name}.stiffness", self.stiffness, (), np.shape(self.nodes))
         else:

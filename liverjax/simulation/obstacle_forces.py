@@ -62,7 +62,8 @@ def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
         scene: as it was run.
         result: `Result` of `liverjax.simulate`, all steps stored.
     """
-    scene, found = prepared(scene), {}
+    scene = prepared(scene)
+    found: dict[str, jax.Array] = {}
     dt = 0.0 if scene.solve.dt is None else scene.solve.dt
     mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
     numbers = jnp.arange(1, len(result.positions) + 1)
@@ -71,7 +72,7 @@ def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
         def at(given: Any) -> jax.Array:
             k, x = given
             acting = physics.freeze(None, Step(mesh, x, k, scene.solve.steps, dt, False, None, free))
-            return -jnp.sum(acting.force(mesh, x, 1.0), axis=0)
+            return 0.0 - jnp.sum(acting.force(mesh, x, 1.0), axis=0)
 
         return jax.lax.map(at, (numbers, jnp.asarray(result.positions)))
 

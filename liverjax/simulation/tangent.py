@@ -441,7 +441,7 @@ def solve(
         positive = jnp.vdot(dq, b) >= 0 if e.mixed is None else jnp.all(jnp.isfinite(dq))
         return dq, jnp.zeros((), jnp.int32), positive
     if K.eliminates is not None:
-        return _one_of_both(e, K, b, tolerance, max_iterations)
+        return _one_of_both(e, K, K.eliminates, b, (tolerance, max_iterations))
     # A block-triangular preconditioner is not symmetric either.
     method = conjugate_gradients if e.conservative and e.mixed is None else stabilised_biconjugate_gradients
     dq, s = method(product(e, K), b, preconditioner(e, K), tolerance, max_iterations)
@@ -449,23 +449,23 @@ def solve(
 
 
 def _one_of_both(
-    e: Equations, K: Tangent, b: jax.Array, tolerance: Number, max_iterations: int
+    e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`solve` where a flag tells if pressures are eliminated: the other way has nothing to do, so it ends at once."""
-    n, flag = 3 * e.mesh.number_of_nodes, K.eliminates
-    motions = _motions(e, K)
+    n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
+    assert isinstance(A, PointMatrix)
 
     def apply(v: jax.Array) -> jax.Array:
         motion = e.free.columns(block_matrix.columns(v))
-        force = mixed_system.without_pressures(e.mesh, e.mixed, K.matrix, motion)
+        force = mixed_system.without_pressures(e.mesh, e.mixed, A, motion)
         return flat_free(e, with_nodal_products(e, K, motion, force))
 
     def fine(r: jax.Array) -> jax.Array:
         return flat_free(e, motions(block_matrix.columns(r)))
 
-    alone, s = conjugate_gradients(apply, jnp.where(flag, b[:n], 0.0), fine, tolerance, max_iterations)
+    alone, s = conjugate_gradients(apply, jnp.where(flag, b[:n], 0.0), fine, *limits)
     load = jnp.where(flag, 0.0, b)
-    both, t = stabilised_biconjugate_gradients(product(e, K), load, preconditioner(e, K), tolerance, max_iterations)
+    both, t = stabilised_biconjugate_gradients(product(e, K), load, preconditioner(e, K), *limits)
     dq = both + jnp.concatenate([alone, jnp.zeros_like(b[n:])])
     return dq, s.iterations + t.iterations, jnp.where(flag, s.positive, t.positive)
 
