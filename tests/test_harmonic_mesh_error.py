@@ -81,6 +81,6 @@ def test_ten_quadratic_elements_a_wave(wave, verified):
     order = float(np.log2(coarse[0] / fine[0]))
     assert 2.5 < order < 4.2 and fine[0] < 6e-3
     assert fine[1] < 1e-3 and fine[2] < 0.3
-    name = wave.__name__.replace("_", " ")
-    verified(f"{name} wave, ten quadratic elements a wave", "closed form", fine[0], 6e-3, order)
-    verified(f"{name} wave, ten quadratic elements a wave, with the mesh's estimate", "closed form", fine[1], 1e-3)
+    name = {plane: "plane wave", torsional: "torsional wave", about_a_sphere: "waves about a sphere"}[wave]
+    verified(f"{name}, ten quadratic elements a wave", "closed form", fine[0], 6e-3, order)
+    verified(f"{name}, ten quadratic elements a wave, with the mesh's estimate", "closed form", fine[1], 1e-3)

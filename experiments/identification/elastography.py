@@ -79,8 +79,9 @@ def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.nd
         G = waves_report.at_voxels(organ, drawn.modulus[f])
         exact = SOFT + (STIFF - SOFT) * part + 2j * np.pi * hertz * VISCOSITY
         known = np.isfinite(sd)
-        for name, off in (("storage", (G - exact).real), ("loss", (G - exact).imag)):
-            out[name].append(float(np.mean(np.abs(off)[known] < 1.645 * (np.abs(G) * sd)[known])))
+        off, allowed = (G - exact)[known], 1.645 * stiffness_map.sd_of_modulus(G, sd)[known]
+        out["storage"].append(float(np.mean(np.abs(off.real) < allowed.real)))
+        out["loss"].append(float(np.mean(np.abs(off.imag) < allowed.imag)))
     return out
 
 
@@ -92,6 +93,7 @@ def rows_of(organ, found, drawn, usual) -> list[dict]:
         place[:, :, [0, -1]] = False
         core = place & np.isfinite(inside)
         maps = [waves_report.at_voxels(organ, G)[core] for G in drawn.modulus]
+        sds = [stiffness_map.sd_of_modulus(G, inside[core]).real for G in maps]
         rows.append(
             {
                 "radius_m": None if label == 1 else CYLINDERS[label - 2][1],
@@ -101,7 +103,7 @@ def rows_of(organ, found, drawn, usual) -> list[dict]:
                 "standard_error_Pa": found.parts.standard_errors[:, k].real.tolist(),
                 "edges_farther_out_voxels": found.parts.farther[:, k].tolist(),
                 "map_median_Pa": [float(np.median(G.real)) for G in maps],
-                "map_sd_Pa": [float(np.median(np.abs(G) * inside[core])) for G in maps],
+                "map_sd_Pa": [float(np.median(sd)) for sd in sds],
                 "direct_median_Pa": [float(np.nanmedian(G.real[place])) for G in usual],
             }
         )

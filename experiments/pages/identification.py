@@ -93,8 +93,8 @@ def plate() -> str:
         f"{data['map_s']:.0f} s, with {data['unknowns']:,} unknowns at {len(hertz)} frequencies.",
         f"90 % intervals of the map hold the true storage modulus in {percent(min(cover['storage']))} to "
         f"{percent(max(cover['storage']))} of the voxels, and the loss modulus in {percent(min(cover['loss']))} to "
-        f"{percent(max(cover['loss']))}. The map knows nothing of edges: it is smooth there, and most voxels that its "
-        "intervals miss are near them.",
+        f"{percent(max(cover['loss']))}. The map is smooth at edges; there its deviation is that of a place known to a "
+        "brick.",
     ]
     return "\n".join(rows)
 

@@ -13,7 +13,7 @@ from fitting.waves import voxels
 from fitting.waves.elastography import Found, Organ
 from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
-from fitting.waves.stiffness_map import WaveMap
+from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -166,8 +166,8 @@ def _of_map(drawn: WaveMap) -> Content:
         "correlation_length_m": drawn.length,
         "chi2_per_component": drawn.chi2 / drawn.components,
         "discrepancy_reached": drawn.reached,
-        "part_of_variance_left": float(np.mean((drawn.sd / drawn.prior_sd) ** 2)),
-        "told_from_the_mean": float(np.mean(np.abs(drawn.exponent.real) > TOLD * drawn.sd)),
+        "part_of_variance_left": float(np.mean((drawn.posterior_sd / drawn.prior_sd) ** 2)),
+        "told_from_the_mean": float(np.mean(np.abs(drawn.exponent.real) > TOLD * drawn.sd.real)),
         "history": drawn.history,
         "run_time_s": drawn.seconds,
     }
@@ -254,14 +254,14 @@ def _write_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.nda
             return
         whole = np.stack([at_voxels(organ, G) for G in drawn.modulus])
         sd = at_voxels(organ, drawn.sd)
-        file["modulus"], file["sd_of_logarithm"] = whole, sd
-        file["sd"] = np.abs(whole) * sd
+        file["modulus"], file["sd_of_logarithm"], file["sd_of_loss_angle"] = whole, sd.real, sd.imag
+        file["sd"] = sd_of_modulus(whole, sd)
         file["draws_of_exponent"] = np.stack([at_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
         file["modulus"].attrs["unit"] = file["sd"].attrs["unit"] = "Pa"
 
 
 def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
-    data = {"sd_of_logarithm": drawn.sd}
+    data = {"sd_of_logarithm": drawn.sd.real, "sd_of_loss_angle": drawn.sd.imag}
     for hertz, G in zip(organ.field.frequencies, drawn.modulus, strict=True):
         data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
     mesh = organ.body.linear
@@ -272,11 +272,11 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
     """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
-    G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd)
+    G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd.real)
     panels = (
         ("storage modulus [kPa]", G.real / 1e3, "viridis"),
         ("loss modulus [kPa]", G.imag / 1e3, "viridis"),
-        ("sd of ln|G| and of the loss angle", sd, "magma"),
+        ("sd of ln|G|", sd, "magma"),
         ("direct inversion, storage [kPa]", usual[f].real / 1e3, "viridis"),
     )
     size = 1e3 * organ.field.spacing * np.array(organ.field.mask.shape)

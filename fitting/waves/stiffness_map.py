@@ -5,7 +5,11 @@ angle) is the mean of a complex nodal field (P,), the same for all frequencies. 
 prior of `fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number
 of equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. The
 deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by
-Gauss-Newton. The uncertainty comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value.
+Gauss-Newton.
+
+The uncertainty has two parts. One comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value. The
+other is the place of what varies. A field that is linear in the bricks shows a step as a slope, wherever in a brick the
+step is. So a place is known to a brick's side w, with the variance w^2/12, and c has |w dc/dx|^2/12 of it.
 """
 
 import time
@@ -37,9 +41,10 @@ class WaveMap(NamedTuple):
     """The map and its uncertainty."""
 
     exponent: np.ndarray  # c (P,) complex at the corners
-    sd: np.ndarray  # (P,) of its real and of its imaginary part
+    sd: np.ndarray  # (P,) complex: of its real part (logarithm of the size), and of its imaginary part (loss angle)
+    posterior_sd: np.ndarray  # (P,) of both, without the place of what varies
     prior_sd: np.ndarray  # (P,)
-    draws: np.ndarray  # (D, P) complex: samples of the posterior
+    draws: np.ndarray  # (D, P) complex: samples of the posterior, each displaced within a brick
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # the prior's, chosen
     length: float  # [m]
@@ -57,6 +62,7 @@ class Course(NamedTuple):
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex
     mean: scipy.sparse.csr_array  # (E, P): the corners' mean
+    slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over a brick's side, along x, y, z
     p: smooth.Prior
     length: float  # [m]
 
@@ -104,7 +110,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
         length: correlation length of the prior [m].
     """
     mean, p = _mean_of_corners(body), smooth.prior(body.linear, length)
-    return Course(m, waves, np.asarray(whole, complex), mean, p, length)
+    return Course(m, waves, np.asarray(whole, complex), mean, _changes_over_bricks(body, mean), p, length)
 
 
 def map_of(
@@ -137,11 +143,14 @@ def map_of(
     deviation = DEVIATIONS[point.k]
     c = deviation * course.field(point.z)
     before, after, departures = _spread(course, point, excess, draws)
+    slopes = np.stack([D @ c for D in course.slopes])
+    place = np.random.default_rng(1).uniform(-0.5, 0.5, (draws, 3)) @ slopes
     return WaveMap(
         exponent=c,
-        sd=after,
+        sd=_with_place(after, slopes.real) + 1j * _with_place(after, slopes.imag),
+        posterior_sd=after,
         prior_sd=before,
-        draws=c + departures,
+        draws=c + departures + place,
         modulus=course.whole[:, None] * np.exp(c),
         deviation=deviation,
         length=course.length,
@@ -153,11 +162,36 @@ def map_of(
     )
 
 
+def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Standard deviations [Pa] of storage (real part) and loss (imaginary part) of moduli G, by those of `WaveMap`."""
+    return np.hypot(G.real * sd.real, G.imag * sd.imag) + 1j * np.hypot(G.imag * sd.real, G.real * sd.imag)
+
+
+def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Standard deviations (P,) with a place that is known to a brick; slopes (3, P) are changes over a brick."""
+    return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
+
+
 def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
     tets = np.asarray(body.linear.tetrahedra)
     rows = np.repeat(np.arange(len(tets)), 4)
     shape = (len(tets), body.linear.number_of_nodes)
     return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
+
+
+def _changes_over_bricks(body: VoxelBody, mean: scipy.sparse.csr_array) -> tuple[scipy.sparse.csr_array, ...]:
+    """Change (P, P) of a field over a brick's side: at each corner the mean of its elements' slopes, by volume."""
+    tets, volumes = np.asarray(body.linear.tetrahedra), np.asarray(body.linear.volumes)
+    D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
+    gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
+    around = scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)
+    sides = np.ptp(np.asarray(body.linear.points)[tets[0]], axis=0)
+    rows, columns = np.repeat(np.arange(len(tets)), 4), tets.ravel()
+    of_elements = [
+        scipy.sparse.csr_array((side * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
+        for a, side in enumerate(sides)
+    ]
+    return tuple((around @ own).tocsr() for own in of_elements)
 
 
 def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
