@@ -35,6 +35,7 @@ from liverjax.physics.boundary import Displaced, Fixed, Traction
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.viscosity import Prony
+from liverjax.reduced.bias import reduced_bias
 from liverjax.reduced.estimate import reduced_error
 from liverjax.reduced.files import load_reduced, save_reduced
 from liverjax.reduced.model import ReducedModel, reduced_identity
@@ -91,6 +92,7 @@ __all__ = [
     "quadratic",
     "read_mesh",
     "reduce_scene",
+    "reduced_bias",
     "reduced_error",
     "reduced_identity",
     "reduced_positions",

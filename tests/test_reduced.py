@@ -9,8 +9,9 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
-from liverjax.reduced.correction import Learnt, correction_at, learnt_correction, stated_at
+from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
+from liverjax.reduced.run import _updated
 from liverjax.reduced.sampling import MOST_STATES, nonnegative_weights, sampled, states_of
 
 pytestmark = pytest.mark.quick_to_compile
@@ -105,7 +106,7 @@ def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
     rest = jnp.eye(3).reshape(9, 1)
 
     def energy(q):
-        F = as_matrix(rest + jnp.tensordot(q, model.slopes, axes=1))
+        F = as_matrix(rest + model.slopes @ q)
         return jnp.sum(model.weights * law.strain_energy(law.measures(F)))
 
     # A static step with no load but this force ends at q: the force of the run is the derivative of this energy.
@@ -128,6 +129,19 @@ def test_weights_give_all_forces_and_are_few():
     xi = nonnegative_weights(G, np.ones(200), 1e-8)
     assert np.all(xi >= 0) and np.count_nonzero(xi) <= 7
     assert np.allclose(G @ xi, G.sum(axis=1), rtol=0, atol=1e-8 * np.abs(G).sum(axis=1).max())
+
+
+def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
+    rng = np.random.default_rng(7)
+    half, moved = rng.normal(size=(6, 6)), rng.normal(size=6)
+    inverse, stiffness = np.eye(6), half @ half.T + np.eye(6)
+    change = stiffness @ moved
+    found = np.asarray(_updated(jnp.asarray(inverse), jnp.asarray(moved), jnp.asarray(change)))
+    # The secant condition, to roundoff; Dennis, Schnabel 1983, theorem 9.2.1: positive where work is.
+    assert np.allclose(found @ change, moved, rtol=0, atol=1e-12 * np.abs(moved).max())
+    assert np.array_equal(found, found.T) and np.linalg.eigvalsh(found)[0] > 0
+    assert np.array_equal(_updated(jnp.asarray(inverse), jnp.asarray(moved), -jnp.asarray(change)), inverse)
+    assert np.array_equal(_updated(jnp.asarray(inverse), jnp.zeros(6), jnp.zeros(6)), inverse)
 
 
 def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained):
@@ -182,6 +196,16 @@ def test_a_polynomial_of_the_coordinates_is_learnt():
     assert learnt_correction(Learnt(q[:5], _missing(q[:5], fields), moved[:5], volumes, 0.1)) is None
 
 
+def test_differences_count_in_proportion_to_the_motion_of_their_run():
+    rng = np.random.default_rng(8)
+    A, parts, moved = rng.normal(size=(20, 5, 4)), rng.normal(size=(20, 5, 3)), np.geomspace(1e-3, 1.0, 20)
+    factors, _ = _least_squares(A, parts, moved, np.arange(20) % 4).without()
+    by_motion = moved[:, None, None]
+    exact = np.linalg.lstsq((A / by_motion).reshape(100, 4), (parts / by_motion).reshape(100, 3), rcond=None)[0]
+    # The ridge of 1e-6 leaves out about as much.
+    assert np.allclose(factors, exact, rtol=0, atol=1e-4 * np.abs(exact).max())
+
+
 def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
     """A cubic term, which no polynomial of degree two has, leaves an error to state; runs are of unlike sizes."""
     rng = np.random.default_rng(4)
@@ -233,6 +257,29 @@ def test_rows_of_the_largest_stated_errors_are_run():
 
 
 @pytest.mark.slow
+def test_the_bias_of_identified_numbers_is_stated(trained):
+    """Data of a full run with known numbers; the reduced model fits them, and one more full run states how far off."""
+    scene, model = trained
+    model, true = replace(model, correction=None), np.array([800.0, 0.35])
+    names = ("law.mu", "viscosity.ratios.0")
+
+    def positions(numbers):
+        own = lj.with_parameters(scene, dict(zip(names, numbers, strict=True)))
+        return lj.reduced_positions(model, own, lj.simulate_reduced(model, own))
+
+    data = lj.simulate(lj.with_parameters(scene, dict(zip(names, true, strict=True)))).check().positions
+    both = jax.jit(lambda p: (positions(p), jax.jacfwd(positions)(p)))
+    p = jnp.asarray(true * [1.1, 0.9])
+    for _ in range(6):
+        x, J = both(p)
+        p = p - jnp.linalg.lstsq(J.reshape(-1, 2) * jnp.asarray(true)[None], jnp.ravel(x - data))[0] * true
+    bias = lj.reduced_bias(model, scene, dict(zip(names, p, strict=True)), lambda x: x)
+    off = np.asarray(p) - true
+    assert np.all(np.abs(off) > 1e-3 * true)  # five modes are too stiff: there is a bias
+    assert np.all(np.abs(off - [float(bias[name]) for name in names]) < 0.2 * np.abs(off))
+
+
+@pytest.mark.slow
 def test_derivatives_and_lanes(trained):
     scene, model = trained
 
@@ -247,6 +294,8 @@ def test_derivatives_and_lanes(trained):
     errors = np.abs((lanes[:7] - lanes[7:]) / (2 * steps) / found - 1)
     # Second order, then the run's tolerance: the curve falls and rises.
     assert errors.min() < 1e-7 and errors[0] > 1e3 * errors.min() and errors[-1] > errors.min()
+    second = (jax.grad(tip)(800.1) - jax.grad(tip)(799.9)) / 0.2
+    assert jax.hessian(tip)(800.0) == pytest.approx(float(second), rel=1e-5)
 
 
 def test_another_scene_and_other_physics_are_refused(trained, tmp_path):

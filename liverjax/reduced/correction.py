@@ -3,7 +3,8 @@
 The reduced model is run with the rows of its training, whose full runs are known. The difference is a sum of fields,
 and the part of each field is a polynomial of the coordinates: linear in all, quadratic in the first few. Where there is
 time, the rates of the coordinates count too. The numbers are those of least squares with a small ridge (closures of
-reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301).
+reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301). Differences count in
+proportion to the largest motion of their run.
 
 Groups of runs are left out in turn. How far off the runs left out are decides how many coordinates have products. The
 same runs tell the error of the corrected motion: the logarithm of it is linear in the logarithms of three numbers that
@@ -140,7 +141,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
         A = np.asarray(jax.vmap(of_run)(jnp.asarray(runs.q)))
         if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # more terms than half of the states tell nothing
             break
-        sums = _least_squares(A, parts, group)
+        sums = _least_squares(A, parts, runs.moved, group)
         out = _left_out(A, sums, group, runs.missing, fields.reshape(-1, *runs.missing.shape[2:]) / roots)
         if not (middle := float(np.median(out.off / runs.moved))) < least:
             continue
@@ -216,13 +217,15 @@ class _LeastSquares(NamedTuple):
         return np.linalg.solve(H, self.products[kept].sum(axis=0)) / self.size[:, None], inverse
 
 
-def _least_squares(A: np.ndarray, parts: np.ndarray, group: np.ndarray) -> _LeastSquares:
-    """Of terms A (R, T, k) and parts (R, T, m) of runs in groups (R,)."""
+def _least_squares(A: np.ndarray, parts: np.ndarray, moved: np.ndarray, group: np.ndarray) -> _LeastSquares:
+    """Of terms A (R, T, k) and parts (R, T, m) of runs in groups (R,), each over its largest displacement (R,)."""
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size = np.where(size > 0, size, 1.0)
+    weight = (1 / moved / np.sqrt(np.mean(1 / moved**2)))[:, None, None]
     squares, products = [], []
     for g in range(group.max() + 1):
-        own, y = (A[group == g] / size).reshape(-1, A.shape[2]), parts[group == g].reshape(-1, parts.shape[2])
+        in_group = group == g
+        own = (weight[in_group] * A[in_group] / size).reshape(-1, A.shape[2])
         squares.append(own.T @ own)
-        products.append(own.T @ y)
+        products.append(own.T @ (weight[in_group] * parts[in_group]).reshape(-1, parts.shape[2]))
     return _LeastSquares(np.stack(squares), np.stack(products), size, A.shape[0] * A.shape[1])

@@ -30,7 +30,9 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
 
     with whole(Path(file)) as new, h5py.File(new, "w") as out:
         for name, unit in _UNITS.items():
-            out[name] = np.asarray(getattr(model, name))
+            array = np.asarray(getattr(model, name))
+            # In files the modes come first.
+            out[name] = np.moveaxis(array, -1, 0) if name == "slopes" else array
             out[name].attrs["unit"] = unit
         if model.correction is not None:
             for name in _LEARNT:
@@ -52,7 +54,9 @@ def load_reduced(file: str | Path) -> ReducedModel:
 
     try:
         with h5py.File(file, "r") as stored:
-            arrays = {name: jnp.asarray(stored[name][()]) for name in _UNITS}
+            arrays = {name: stored[name][()] for name in _UNITS}
+            arrays["slopes"] = np.ascontiguousarray(np.moveaxis(arrays["slopes"], 0, -1))
+            arrays = {name: jnp.asarray(array) for name, array in arrays.items()}
             ranges = {name: jnp.asarray(value[()]) for name, value in stored.get("ranges", {}).items()}
             identity = str(stored.attrs["identity"])
             return ReducedModel(**arrays, ranges=ranges, correction=_correction(stored), identity=identity)

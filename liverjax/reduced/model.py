@@ -33,7 +33,7 @@ class ReducedModel:
     """n modes and S points of one scene; numbers of its law, viscosity and loads stay free."""
 
     modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
-    slopes: jax.Array = param("1/m", "gradients of the modes at the points (n, 9, S), row by row")
+    slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), row by row")
     weights: jax.Array = param("m^3", "reference volume that a point stands for (S,), not negative")
     points: jax.Array = param("1", "number q E + e of point q of element e (S,)")
     ranges: dict[str, Any] = param("1", "parameters of the training: name -> lowest and highest value")
@@ -60,7 +60,7 @@ def as_matrix(flat: jax.Array) -> Matrix:
 def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
     """The model of these modes (n, V, 3) that takes the stress at every point: Galerkin's projection."""
     mesh = scene.mesh
-    slopes = jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes)
+    slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
     w = mesh.weights.ravel()
     return ReducedModel(
         modes=modes,

@@ -3,7 +3,7 @@
 import numpy as np
 
 #: The most rows and columns whose products are decomposed; of more rows, as many are taken evenly.
-MOST_PRODUCTS = 5000
+MOST_PRODUCTS = 6000
 
 
 def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:

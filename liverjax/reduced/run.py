@@ -74,7 +74,7 @@ class _Equations(NamedTuple):
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
-    spread: jax.Array | None  # sizes of the slopes (n, 9, S) [1/m] where a part of the body is moved
+    spread: jax.Array | None  # sizes of the slopes (9, S, n) [1/m] where a part of the body is moved
     noise: jax.Array  # size of forces whose roundoff is the tolerance [N]: no load leaves only these
 
 
@@ -90,7 +90,7 @@ def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
 
 
 def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
-    return e.gradient + jnp.tensordot(q, e.model.slopes, axes=1)
+    return e.gradient + e.model.slopes @ q
 
 
 def _stresses(solid: Solid, F: jax.Array) -> jax.Array:
@@ -104,18 +104,18 @@ def _noise(model: ReducedModel, scene: Scene) -> jax.Array:
     assert isinstance(own, Elasticity)
     rest = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)).astype(model.slopes.dtype)
     P = jax.jvp(lambda F: _stresses(Elastic(law=own.law), F), (rest,), (jnp.zeros_like(rest).at[0].set(1.0),))[1]
-    force = jnp.linalg.norm(jnp.tensordot(model.slopes, model.weights[None] * P, axes=2))
+    force = jnp.linalg.norm(jnp.tensordot(model.weights[None] * P, model.slopes, axes=2))
     return jax.lax.stop_gradient(20 * float(np.finfo(np.float64).eps) / scene.solve.tolerance * force)
 
 
 def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Out-of-balance forces (n,) and the size of all forces, with the deformation gradients F (9, S) of q."""
     P = _stresses(e.acting, F)
-    internal = jnp.tensordot(e.model.slopes, e.model.weights[None] * P, axes=2)
+    internal = jnp.tensordot(e.model.weights[None] * P, e.model.slopes, axes=2)
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
         # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
-        size = size + jnp.linalg.norm(jnp.tensordot(e.spread, e.model.weights[None] * jnp.abs(P), axes=2))
+        size = size + jnp.linalg.norm(jnp.tensordot(e.model.weights[None] * jnp.abs(P), e.spread, axes=2))
     if e.mass is not None:
         inertia = e.mass @ _kinematics(e, q).acceleration
         r, size = r + inertia, size + jnp.linalg.norm(inertia)
@@ -132,9 +132,8 @@ def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
             for c in range(3):
                 A[3 * r + i][3 * c + j] = A[3 * c + j][3 * r + i] = jnp.broadcast_to(K[r][c], F.shape[1:])
     moduli = e.model.weights[None, None] * jnp.stack([jnp.stack(row) for row in A])
-    AB = jnp.sum(moduli[None] * B[:, None], axis=2)
-    n = len(B)
-    elastic = B.reshape(n, -1) @ AB.reshape(n, -1).T
+    AB = jnp.sum(moduli[..., None] * B[None], axis=1)
+    elastic = jnp.tensordot(B, AB, axes=((0, 1), (0, 1)))
     if e.mass is None:
         return elastic
     return elastic + FACTOR["newmark" if e.newmark else "euler"] / e.dt**2 * e.mass
@@ -164,7 +163,19 @@ class _ReducedIterate(NamedTuple):
 
 
 #: An iteration that leaves more than this part of the residual calls for the tangent at hand, which costs ten of them.
-_LITTLE_GAIN = 0.5
+_LITTLE_GAIN = 0.95
+
+
+def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
+    """The inverse that fits the change of the forces along the last motion; it stays symmetric, and positive if it was.
+
+    Broyden, Fletcher, Goldfarb, Shanno (1970). Where forces fall along the motion, no positive one fits: it is kept.
+    """
+    work, towards = moved @ change, inverse @ change
+    seen = work > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(change)
+    per_work = jnp.where(seen, 1 / jnp.where(seen, work, 1.0), 0.0)
+    half = jnp.outer(moved, per_work * (towards - 0.5 * (1 + per_work * (change @ towards)) * moved))
+    return inverse - half - half.T
 
 
 def _judged(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -177,19 +188,16 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: _Equations, at: _ReducedIterate) -> _ReducedIterate:
-    """One iteration with the inverse at hand, which is then updated with the new forces (Broyden 1965)."""
+    """One iteration with the inverse at hand, which is then updated with the new forces."""
     dq = at.inverse @ at.r
-    dF = jnp.tensordot(dq, e.model.slopes, axes=1)
+    dF = e.model.slopes @ dq
     # Halved until no sampled point is inverted, six times at most.
     part = jax.lax.while_loop(
         lambda part: (part > 0.02) & ~_upright(at.F - part * dF), lambda part: 0.5 * part, jnp.ones((), dq.dtype)
     )
     q, F = at.q - part * dq, at.F - part * dF
     r, size = _judged(e, q, F)
-    moved, change = -part * dq, r - at.r
-    row = moved @ at.inverse
-    seen = row @ change
-    inverse = at.inverse + jnp.outer((moved - at.inverse @ change) / jnp.where(seen == 0, 1.0, seen), row)
+    inverse = _updated(at.inverse, -part * dq, r - at.r)
     # An old inverse may lead astray: such a step is not taken.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
@@ -202,8 +210,38 @@ def _corrected(e: _Equations, at: _ReducedIterate) -> _ReducedIterate:
 def _newton(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse: jax.Array) -> _Found:
     """The coordinates at the end of a step, from the inverse of the step before (zeros: none yet).
 
-    The tangent is taken anew only where the iterations gain little. Derivatives are those of the solution.
+    Derivatives are those of the solution.
     """
+    arrays, tree = jax.tree.flatten((e, tolerance, inverse))
+
+    def solve(*arrays: jax.Array) -> _Found:
+        return _solved(newmark, most, *jax.tree.unflatten(tree, arrays))
+
+    found: _Found = _lane_by_lane(solve)(*arrays) if jax.default_backend() == "cpu" else solve(*arrays)
+    return found
+
+
+def _lane_by_lane(function: Callable) -> Callable:
+    """The function of arrays, with lanes of vmap one by one: on a CPU all of them would wait for the slowest, and for
+    the tangent that any one needs. As `jax.custom_batching.sequential_vmap`, which fails in second derivatives."""
+    own = jax.custom_batching.custom_vmap(function)
+
+    @own.def_vmap
+    def lanes(size: int, batched: list[bool], *arrays: jax.Array) -> tuple[Any, Any]:
+        with_lanes = [a for a, b in zip(arrays, batched, strict=True) if b]
+
+        def one(lane: list[jax.Array]) -> Any:
+            left = iter(lane)
+            return own(*(next(left) if b else a for a, b in zip(arrays, batched, strict=True)))
+
+        out = jax.lax.map(one, with_lanes) if with_lanes else function(*arrays)
+        return out, jax.tree.map(lambda _: bool(with_lanes), out)
+
+    return own
+
+
+def _solved(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse: jax.Array) -> _Found:
+    """Newton's method with an inverse that is kept; the tangent is taken anew only where the iterations gain little."""
     e = e._replace(newmark=newmark)
 
     def unfinished(at: _ReducedIterate) -> jax.Array:
@@ -221,8 +259,10 @@ def _newton(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse:
     if e.motion is not None and not newmark:
         # A parabola through the last coordinates. Accelerations of Newmark's method ring: they foretell nothing.
         start = start + e.dt**2 * e.motion.acceleration
-    start = jnp.where(_upright(_deformation(e, start)), start, e.q)
-    F, none = _deformation(e, start), jnp.zeros((), jnp.int32)
+    foretold, none = _deformation(e, start), jnp.zeros((), jnp.int32)
+    good = _upright(foretold)
+    start = jnp.where(good, start, e.q)
+    F = jax.lax.cond(good, lambda: foretold, lambda: _deformation(e, e.q))
     r, size = _judged(e, start, F)
     begin = _ReducedIterate(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
     at = inner(begin)
@@ -288,7 +328,7 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     """What a run begins with: coordinates, memory, motion at rest, an empty inverse, mass matrix. Without inertia
     motion and mass are None."""
-    n, S = model.slopes.shape[0], model.weights.shape[0]
+    n, S = model.number_of_modes, model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
     inverse = jnp.zeros((n, n), q.dtype)
     memory = None if scene.viscosity is None else initial_history(scene.viscosity, S, q.dtype)

@@ -22,8 +22,8 @@ from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 
-#: The most states whose forces are taken: memory and time grow with them and their square.
-MOST_STATES = 120
+#: The most states whose forces are taken: memory and time grow with them.
+MOST_STATES = 240
 #: States whose forces move less than this part of the largest coordinate are left out: roundoff [1].
 LEAST_MOTION = 1e-9
 
@@ -55,7 +55,7 @@ def sampled(
     points = np.flatnonzero(xi)
     return replace(
         whole,
-        slopes=whole.slopes[:, :, points],
+        slopes=whole.slopes[:, points],
         weights=whole.weights[points] * xi[points],
         points=whole.points[points],
     )
@@ -90,14 +90,14 @@ def _contributions(whole: ReducedModel, scene: Scene, q: jax.Array, times: jax.A
 
     def advance(memory: Any, given: tuple) -> tuple:
         k, own = given
-        F = as_matrix(F0[k if len(F0) > 1 else 0] + jnp.tensordot(own, whole.slopes, axes=1))
+        F = as_matrix(F0[k if len(F0) > 1 else 0] + whole.slopes @ own)
         acting = solid.freeze(memory, step)
         P = jnp.stack([entry for row in acting.stress(F) for entry in row])
         return solid.advance(memory, acting, End(points, F, None)), P
 
     P: jax.Array
     _, P = jax.lax.scan(advance, memory, (jnp.arange(len(q)), q))
-    return jnp.sum(whole.slopes[None] * (whole.weights[None, None] * P[times])[:, None], axis=2)
+    return jnp.einsum("kip,ipn->knp", whole.weights[None, None] * P[times], whole.slopes)
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
