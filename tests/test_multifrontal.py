@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -120,6 +121,25 @@ def test_other_ways_where_the_first_fails(monkeypatch):
     for other in (single, pivoted):
         assert np.linalg.norm(other - double) < 1e-11 * np.linalg.norm(double)
         assert not np.array_equal(other, double)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_unknowns(verified):
+    """A cube of 16 quadratic cells a side at 60 Hz: one factor of 1 GB, in single precision and refined."""
+    mesh = lj.quadratic(lj.shapes.box((0.08, 0.08, 0.08), (16, 16, 16)))
+    body = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=3000.0, bulk=3e4),
+        viscosity=lj.Prony(ratios=jnp.array([0.3]), relaxation_times=jnp.array([0.003])),
+        body=lj.Body(density=1000.0),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_min"], by=jnp.array([1e-4, 0.0, 0.0])),),
+    )
+    begin = time.process_time()
+    residual = float(lj.harmonic(body, [60.0]).check().residual[0])
+    seconds = time.process_time() - begin  # of all cores, with compilation
+    assert sum(factor.nbytes for factor in sparse._factors.values()) < 1.2e9
+    assert residual < 1e-12 and seconds < 120
+    verified("104,544 unknowns of harmonic motion, residual", "balance of forces", residual, 1e-12, cpu_s=seconds)
 
 
 ONE_CORE = """
