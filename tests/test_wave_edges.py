@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from experiments.sources import cylinders_in_waves
 from fitting.reports import waves_report
@@ -72,6 +73,49 @@ def test_sheared_layers_are_in_balance():
     # The one inner corner has three rows of its kink. They are integrals over parts that are planes in an eighth of an
     # element: what is left of them is of that order. All others are exact.
     assert found.kinks > 3 and left[-4] < 1e-12 * size and left[-1] < size / 8
+
+
+def layers():
+    """Two layers whose edge is at x = 3.3 voxels, its distance (V,), their equations and moduli."""
+    body = voxels.voxel_body(np.ones((7, 5, 5), bool), np.ones(3))
+    phi = np.asarray(body.mesh.points)[:, 0] - 3.3
+    m = edges.region_matrices(balance.matrices(body, DENSITY), body, DENSITY, np.stack([-phi, phi]))
+    return body, phi, m, np.array([3000.0 + 0j, 9000.0 + 0j])
+
+
+def test_kinks_are_free_of_the_measurement():
+    """Sheared layers, without noise: the kinks come out by themselves, with an amplitude of 1 voxel."""
+    body, phi, m, G = layers()
+    u = np.zeros((body.mesh.number_of_nodes, 3), complex)
+    u[:, 1] = 2.0 * phi - np.abs(phi)
+    here = regions._state_of_regions(m, G, 0.0, u.ravel(), 1e-3).here
+    kinks = here.motion[u.size :].reshape(-1, 3)
+    # What is left of chi^2 (8) is of the quadrature in an eighth of an element; kinks of 0 would leave 4e6.
+    assert here.chi2 < 100 and abs(np.median(kinks[:, 1]) - 1) < 0.1
+
+
+def test_pressures_jump_at_edges():
+    """Stretched along x and pressed along y by the same amount, layers need pressures that differ by 2 (G2 - G1)."""
+    body, _, m, G = layers()
+    X = np.asarray(body.mesh.points)
+    u = np.stack([X[:, 0], -X[:, 1], 0 * X[:, 0]], axis=1).ravel()
+    forces = (m.rows(G, 0.0) @ np.concatenate([u, np.zeros(m.kinks)])).real
+    p = np.linalg.lstsq(m.forces.toarray(), forces, rcond=None)[0]
+    same = m.forces.toarray().reshape(len(forces), 2, -1).sum(axis=1)
+    continuous = same @ np.linalg.lstsq(same, forces, rcond=None)[0]
+    left = [np.linalg.norm(forces - own) / np.linalg.norm(forces) for own in (m.forces @ p, continuous)]
+    assert left[0] < 0.01 and left[1] > 0.3, left
+
+
+def test_small_labels_keep_their_volume():
+    """Smoothing alone would take a good part of a ball of 2 voxels; volumes are counted between the voxels."""
+    grid = np.stack(np.meshgrid(*[np.arange(11)] * 3, indexing="ij"), axis=-1)
+    labels = 1 + (np.linalg.norm(grid - 5.0, axis=-1) < 2.1)
+    body = voxels.voxel_body(np.ones(labels.shape, bool), np.ones(3))
+    s, above = edges.places(labels, body, np.array([1, 2])), np.zeros(labels.shape)
+    above[tuple(body.voxel.T)] = s[1] - s[0]
+    fine = ndimage.zoom(above, 8, order=1, grid_mode=True, mode="grid-constant")
+    assert np.sum(fine > 0) / 8**3 == pytest.approx(np.sum(labels == 2), rel=0.03)
 
 
 def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
