@@ -62,6 +62,34 @@ def test_effectivity_against_a_finer_mesh(order, cells, by, verified):
     verified(f"mesh error, order {order}, {cells} cells", "finer meshes", abs(effectivity - 1), 1.0)
 
 
+@pytest.mark.slow
+def test_a_quadratic_body_that_has_come_to_rest_has_the_estimate_of_one_at_rest():
+    """By Newmark's method, which begins with forces over masses; functions of order 3 have none.
+
+    Half of the stiffness relaxes, so the body at rest has the other half.
+    """
+    mesh = lj.quadratic(lj.shapes.box((0.02, 0.01, 0.01), (2, 1, 1)))
+    law = lj.laws.NeoHookean(mu=800.0, bulk=1600.0)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=law,
+        viscosity=lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.02])),
+        body=lj.Body(density=1000.0, gravity=(1.0, 0.0, 0.0)),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        solve=lj.Solve(kind="dynamic", integrator="newmark", dt=0.01, steps=300),
+    )
+    still = replace(scene, law=lj.laws.scaled(law, 0.5), viscosity=None, solve=lj.Solve())
+    moved = []
+    for each in (scene, still):
+        result = lj.simulate(each, mesh_error=True).check()
+        assert bool(result.mesh_error.found.all())
+        # Newmark's method does not damp the fastest swings: the mean of the last hundred steps.
+        moved.append((result.positions[-100:].mean(axis=0), result.mesh_error.positions[-100:].mean(axis=0)))
+    (x, change), (expected, its) = moved
+    assert np.abs(x - expected).max() < 1e-3 * np.abs(expected - mesh.points).max()
+    assert np.abs(change - its).max() < 0.05 * np.abs(its).max()
+
+
 def test_mesh_error_refuses_what_it_cannot_say():
     scene = _pull(1, 1)
     with pytest.raises(lj.InputError, match="leave start out"):

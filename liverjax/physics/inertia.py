@@ -34,7 +34,10 @@ class Inertia(Physics):
         acceleration = None
         if self.integrator == "newmark":
             mass = self.density * nodal_volumes(start.mesh)
-            acceleration = start.free.vectors(-start.force()) / mass[:, None]
+            # Functions of order 3, of the mesh's estimate, have no mass: they follow the others at once.
+            has_mass = (mass > 0)[:, None]
+            forces = start.free.vectors(-start.force())
+            acceleration = jnp.where(has_mass, forces / jnp.where(has_mass, mass[:, None], 1.0), 0.0)
         return Motion(jnp.zeros_like(start.x), acceleration)
 
     def freeze(self, memory: Motion, step: Step) -> "Moving":

@@ -47,7 +47,9 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
         f"displacement ({size:.3g} m)"
     )
     if not np.all(np.asarray(result.mesh_error.found)):
-        return f"{said}; at some steps it turns elements inside out: the mesh is too coarse to say more"
+        return (
+            f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse to say more"
+        )
     if error <= _SMALL * size:
         return said
     return f"{said}: take {'order = 2 in [mesh], or a finer mesh' if scene.mesh.order == 1 else 'a finer mesh'}"

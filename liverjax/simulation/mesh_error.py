@@ -9,7 +9,7 @@ found. With those of one solve a quarter of a flat punch's force seemed to be mi
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
 moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds
 of the error, so du is multiplied by 1.5. It leaves out the errors of the body's shape, of the time steps and of the
-fluid's pressures.
+fluid's pressures. Cubic functions have weight and no mass: in a body's free fall du is too large.
 """
 
 from collections.abc import Callable
@@ -42,6 +42,7 @@ from liverjax.simulation.equations import (
     residual,
     unknowns,
 )
+from liverjax.solvers.krylov import true_residual
 from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
@@ -171,7 +172,11 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
     def solved(q: jax.Array) -> _Solved:
         f = forces(e, q, one)
         K = tangent.tangent(e, f.pressure, f.x, one)
-        return tangent.solve(e, K, -residual(e, q, one)[0], tolerance, MOST_LINEAR_ITERATIONS)
+        load = -residual(e, q, one)[0]
+        dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
+        # An iteration may break off without a word.
+        ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
+        return dq, iterations, positive & ended
 
     if not any(a.kinked for a in e.nodal):
         return q, solved(q)
