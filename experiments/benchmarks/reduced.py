@@ -359,7 +359,7 @@ def baselines(model: lj.ReducedModel, scene: lj.Scene) -> list[dict[str, Any]]:
         "corotational, elastic": timed(lambda s: corotational(s, DT, s.solve.steps), elastic, rounds=1),
         "linear, precomputed inverse": _precomputed(elastic),
     }
-    small, small_time = timed(lambda s: lj.simulate_reduced(model, s), loosely(plain), rounds=5)
+    small, small_time = timed(lambda s, model: lj.simulate_reduced(model, s), loosely(plain), model, rounds=5)
     back()
     rivals["hyperelastic, full"] = (hyper.positions, hyper_time)
     rivals["viscous, reduced"] = (lj.reduced_positions(model, plain, small), small_time)
