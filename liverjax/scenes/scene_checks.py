@@ -14,7 +14,7 @@ from liverjax.physics.base import Physics
 from liverjax.physics.loads import Traction
 from liverjax.physics.prescribed import Displaced, free_places
 from liverjax.physics.sliding_support import SlidingSupport
-from liverjax.physics.volumes.mixed import check as check_mixed_law
+from liverjax.physics.volumes.mixed import check_mixed_law
 from liverjax.scenes.region_checks import check_region_elements, check_region_numbers
 from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Body, Scene

@@ -35,7 +35,7 @@ from liverjax.tensors.matrices import Matrix, cofactor, determinant, scale_matri
 from liverjax.tensors.places import given, taken
 
 
-def check(law: Law, name: str = "[solve] volumetric = 'mixed'") -> None:
+def check_mixed_law(law: Law, name: str = "[solve] volumetric = 'mixed'") -> None:
     """Refuse a law whose pressure cannot be an unknown of its own.
 
     Raises:
