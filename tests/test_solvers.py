@@ -193,6 +193,31 @@ def test_a_guess_takes_up_what_the_last_steps_foretold():
     assert taken[:2] == more[:2] and all(a < b for a, b in zip(taken[3:], more[3:], strict=True))
 
 
+def test_a_second_derivative_of_steps_is_right_or_nan_never_another_number():
+    """Two steps in a loop, each the root of q^3 + a q = 1 + q_before / 10."""
+
+    def end(a):
+        def step(before, _):
+            method = Problem(
+                residual=lambda q, s: (q**3 + a * q - 1 - before / 10, jnp.ones(()), None),
+                tangent=lambda q, s, by, near: 3 * q**2 + a,
+                solve=lambda K, b, tolerance, most: (b / K, jnp.ones((), jnp.int32), jnp.array(True)),
+                preconditioner=lambda K: lambda r: r / K,
+                moved=False,
+                numbers=(a, before),
+            )
+            return step_cutting.solve(method, before, StepOptions(tolerance=1e-14))[0], None
+
+        return jax.lax.scan(step, jnp.full(1, 0.4), None, length=2)[0][0]
+
+    a, slope = jnp.asarray(2.0), jax.grad(end)
+    differences = (slope(a + 1e-4) - slope(a - 1e-4)) / 2e-4  # off by 1e-8, the square of the width
+    for second in (jax.jacfwd(jax.jacfwd(end)), jax.grad(jax.jacfwd(end))):
+        assert np.isclose(second(a), differences, rtol=1e-7)
+    for second in (jax.hessian(end), jax.grad(slope)):
+        assert np.isnan(second(a)) or np.isclose(second(a), differences, rtol=1e-7)
+
+
 def test_lanes_do_not_disturb_each_other():
     p = jnp.array([0.1, jnp.nan, 20.0])
     x, s = jax.vmap(_solve)(p)

@@ -67,6 +67,7 @@ def problem_of(e: Equations) -> Problem:
         kinks=any(a.kinked for a in e.nodal),
         beside=_flowing(e),
         potential=potential,
+        numbers=e,
     )
 
 

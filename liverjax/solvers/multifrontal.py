@@ -104,7 +104,8 @@ def fronts(A: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]
     ends = np.searchsorted(
         node[order], np.arange(max(node.max(initial=0), max(g.max(initial=0) for g, _ in groups)) + 2)
     )
-    none, found = np.zeros(0, int), []
+    none = np.zeros(0, int)
+    found: list[Front] = []
     each = [np.concatenate([order[ends[v] : ends[v + 1]] for v in nodes] or [none]) for nodes, _ in groups]
     when = np.empty(len(node), int)
     order_of = np.concatenate(each)

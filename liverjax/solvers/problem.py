@@ -95,6 +95,8 @@ class Problem(NamedTuple):
     kinks: bool = False
     #: What a step that cannot be followed is minimised with; None: it is not.
     potential: "Potential | None" = None
+    #: A pytree of all numbers that r depends on, beside q and s: what a root has derivatives by.
+    numbers: Any = None
 
 
 class Potential(NamedTuple):

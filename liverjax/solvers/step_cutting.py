@@ -201,8 +201,23 @@ def _with_derivative(
             return differentiable_solve(matvec, b, problem.preconditioner(K), *limits, known), ()
         return symmetric_solve(linear, y, lambda b, earlier: problem.adjoint(K, b, *limits, earlier), limits[0])
 
-    root, hints = jax.lax.custom_root(lack, (both, last), lambda _, u: u, tangent_solve)
+    root, hints = jax.lax.custom_root(lack, (both, last), lambda _, u: (_guarded(problem, u[0]), u[1]), tangent_solve)
     return root[:n], beside if lacking is None else root[n:], hints
+
+
+def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
+    """q, whose derivative is NaN if it is ever taken through this function, which a correct derivative never does.
+
+    Up to jax 0.10 the derivative of a loop's derivative in reverse mode forgets the rule by which a root is
+    differentiated. It would take the root for a constant, and give a wrong number without a word.
+    """
+    leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
+    some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]
+    if not some:
+        return q
+    total = jnp.sum(jnp.concatenate([leaf.astype(q.dtype) for leaf in some]))
+    # The root of 0 has no derivative.
+    return q + jnp.sqrt(jnp.where(jnp.isfinite(total), 0.0 * total, 0.0))
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
