@@ -12,7 +12,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.elements.gradients import volume_ratios
-from liverjax.jobs.fields import reaction_table
+from liverjax.jobs.reactions import reaction_table
 from liverjax.physics.attached import ligament, vessel
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.attached.membrane import Membrane

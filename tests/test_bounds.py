@@ -177,10 +177,16 @@ def _spring(**given) -> dict:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"fixed": (lj.Fixed(nodes=jnp.array([999])),)}, "fixed.0.nodes names no node or one beyond 26: renumber them"),
+        (
+            {"fixed": (lj.Fixed(nodes=jnp.array([999])),)},
+            "fixed.0.nodes names node 999, the mesh has 0 to 26: renumber them",
+        ),
         ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64: give whole"),
         ({"fixed": (lj.Fixed(nodes=TOP),)}, "fixed.0.nodes has shape (2, 3): give whole node numbers (n,)"),
-        ({"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)}, "displaced.0.nodes names no node or"),
+        (
+            {"displaced": (lj.Displaced(nodes=jnp.array([27]), by=jnp.zeros(3)),)},
+            "displaced.0.nodes names node 27, the mesh has",
+        ),
         ({"traction": (lj.Traction(triangles=LOST, pressure=1.0),)}, "traction.0.triangles has [1, 2, 4], which is no"),
         (
             {"traction": (lj.Traction(triangles=TOP.ravel(), pressure=1.0),)},
@@ -188,30 +194,30 @@ def _spring(**given) -> dict:
         ),
         (
             {"porosity": replace(SOUND.porosity, drained=jnp.array([27]))},
-            "porosity.drained names no node or one beyond",
+            "porosity.drained names node 27, the mesh has",
         ),
         (
             {"porosity": replace(SOUND.porosity, inlet=(Inlet(nodes=jnp.array([99]), pressure=1.0),))},
-            "porosity.inlet.0.nodes names no node or one beyond 26",
+            "porosity.inlet.0.nodes names node 99, the mesh has 0 to 26",
         ),
         (
             {"porosity": replace(SOUND.porosity, inlet=(Inlet(triangles=LOST, flux=1.0),))},
             "porosity.inlet.0.triangles has [1, 2, 4], which is no face of an element",
         ),
         (_plate(triangles=LOST), "obstacle.0.triangles has [1, 2, 4], which is no face"),
-        (_plate(triangles=jnp.zeros((0, 3), int)), "obstacle.0.triangles names no node or one beyond 7"),
+        (_plate(triangles=jnp.zeros((0, 3), int)), "obstacle.0.triangles names no node: give node numbers from 0 to 7"),
         (_plate(position=jnp.zeros(2)), "obstacle.0.position has shape (2,): give shape (3,)"),
         (_plate(by=jnp.array(0.1)), "obstacle.0.by has shape (): give shape (3,)"),
         (_plate(stiffness=jnp.ones(3)), "obstacle.0.stiffness has shape (3,): give one number or shape (2,)"),
         (
             _plate(times=jnp.array([1.0, 0.0]), history=jnp.zeros((2, 3))),
-            "obstacle.0 history must have increasing times",
+            "obstacle.0 history must have increasing times, it has 0 s after 1 s: sort them",
         ),
         (_spring(triangles=LOST, normal=1.0), "support.0.triangles has [1, 2, 4], which is no face of an element"),
         (_spring(triangles=TOP, normal=jnp.ones(5)), "support.0.normal has shape (5,): give one number or shape (2,)"),
         (
             _spring(nodes=jnp.array([99]), stiffness=1.0),
-            "support.0.nodes names no node or one beyond 26: renumber them",
+            "support.0.nodes names node 99, the mesh has 0 to 26: renumber them",
         ),
         (
             _spring(triangles=TOP, normal=1.0, times=jnp.array([0.0, 1.0]), history=jnp.array([1.0, -1.0])),

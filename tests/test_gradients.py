@@ -261,3 +261,22 @@ def test_segments_cover_all_steps():
         for kept in range(1, steps):
             count, length, rest = gradient_checkpoints.lengths(steps, kept)
             assert count * length + rest == steps and count + (rest > 0) <= kept
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["static", "dynamic viscous", "complete"])
+def test_a_second_derivative_of_a_run(kind):
+    """Forward mode first, against central differences of the gradient; the other order is right, or NaN."""
+    scene = _scene(kind, (1, 1, 1), 2)
+
+    def size(mu):
+        return jnp.sum(lj.simulate(lj.with_parameters(scene, {"law.mu": mu})).positions[-1] ** 2) * 1e4
+
+    slope, h = jax.jit(jax.grad(size)), 0.8
+    # Second order: halving the width leaves a quarter of the error.
+    wide, narrow = (float(slope(770.0 + d) - slope(770.0 - d)) / (2 * d) for d in (2 * h, h))
+    expected = narrow + (narrow - wide) / 3
+    found = float(jax.grad(jax.jacfwd(size))(770.0))
+    assert found == pytest.approx(expected, rel=1e-5)
+    other = float(jax.hessian(size)(770.0))
+    assert np.isnan(other) or other == pytest.approx(expected, rel=1e-5)

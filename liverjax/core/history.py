@@ -64,7 +64,7 @@ def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) 
     """Refuse a history made in Python that cannot be used; traced numbers pass.
 
     Raises:
-        InputError: one of times and history without the other, shapes that do not go together.
+        InputError: one of times and history without the other, shapes that do not go together, times that fall.
     """
     if (times is None) != (history is None):
         raise InputError(f"{name} needs both times and history, or none of them: give the other")
@@ -75,8 +75,12 @@ def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) 
     if len(count) != 1 or np.shape(history) not in allowed:
         shapes = " or ".join(map(str, allowed))
         raise InputError(f"{name} history has shape {np.shape(history)}, its times {count}: give {shapes}")
-    if not isinstance(times, jax.core.Tracer) and not (count[0] and np.all(np.diff(np.asarray(times)) > 0)):
-        raise InputError(f"{name} history must have increasing times: sort them")
+    if isinstance(times, jax.core.Tracer):
+        return
+    falls = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))
+    if not count[0] or falls.size:
+        found = f"{times[falls[0] + 1]:g} s after {times[falls[0]]:g} s" if count[0] else "none"
+        raise InputError(f"{name} history must have increasing times, it has {found}: sort them")
 
 
 def entry_at(time: Number, times: Any, history: Numbers) -> jax.Array:

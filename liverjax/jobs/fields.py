@@ -16,10 +16,8 @@ from liverjax.elements.gradients import volume_gradients
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.physics.registry import law_at_rest
-from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import Equations, Sizes, State, advanced, equations, force_sizes, initial_state
-from liverjax.simulation.obstacle_forces import obstacle_forces, spring_forces
 from liverjax.simulation.run import Result, prepared
 from liverjax.tensors.matrices import Matrix, add_matrices, deformation_gradient, determinant, pack
 
@@ -143,39 +141,3 @@ def at_vertices(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
         for t in range(len(values)):
             np.add.at(total[t], corner, weighted[t])
     return total / weight.reshape(1, -1, *[1] * (values.ndim - 2))
-
-
-def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
-    """Time, and the force of each part that holds the body over time: column names and rows.
-
-    Of obstacles also their displacement and the largest depth of the surface in them.
-    """
-    names, columns = ["time"], [np.asarray(result.times)]
-
-    def add(name: str, vectors: Any, unit: str) -> None:
-        names.extend(f"{name}.{axis}_{unit}" for axis in "xyz")
-        columns.extend(np.asarray(vectors).T)
-
-    held = {
-        f"{kind}.{k}": np.unique(np.asarray(part.nodes))
-        for kind in ("fixed", "displaced")
-        for k, part in enumerate(getattr(scene, kind))
-    }
-    # A node that slides and is held as well counts where it is held.
-    taken = np.concatenate([*held.values(), np.zeros(0, int)])
-    for k, place in enumerate(scene.named("support")):
-        physics = scene.physics[place]
-        if isinstance(physics, SlidingSupport):
-            held[f"support.{k}"] = np.setdiff1d(np.asarray(physics.nodes), taken)
-    for name, nodes in held.items():
-        add(name, np.asarray(result.reactions)[:, nodes].sum(axis=1), "N")
-    for name, force in spring_forces(scene, result).items():
-        add(name, force, "N")
-    if scene.named("obstacle"):
-        contact = obstacle_forces(scene, result)
-        for k in range(len(contact.force)):
-            add(f"obstacle.{k}", 0.0 - np.asarray(contact.force[k]), "N")
-            add(f"obstacle.{k}", contact.displacement[k], "m")
-            names.append(f"obstacle.{k}.depth_m")
-            columns.append(np.asarray(contact.depth[k]))
-    return names, np.stack(columns, axis=1)

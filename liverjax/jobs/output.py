@@ -8,8 +8,9 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.files import whole
-from liverjax.jobs.fields import FIELDS, at_vertices, reaction_table
+from liverjax.jobs.fields import FIELDS, at_vertices
 from liverjax.jobs.pictures import Surface, draw_surface
+from liverjax.jobs.reactions import reaction_table
 from liverjax.mesh.files import meshio_cells
 from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene import Scene

@@ -72,8 +72,11 @@ def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
     if numbers.ndim != 1 or (numbers.size and numbers.dtype.kind not in "iu"):
         found = f"shape {numbers.shape}" if numbers.ndim != 1 else f"numbers of type {numbers.dtype}"
         raise InputError(f"{name} has {found}: give whole node numbers (n,)")
-    if numbers.size < least or (numbers.size and not 0 <= numbers.min() <= numbers.max() < count):
-        raise InputError(f"{name} names no node or one beyond {count - 1}: renumber them")
+    if numbers.size < least:
+        raise InputError(f"{name} names no node: give node numbers from 0 to {count - 1}")
+    wrong = numbers[(numbers < 0) | (numbers >= count)]
+    if wrong.size:
+        raise InputError(f"{name} names node {wrong[0]}, the mesh has 0 to {count - 1}: renumber them")
 
 
 def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:

@@ -1,14 +1,12 @@
-"""Forces on the rigid obstacles of a run, the depth of the surface in each, and the pull of springs and ligaments."""
+"""Forces on the rigid obstacles of a run, and the depth of the surface in each."""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from liverjax.physics.attached.ligament import Ligament
-from liverjax.physics.base import End, Free, Physics, Start, Step
+from liverjax.physics.base import End, Free, Start, Step
 from liverjax.physics.contact.obstacle import Obstacle, largest_depth
-from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result, prepared
 from liverjax.tensors.matrices import deformation_gradient
@@ -53,32 +51,3 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
         return ObstacleForces(none, none[..., 0], none)
     each = [one(obstacle) for obstacle in found]
     return ObstacleForces(*(jnp.stack(a) for a in zip(*each, strict=True)))
-
-
-def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
-    """Forces (T, 3) [N] on the body of every support with springs and every ligament that ends outside, by name.
-
-    Args:
-        scene: as it was run.
-        result: `Result` of `liverjax.simulate`, all steps stored.
-    """
-    scene = prepared(scene)
-    found: dict[str, jax.Array] = {}
-    dt = 0.0 if scene.solve.dt is None else scene.solve.dt
-    mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
-    numbers = jnp.arange(1, len(result.positions) + 1)
-
-    def pull(physics: Physics) -> jax.Array:
-        def at(given: Any) -> jax.Array:
-            k, x = given
-            acting = physics.freeze(None, Step(mesh, x, k, scene.solve.steps, dt, False, None, free))
-            return 0.0 - jnp.sum(acting.force(mesh, x, 1.0), axis=0)
-
-        return jax.lax.map(at, (numbers, jnp.asarray(result.positions)))
-
-    for section in ("support", "ligament"):
-        for k, place in enumerate(scene.named(section)):
-            physics = scene.physics[place]
-            if isinstance(physics, ElasticSupport) or (isinstance(physics, Ligament) and physics.to is not None):
-                found[f"{section}.{k}"] = pull(physics)
-    return found

@@ -209,7 +209,7 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
     """q, whose derivative is NaN if it is ever taken through this function, which a correct derivative never does.
 
     Up to jax 0.10 the derivative of a loop's derivative in reverse mode forgets the rule by which a root is
-    differentiated. It would take the root for a constant, and give a wrong number without a word.
+    differentiated (jax 0.11.2 does not). It would take the root for a constant, and give a wrong number without a word.
     """
     leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
     some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]

@@ -1,0 +1,86 @@
+"""Forces on the body over time, part by part: the table of `reactions.csv`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.base import Free, Physics, Step
+from liverjax.physics.elastic_support import ElasticSupport
+from liverjax.physics.sliding_support import SlidingSupport
+from liverjax.scenes.scene import Scene
+from liverjax.simulation.obstacle_forces import obstacle_forces
+from liverjax.simulation.run import Result, prepared
+
+
+def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
+    """Time, and the force of each part that holds the body over time: column names and rows.
+
+    Of obstacles also their displacement and the largest depth of the surface in them.
+    """
+    names, columns = ["time"], [np.asarray(result.times)]
+
+    def add(name: str, vectors: Any, unit: str) -> None:
+        names.extend(f"{name}.{axis}_{unit}" for axis in "xyz")
+        columns.extend(np.asarray(vectors).T)
+
+    held = {
+        f"{kind}.{k}": np.unique(np.asarray(part.nodes))
+        for kind in ("fixed", "displaced")
+        for k, part in enumerate(getattr(scene, kind))
+    }
+    # A node that slides and is held as well counts where it is held.
+    taken = np.concatenate([*held.values(), np.zeros(0, int)])
+    for k, place in enumerate(scene.named("support")):
+        physics = scene.physics[place]
+        if isinstance(physics, SlidingSupport):
+            held[f"support.{k}"] = np.setdiff1d(np.asarray(physics.nodes), taken)
+    for name, nodes in held.items():
+        add(name, np.asarray(result.reactions)[:, nodes].sum(axis=1), "N")
+    for name, force in spring_forces(scene, result).items():
+        add(name, force, "N")
+    if scene.named("obstacle"):
+        contact = obstacle_forces(scene, result)
+        for k in range(len(contact.force)):
+            add(f"obstacle.{k}", 0.0 - np.asarray(contact.force[k]), "N")
+            add(f"obstacle.{k}", contact.displacement[k], "m")
+            names.append(f"obstacle.{k}.depth_m")
+            columns.append(np.asarray(contact.depth[k]))
+    return names, np.stack(columns, axis=1)
+
+
+def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
+    """Forces (T, 3) [N] on the body of every support with springs and every ligament that ends outside, by name.
+
+    Args:
+        scene: as it was run.
+        result: `Result` of `liverjax.simulate`, all steps stored.
+    """
+
+    def holds(physics: Physics) -> bool:
+        return isinstance(physics, ElasticSupport) or (isinstance(physics, Ligament) and physics.to is not None)
+
+    places = {
+        f"{section}.{k}": place
+        for section in ("support", "ligament")
+        for k, place in enumerate(scene.named(section))
+        if holds(scene.physics[place])
+    }
+    if not places:
+        return {}
+    scene = prepared(scene)
+    dt = 0.0 if scene.solve.dt is None else scene.solve.dt
+    mesh, free = scene.mesh, Free(jnp.ones_like(scene.mesh.points))
+    numbers = jnp.arange(1, len(result.positions) + 1)
+
+    def pull(physics: Physics) -> jax.Array:
+        def at(given: Any) -> jax.Array:
+            k, x = given
+            acting = physics.freeze(None, Step(mesh, x, k, scene.solve.steps, dt, False, None, free))
+            return 0.0 - jnp.sum(acting.force(mesh, x, 1.0), axis=0)
+
+        return jax.lax.map(at, (numbers, jnp.asarray(result.positions)))
+
+    return {name: pull(scene.physics[place]) for name, place in places.items()}
