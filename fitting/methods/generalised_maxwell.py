@@ -167,7 +167,7 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
     if dense.misfit > HOPELESS:
         above = np.median(sweep.loss / sweep.storage)
         hint = (
-            f"loss_modulus is {above:.1f} times storage_modulus (are the two columns exchanged?)"
+            f"loss_modulus is {above:.1f} times storage_modulus (are the two columns exchanged, or in different units?)"
             if above > 1
             else "check columns and units"
         )
