@@ -24,7 +24,7 @@ class PathStep(NamedTuple):
     def with_inside(self, value: Any) -> Any:
         """The owner with `value` at the key."""
         owner, key = self
-        if dataclasses.is_dataclass(owner):
+        if dataclasses.is_dataclass(owner) and not isinstance(owner, type):
             return replace(owner, **{key: value})
         if isinstance(owner, dict):
             return owner | {key: value}

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import replace as replace
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -95,9 +96,3 @@ def struct(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     return made
-
-
-def replace(of: T, **changes: Any) -> T:
-    """A copy with other values in some fields."""
-    whole: Any = of
-    return dataclasses.replace(whole, **changes)

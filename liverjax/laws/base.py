@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Content, Number, Numbers, param, replace, static, struct
 from liverjax.laws.derivatives import First, Second, accumulate, autodiff_derivatives, reduced, split_derivatives
 from liverjax.laws.terms import invariant_terms
 from liverjax.laws.terms.green_terms import components, material_axes
@@ -45,6 +45,8 @@ class Law:
     """A hyperelastic law per reference volume [Pa]; see the module for what to override."""
 
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
+    #: Every law is a struct, so `dataclasses.replace` takes it.
+    __dataclass_fields__: ClassVar[Content]
     #: The energies of a law; None: it has none of that kind.
     isochoric_energy: Any = None
     stretch_energy: Any = None

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Indices, Number
+from liverjax.core.struct import Content, Indices, Number
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.darcy import Guess
@@ -214,6 +214,8 @@ class NodalForce:
 class Physics:
     """One physics of a scene: a struct of numbers; see the module."""
 
+    #: Every physics is a struct, so `dataclasses.replace` takes it.
+    __dataclass_fields__: ClassVar[Content]
     #: Table of the scene file that it is read from, and the keys of that table.
     section: ClassVar[str] = ""
     #: Whether it makes nodes move together: the factorisation knows no such rows.

@@ -6,7 +6,7 @@ A law of another kind is computed for the elements of its region alone.
 import jax.numpy as jnp
 
 from liverjax.core import names
-from liverjax.core.struct import replace
+from liverjax.core.struct import Content, replace
 from liverjax.laws import Law
 from liverjax.laws.by_region import ByRegion
 from liverjax.mesh.tetrahedra import TetMesh
@@ -52,7 +52,7 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
     """The series with one number a mode and element (N, E) where a region has its own."""
-    found = {}
+    found: Content = {}
     for name in VISCOUS:
         own = {
             k: region.viscosity[name]
@@ -68,13 +68,13 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
     if not found:
         return prony
     shape = next(iter(found.values())).shape
-    plain = {name: jnp.broadcast_to(jnp.asarray(getattr(prony, name), float)[:, None], shape) for name in VISCOUS}
+    plain: Content = {n: jnp.broadcast_to(jnp.asarray(getattr(prony, n), float)[:, None], shape) for n in VISCOUS}
     return replace(prony, **plain | found)
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
     """The porosity with one number an element (E,), or (1, E) of quadratic ones, where a region has its own."""
-    found: dict[str, object] = {}
+    found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
             before = jnp.asarray(found.get(name, getattr(porosity, name)), float)

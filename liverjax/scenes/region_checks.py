@@ -7,7 +7,7 @@ from liverjax import laws
 from liverjax.core import names
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import Content, replace
 from liverjax.laws import Law
 from liverjax.physics.porosity import Porosity, check_sponge
 from liverjax.physics.viscosity import Prony, check_series
@@ -73,8 +73,9 @@ def check_viscosity(prony: Prony | None, region: Region, name: str) -> None:
             raise InputError(f"{name}: viscosity.{key} has {n} numbers and the scene {modes} modes: give {modes}")
     if any(isinstance(value, jax.core.Tracer) for value in (*own.values(), prony.ratios)):
         return
+    changed: Content = {key: np.asarray(value, float) for key, value in own.items()}
     try:
-        check_series(replace(prony, **{key: np.asarray(value, float) for key, value in own.items()}))
+        check_series(replace(prony, **changed))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
 
@@ -85,7 +86,7 @@ def check_porosity(porosity: Porosity | None, region: Region, name: str) -> None
     Raises:
         InputError: no [porosity] in the scene, an unknown name, numbers out of bounds.
     """
-    own = region.porosity or {}
+    own: Content = dict(region.porosity or {})
     if not own:
         return
     if porosity is None:

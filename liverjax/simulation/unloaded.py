@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from liverjax import laws
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import Content, replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh, with_points
 from liverjax.physics.prescribed import Fixed
@@ -73,7 +73,7 @@ def resting(scene: Scene) -> Scene:
     held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
     # A step without length: histories are at their beginning.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")
-    changed = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
+    changed: Content = {"fixed": (*scene.fixed, *held), "physics": tuple(p.at_beginning() for p in scene.physics)}
     return replace(scene, law=law, viscosity=None, displaced=(), solve=solve, points_are="reference", **changed)
 
 

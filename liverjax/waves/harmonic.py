@@ -9,7 +9,7 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, Numbers, param, replace, struct
+from liverjax.core.struct import Content, Number, Numbers, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
 from liverjax.physics.contact.friction import RoughObstacle
@@ -27,7 +27,7 @@ from liverjax.waves.operator import Operator, free_part, operator
 
 MASSES = ("consistent", "lumped")
 #: What the equations of one instant need of [solve].
-_STILL = {
+_STILL: Content = {
     "kind": "static",
     "frequencies": None,
     "dt": None,

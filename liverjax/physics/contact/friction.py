@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Array, Number, param, replace, struct
+from liverjax.core.struct import Array, Content, Number, param, replace, struct
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Start, Step
 from liverjax.physics.contact.obstacle import (
@@ -44,7 +44,7 @@ class RoughObstacle(Obstacle):
     conservative: ClassVar[bool] = False
 
     @classmethod
-    def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> Self:
+    def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
         """From [[obstacle]] with a friction."""
         plain = super().read(mesh, table, name)
         return replace(plain, friction=table["friction"])

@@ -42,7 +42,7 @@ _POINTS = np.full(3, 1 / 3), np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 class Obstacle(Physics):
     """One rigid shape that stands still, moves `by` a vector within the run, or follows a history."""
 
-    triangles: jax.Array = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
+    triangles: Indices = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
     shape: str = static(default="plane", about="plane, sphere, cylinder or cone")
     position: Numbers = param(
         "m", "point of the plane or of the cylinder's axis, centre, tip (3,)", default=(0.0, 0.0, 0.0)
