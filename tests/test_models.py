@@ -201,6 +201,28 @@ def test_a_spectrum_has_as_many_parameters_as_the_data_give_it():
     assert stiff.effective < 4 < free.effective and stiff.decades > free.decades
 
 
+def test_evidence_is_the_restricted_likelihood():
+    """Against Patterson and Thompson (1971, Biometrika 58): strengths as random effects, their straight line fixed."""
+    rng = np.random.default_rng(0)
+    times, m = np.logspace(2, -2, 9), 30
+    A = rng.normal(size=(m, 10))
+    y = A @ np.linspace(1.0, 3.0, 10) + rng.normal(size=m)
+    found, exact = [], []
+    for weight in (1e-2, 1.0, 1e3):
+        L = relaxation_spectrum.second_differences(9, weight)
+        x = np.linalg.solve(A.T @ A + L.T @ L, A.T @ y)
+        grid = relaxation_spectrum.GridOfTimes(times, np.ones(10), 2, weight)
+        found.append(relaxation_spectrum.described(x, A, A @ x - y, grid).evidence)
+        line = np.column_stack([np.eye(10)[:, 0], np.r_[0, np.ones(9)], np.r_[0, np.arange(9.0)]])
+        X, Z = A @ line, A @ np.linalg.pinv(L)  # what the prior leaves free, and effects of unit variance
+        V = np.eye(m) + Z @ Z.T
+        inner = X.T @ np.linalg.solve(V, X)
+        left = y - X @ np.linalg.solve(inner, X.T @ np.linalg.solve(V, y))
+        square = left @ np.linalg.solve(V, left)
+        exact.append((m - 3) * np.log(square) + np.linalg.slogdet(V)[1] + np.linalg.slogdet(inner)[1])
+    assert np.allclose(np.diff(found), np.diff(exact), rtol=1e-9)
+
+
 def maxwell_fluid(noise: float) -> Sweep:
     omega = np.geomspace(0.1, 40, 31)
     G = 400 * 1j * omega * 5 / (1 + 1j * omega * 5) + 600 * 1j * omega * 0.05 / (1 + 1j * omega * 0.05)

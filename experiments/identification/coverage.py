@@ -3,32 +3,38 @@
 1,000 synthetic sweeps with what laboratories have: noise of 2 %, an inertia that is subtracted 0.05 % wrong, a gap off
 by 50 um, a sample trimmed under a compression of 0 to 20 %. Truths are Prony modes, springpots, and a wide spectrum.
 For the intervals all sweeps are fitted side by side in NumPy, by the residuals, the iteration and the criterion of the
-program; models are chosen by the program itself.
+program, to Prony modes and to a springpot beside a spring. Some are fitted by the program itself, with all its models;
+it chooses the models of the predictions too.
 
     python -m experiments coverage [--quick]
+    python -m experiments.identification.coverage program prediction    (these parts again, beside the others)
 """
 
+import json
+import sys
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from experiments.common import either, plt, save
+from experiments.common import RESULTS, either, plt, save
 from fitting.fits import viscoelastic
 from fitting.fits.families import models
 from fitting.fits.families.choice import contains, label_of
 from fitting.fits.viscoelastic import Fit, information_criterion
 from fitting.methods import generalised_maxwell, host
+from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import GAIN, State, accept, begin
 from fitting.readers.frequency_sweep import Sweep
 from liverjax.core.plotting import BLUE, GREY, ORANGE
 
 SWEEPS, STARTS, NOISE = either(1000, 40), 6, 0.02
-#: Sweeps whose first decade is left out; of all the last one is.
-FIRST = either(300, 40)
+#: Sweeps whose first decade is left out (of all the last one is), and those of each truth that the program itself fits.
+FIRST, OWN = either(300, 40), either(60, 2)
 OMEGA = np.geomspace(0.1, 100, 31)
 #: Frequencies [rad/s] at which intervals of the fitted moduli are looked at, and the ones that are left out at the end.
 LOOKED_AT, LAST_DECADE = np.geomspace(0.1, 100, 7), OMEGA > 10 * (1 + 1e-9)
@@ -248,6 +254,45 @@ def parameters(truth: Truth, names: list[str], fits: dict[str, Fits], order: np.
     return {key: float(value) for key, value in out.items()}
 
 
+def fitted_moduli(fit: Fit, sweep: Sweep) -> Estimate:
+    """G' then G'' at `LOOKED_AT` of a fit of the program, with errors by the delta method."""
+
+    def of(u):
+        if fit.kind.moduli is not None:
+            G = fit.kind.moduli(u, LOOKED_AT)
+            return jnp.concatenate([jnp.real(G), jnp.imag(G)])
+        halves = generalised_maxwell.moduli(fit.kind.maxwell(u), LOOKED_AT)
+        return (np if isinstance(u, np.ndarray) else jnp).concatenate(halves, axis=-1)
+
+    names = [f"{part} at {omega:.3g} rad/s" for part in ("storage", "loss") for omega in LOOKED_AT]
+    count, given = 2 * len(fit.storage), sweep.noise_given
+    return estimated(names, of, fit.solution, count, given, fit.kind.effective)
+
+
+def by_the_program(truth: Truth) -> dict:
+    """Coverage of the moduli by the program's choices on sweeps with noise alone: N modes, a spectrum, any model."""
+    data, out = measured(np.random.default_rng(10), truth, 0), {}
+    for k, kind in enumerate(TRUTHS):
+        inside: dict[str, list] = {"prony": [], "spectrum": [], "auto": []}
+        chosen: dict[str, int] = {}
+        for row in np.flatnonzero(truth.kind == k)[:OWN]:
+            sweep = Sweep(OMEGA, *np.split(data[row], 2))
+            true = Truth(*(field[row : row + 1] for field in truth)).moduli(LOOKED_AT)[0]
+            dense = generalised_maxwell.spectrum(sweep)
+            prony = viscoelastic.choose_modes(sweep, dense)[0]
+            tried = models.every_model(sweep, "auto", prony, dense)
+            best = models.best_of_models(tried, sweep)[0]
+            chosen[best.kind.name] = chosen.get(best.kind.name, 0) + 1
+            wide = next(fit for fit in tried if fit.kind.name == "spectrum")
+            for name, fit in (("prony", prony), ("spectrum", wide), ("auto", best)):
+                found = fitted_moduli(fit, sweep)
+                off = np.abs(found.values - np.concatenate([true.real, true.imag]))
+                inside[name].append(off <= found.quantile * found.standard_errors)
+        out[kind] = {name: float(np.mean(rows)) for name, rows in inside.items()} | {"chosen": chosen}
+        print(kind, out[kind], flush=True)
+    return {"sweeps": OWN, "moduli": out}
+
+
 def beyond(fit: Fit, omega: np.ndarray) -> np.ndarray:
     """G* (n,) [Pa] of a fit at frequencies outside its band, by its own model."""
     if fit.kind.moduli is not None:
@@ -329,20 +374,34 @@ def figure(rows: list[dict]) -> plt.Figure:
     return fig
 
 
-def main() -> None:
-    """Run all."""
-    begin_at = time.perf_counter()
-    truth = truths(np.random.default_rng(0), SWEEPS)
+def intervals_of(truth: Truth) -> list[dict]:
+    """A row for each disturbance."""
     rows = []
     for k in range(len(DISTURBANCES)):
         rows.append(study(k, truth, np.random.default_rng(10 + k)))
         print(rows[-1], flush=True)
-    predicted = prediction(truth, np.random.default_rng(20))
-    print(predicted)
-    seconds = time.perf_counter() - begin_at
-    content = {"sweeps": SWEEPS, "noise": NOISE, "rows": rows, "prediction": predicted, "seconds": seconds}
-    save("coverage", content, figure(rows))
+    return rows
+
+
+PARTS: dict[str, Callable[[Truth], object]] = {
+    "rows": intervals_of,
+    "program": by_the_program,
+    "prediction": lambda truth: prediction(truth, np.random.default_rng(20)),
+}
+
+
+def main(parts: list[str] | None = None) -> None:
+    """Run all, or some parts beside the others' results."""
+    truth = truths(np.random.default_rng(0), SWEEPS)
+    content = json.loads((RESULTS / "coverage.json").read_text()) if parts else {"sweeps": SWEEPS, "noise": NOISE}
+    seconds = content.setdefault("seconds_of_parts", {})
+    for name in parts or PARTS:
+        begin_at = time.perf_counter()
+        content[name] = PARTS[name](truth)
+        seconds[name] = time.perf_counter() - begin_at
+    content["seconds"] = sum(seconds.values())
+    save("coverage", content, figure(content["rows"]))
 
 
 if __name__ == "__main__":
-    main()
+    main([a for a in sys.argv[1:] if not a.startswith("-")])

@@ -2,8 +2,10 @@
 nothing.
 
 For fixed times the moduli are linear in the strengths, so the minimum is the only one. Strengths are measured in the
-size of the data at omega = 1 / tau, and their second differences are held down by a weight that the information
-criterion chooses. Method: Honerkamp and Weese (1989), Macromolecules 22, with that criterion in place of theirs.
+size of the data at omega = 1 / tau, and their second differences are held down by a weight. Method: Honerkamp and Weese
+(1989), Macromolecules 22. Grid and weight are those of the highest restricted likelihood (Wahba 1985, Ann. Stat. 13):
+the errors that follow from it hold the truth about as often as they say. Those of the weight that the information
+criterion would choose, a larger one, do so less often (`experiments/identification/coverage.py`).
 """
 
 from collections.abc import Sequence
@@ -30,21 +32,22 @@ class GridSpectrum(NamedTuple):
     smoothing: float  # weight of the second differences
     prior: np.ndarray  # (R, 1 + K): its rows are the penalty, in equilibrium and strengths [1/Pa]
     effective: float  # number of parameters that the data determine
-    criterion: float
+    criterion: float  # information criterion, for the comparison with other models
+    evidence: float  # -2 log of the restricted likelihood but for a constant, the level of the noise estimated
     decades: float  # of relaxation times whose strengths the data carry
     places: np.ndarray  # (K,) of these times in the whole grid
 
 
 def fit(sweep: Sweep) -> GridSpectrum:
-    """The spectrum of lowest criterion over grids and weights."""
-    return min((at(sweep, grid, w) for grid in GRIDS for w in WEIGHTS), key=lambda found: found.criterion)
+    """The spectrum of the likeliest grid and weight."""
+    return min((at(sweep, grid, w) for grid in GRIDS for w in WEIGHTS), key=lambda found: found.evidence)
 
 
 def fit_all(sweeps: Sequence[Sweep]) -> list[GridSpectrum]:
-    """Spectra of several samples on one grid with one weight: those of the lowest sum of criteria."""
+    """Spectra of several samples on one grid with one weight: the likeliest for all."""
     band = min(s.resolved[0] for s in sweeps), max(s.resolved[1] for s in sweeps)
     every = ([at(s, grid, w, band) for s in sweeps] for grid in GRIDS for w in WEIGHTS)
-    return min(every, key=lambda found: sum(f.criterion for f in found))
+    return min(every, key=lambda found: sum(f.evidence for f in found))
 
 
 def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float] | None = None) -> GridSpectrum:
@@ -109,6 +112,17 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
         prior=(L / grid.unit)[:, np.concatenate([[True], kept])],
         effective=effective,
         criterion=float(m * np.log(mean_square) + effective * np.log(m)),
+        evidence=_restricted_likelihood(x, A, r, L),
         decades=float(carried),
         places=np.flatnonzero(kept),
     )
+
+
+def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:
+    """`GridSpectrum.evidence`: the prior leaves as many numbers free as L has columns beyond its rows."""
+    square = max(float(r @ r + np.sum((L @ x) ** 2)), 1e-300)
+    with np.errstate(divide="ignore"):
+        both = 2 * np.sum(np.log(np.abs(np.diag(np.linalg.qr(np.vstack([A, L]), mode="r")))))
+    free = L.shape[1] - L.shape[0]
+    prior = np.linalg.slogdet(L[:, 1:] @ L[:, 1:].T)[1]
+    return float((len(r) - free) * np.log(square) + both - prior)

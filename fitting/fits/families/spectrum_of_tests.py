@@ -101,7 +101,7 @@ def _minimum(function: Callable, data: list, grid: GridOfTimes, x: np.ndarray) -
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """The spectrum of lowest criterion over grids and weights.
+    """The spectrum of the likeliest grid and weight.
 
     Args:
         tests: one or more.
@@ -120,7 +120,7 @@ def spectrum_of(
             grid = GridOfTimes(times, unit, per_decade, float(weight))
             found = _minimum(function, data, grid, x)
             x, told = found.x, relaxation_spectrum.described(found.x, found.J, found.r, grid)
-            if best is None or told.criterion < best[0].criterion:
+            if best is None or told.evidence < best[0].evidence:
                 best = told, grid, found
     assert best is not None
     return best
