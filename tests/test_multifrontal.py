@@ -32,7 +32,12 @@ def system(kind: type) -> tuple[scipy.sparse.csr_array, list[multifrontal.Front]
     lines, columns = np.broadcast_arrays(at[:, None], at[None])
     n = 2 * len(points)
     A = scipy.sparse.coo_array((blocks.ravel(), (lines.ravel(), columns.ravel())), shape=(n, n)).tocsr()
-    return A, multifrontal.fronts(A, multifrontal.dissected(tets, points), np.arange(n) // 2)
+    return A, multifrontal.fronts(neighbours(tets), multifrontal.dissected(tets, points), np.arange(n) // 2)
+
+
+def neighbours(tets: np.ndarray) -> scipy.sparse.csr_array:
+    at = tuple(a.ravel() for a in np.broadcast_arrays(tets[:, None], tets[None]))
+    return scipy.sparse.coo_array((np.ones(len(at[0])), at)).tocsr()
 
 
 @pytest.mark.parametrize("kind", [float, complex])
@@ -61,7 +66,8 @@ def test_groups_whose_nodes_are_all_held(single, monkeypatch):
     points = np.asarray(box.points)
     keep = np.flatnonzero(np.repeat(points[:, 2] > 0.7, 2))
     free = A[keep][:, keep].tocsr()
-    plan = multifrontal.fronts(free, multifrontal.dissected(np.asarray(box.tetrahedra).T, points), keep // 2)
+    tets = np.asarray(box.tetrahedra).T
+    plan = multifrontal.fronts(neighbours(tets), multifrontal.dissected(tets, points), keep // 2)
     assert any(len(front.own) == 0 for front in plan)
     known = np.random.default_rng(2).normal(size=len(keep)) + 0j
     _, error = multifrontal.refined_solution(multifrontal.factorised(free, plan, single), free @ known)

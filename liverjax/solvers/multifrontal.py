@@ -3,12 +3,15 @@
 Nested dissection (George 1973, SIAM J. Numer. Anal. 10, 345): the elements are halved across their longest side again
 and again, and the nodes between two halves come after both. Each group of nodes is eliminated in a dense matrix of
 itself and its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is
-products of matrices, on all cores. By symmetry the lower triangles are enough. Pivots are chosen within the unknowns
-that are eliminated together. Large matrices are factorised in single precision and solved with refinement: half the
-time and memory, and the same digits. Where that does not converge, double precision follows.
+products of matrices. Groups whose children are done are eliminated side by side, one a core. By symmetry the lower
+triangles are enough. Pivots are chosen within the unknowns that are eliminated together. Large matrices are factorised
+in single precision and solved with refinement: half the time and memory, and the same digits. Where that does not
+converge, double precision follows.
 """
 
 import itertools
+import os
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,7 +22,9 @@ if TYPE_CHECKING:
 #: Nodes of a group that is not halved any more; unknowns from which on single precision pays.
 LEAF, SINGLE_FROM = 40, 20_000
 #: Unknowns of a group that are eliminated together, and the side of the tiles of what they change.
-PIVOTS, TILE = 512, 512
+PIVOTS, TILE = 256, 256
+#: Part of all work below which groups are eliminated with their descendants, in one piece.
+PIECE = 1 / 32
 #: Steps of refinement, and the part of the terms of an equation that may be out of balance.
 STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
@@ -33,12 +38,11 @@ class Front(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """Unknowns that were eliminated together: L U of their own matrix A, and X = A^-1 B of those that come after."""
+    """Unknowns that were eliminated together: A^-1 of their own matrix, and X = A^-1 B of those that come after."""
 
     own: np.ndarray  # (n,)
     after: np.ndarray  # (m,)
-    lu: np.ndarray  # (n, n)
-    pivots: np.ndarray  # (n,)
+    inverse: np.ndarray  # (n, n)
     X: np.ndarray  # (n, m)
 
 
@@ -52,7 +56,7 @@ class Factor(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Memory."""
-        return self.matrix.data.nbytes + sum(step.lu.nbytes + step.X.nbytes for step in self.steps)
+        return self.matrix.data.nbytes + sum(step.inverse.nbytes + step.X.nbytes for step in self.steps)
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
@@ -98,25 +102,36 @@ def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.concatenate([_neighbours_together(half, points) for half in halves])
 
 
-def fronts(A: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray) -> list[Front]:
-    """The groups as unknowns of A (N, N); `node` (N,) is the node of each unknown."""
+def fronts(
+    neighbours: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray
+) -> list[Front]:
+    """The groups as unknowns.
+
+    Args:
+        neighbours: (V, V), an entry for each two nodes whose unknowns are coupled.
+        groups: `dissected`.
+        node: (N,) the node of each unknown.
+    """
     order = np.argsort(node, kind="stable")
-    ends = np.searchsorted(
-        node[order], np.arange(max(node.max(initial=0), max(g.max(initial=0) for g, _ in groups)) + 2)
-    )
-    none = np.zeros(0, int)
-    found: list[Front] = []
-    each = [np.concatenate([order[ends[v] : ends[v + 1]] for v in nodes] or [none]) for nodes, _ in groups]
-    when = np.empty(len(node), int)
-    order_of = np.concatenate(each)
-    when[order_of] = np.arange(len(node))
-    done = 0
-    for own, (_, children) in zip(each, groups, strict=True):
+    ends = np.searchsorted(node[order], np.arange(neighbours.shape[0] + 1))
+    when, nodes = np.zeros(neighbours.shape[0], int), np.concatenate([own for own, _ in groups])
+    when[nodes] = np.arange(len(nodes))
+    done, found = 0, []
+    borders: list[np.ndarray] = []
+    for own, children in groups:
         done += len(own)
-        near = [A.indices[A.indptr[i] : A.indptr[i + 1]] for i in own] + [found[c].border for c in children]
-        later = np.unique(when[np.concatenate([none, *near])])
-        found.append(Front(own, order_of[later[later >= done]], children))
+        near = [neighbours.indices[neighbours.indptr[v] : neighbours.indptr[v + 1]] for v in own]
+        later = np.unique(when[np.concatenate([*near, *(borders[c] for c in children)])])
+        borders.append(nodes[later[later >= done]])
+        found.append(Front(_unknowns(own, order, ends), _unknowns(borders[-1], order, ends), children))
     return found
+
+
+def _unknowns(nodes: np.ndarray, order: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Unknowns of nodes, node by node."""
+    first, number = ends[nodes], ends[nodes + 1] - ends[nodes]
+    before = np.cumsum(number) - number
+    return order[np.repeat(first - before, number) + np.arange(number.sum())]
 
 
 def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool) -> Factor:
@@ -125,41 +140,104 @@ def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool) -> 
     Raises:
         numpy.linalg.LinAlgError: values that are not finite, or a group whose own matrix has no inverse.
     """
-    import scipy.sparse
-
-    scale = _scale(A)
-    D = scipy.sparse.diags_array(scale)
-    A = (D @ A @ D).tocsr()
+    A, scale = _scaled(A)
     if not np.all(np.isfinite(A.data)):
         raise np.linalg.LinAlgError("not finite")
     kind = np.result_type(A.dtype, np.float32)
     if single:
         kind = np.dtype(np.complex64 if kind.kind == "c" else np.float32)
-    place, steps = np.full(A.shape[0], -1), []
-    rests: dict[int, np.ndarray] = {}
-    memory = np.empty(max((len(front.own) + len(front.border)) ** 2 for front in plan), kind)
-    for k, front in enumerate(plan):
-        F, n = _matrix_of_group(A, front, place, memory), len(front.own)
-        for c in front.children:
-            if c in rests:  # a part of the body that nothing couples with the others has left nothing
-                _add(F, place[plan[c].border], rests.pop(c))
-        place[front.own] = place[front.border] = -1
-        steps += _eliminated(F, front)
-        if len(front.border):
-            rests[k] = F[n:, n:].copy(order="F")
+    steps = _all_pieces(_Elimination(A, plan, kind, [None] * len(plan), [[] for _ in plan]))
     return Factor(A, scale, steps)
 
 
-def _scale(A: Any) -> np.ndarray:
-    """Scales (N,) that make the largest entry of every line nearly 1, on both sides alike (Ruiz 2001)."""
+class _Elimination(NamedTuple):
+    """What the threads share."""
+
+    A: Any
+    plan: list[Front]
+    kind: np.dtype
+    rests: list[np.ndarray | None]  # what each group leaves to the next
+    steps: list[list[Eliminated]]  # of each group
+
+    def piece(self, groups: list[int]) -> None:
+        """Eliminate some groups, one after the other."""
+        place = np.full(self.A.shape[0], -1)
+        size = max(len(front.own) + len(front.border) for front in (self.plan[k] for k in groups))
+        memory, scratch = np.empty(size**2, self.kind), np.empty(min(size, TILE) ** 2, self.kind)
+        for k in groups:
+            front = self.plan[k]
+            F, n = _matrix_of_group(self.A, front, place, memory), len(front.own)
+            for c in front.children:
+                rest = self.rests[c]
+                if rest is not None:  # a part of the body that nothing couples with the others has left nothing
+                    _add(F, place[self.plan[c].border], rest)
+                    self.rests[c] = None
+            place[front.own] = place[front.border] = -1
+            self.steps[k] = _eliminated(F, front, scratch)
+            if len(front.border):
+                self.rests[k] = F[n:, n:].copy(order="F")
+
+
+def _all_pieces(own: _Elimination) -> list[Eliminated]:
+    """All groups in pieces, as many at a time as there are cores. The sums do not depend on who is first."""
+    pieces, waits_for = _work_in_pieces(own.plan)
+    running: dict[Future, int] = {}
+    with ThreadPoolExecutor(_cores()) as pool:
+        ready = [k for k, missing in enumerate(waits_for) if not missing]
+        while ready or running:
+            running |= {pool.submit(own.piece, pieces[k]): k for k in ready}
+            over = wait(running, return_when=FIRST_COMPLETED).done
+            ended = {running.pop(future) for future in over}
+            for future in over:
+                future.result()
+            ready = [k for k, missing in enumerate(waits_for) if missing & ended and not missing - ended]
+            for missing in waits_for:
+                missing -= ended
+    return [step for steps in own.steps for step in steps]
+
+
+def _cores() -> int:
+    """Cores that the process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]:
+    """Groups that are eliminated in one piece, and the pieces that each piece waits for."""
+    n, m = (
+        np.array([len(part) for part in parts], float) for parts in zip(*(front[:2] for front in plan), strict=True)
+    )
+    work = n**3 / 3 + n**2 * m + n * m**2
+    below = work.copy()
+    for k, front in enumerate(plan):
+        below[k] += below[front.children].sum()
+    small, piece_of = below < PIECE * work.sum(), np.full(len(plan), -1)
+    pieces: list[list[int]] = []
+    for k in range(len(plan) - 1, -1, -1):  # parents first
+        if piece_of[k] < 0:
+            piece_of[k] = len(pieces)
+            pieces.append([])
+        pieces[piece_of[k]].insert(0, k)
+        if small[k]:
+            piece_of[plan[k].children] = piece_of[k]
+    children = [{int(piece_of[c]) for k in piece for c in plan[k].children} - {q} for q, piece in enumerate(pieces)]
+    return pieces, children
+
+
+def _scaled(A: Any) -> tuple[Any, np.ndarray]:
+    """The matrix with scales (N,) on both sides that make the largest entry of every line nearly 1, and these (Ruiz
+    2001)."""
     import scipy.sparse
 
-    size, scale = abs(A), np.ones(A.shape[0])
+    A = A.tocsr()
+    size, scale, row = abs(A.data), np.ones(A.shape[0]), np.repeat(np.arange(A.shape[0]), np.diff(A.indptr))
+    known = np.flatnonzero(np.diff(A.indptr))
     for _ in range(3):
-        D = scipy.sparse.diags_array(scale)
-        largest = (D @ size @ D).max(axis=1).toarray().ravel()
+        largest = np.zeros(len(scale))
+        if len(known):
+            largest[known] = scale[known] * np.maximum.reduceat(size * scale[A.indices], A.indptr[known])
         scale = scale / np.sqrt(np.where(largest > 0, largest, 1.0))
-    return scale
+    data = A.data * (scale[row] * scale[A.indices])
+    return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape), scale
 
 
 def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
@@ -185,30 +263,40 @@ def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
             F[row : row + d - c, column : column + b - a] += rest[c:d, a:b]
 
 
-def _eliminated(F: np.ndarray, front: Front) -> list[Eliminated]:
+def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
     """Eliminate a group in its matrix F (n + m, n + m), whose lower triangle becomes that of what is left."""
-    from scipy.linalg import get_lapack_funcs
-
-    factor, solve = get_lapack_funcs(("getrf", "getrs"), (F,))
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     for a in range(0, n, PIVOTS):
         b = min(a + PIVOTS, n)
         A = np.tril(F[a:b, a:b])
-        lu, pivots, info = factor(A + np.tril(A, -1).T)
-        if info != 0:
-            raise np.linalg.LinAlgError("singular")
+        inverse = _inverted(A + np.tril(A, -1).T)
         B = F[b:, a:b].T
-        X = solve(lu, pivots, B)[0] if B.shape[1] else B.copy()
-        found.append(Eliminated(every[a:b], every[b:], lu, pivots, X))
-        _take_off(F[b:, b:], B, X)
+        X = inverse @ B
+        found.append(Eliminated(every[a:b], every[b:], inverse, X))
+        _take_off(F[b:, b:], B, X, scratch)
     return found
 
 
-def _take_off(rest: np.ndarray, B: np.ndarray, X: np.ndarray) -> None:
+def _inverted(A: np.ndarray) -> np.ndarray:
+    """The inverse of a matrix that is not empty."""
+    from scipy.linalg import get_lapack_funcs
+
+    factor, invert = get_lapack_funcs(("getrf", "getri"), (A,))
+    lu, pivots, info = factor(A)
+    inverse, wrong = invert(lu, pivots, overwrite_lu=True)
+    if info or wrong:
+        raise np.linalg.LinAlgError("singular")
+    return inverse
+
+
+def _take_off(rest: np.ndarray, B: np.ndarray, X: np.ndarray, scratch: np.ndarray) -> None:
     """Take B^T X, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile."""
     for j in range(0, len(rest), TILE):
         for i in range(j, len(rest), TILE):
-            rest[i : i + TILE, j : j + TILE] -= B[:, i : i + TILE].T @ X[:, j : j + TILE]
+            tile = rest[i : i + TILE, j : j + TILE]
+            product = scratch[: tile.size].reshape(tile.shape, order="F")
+            np.matmul(B[:, i : i + TILE].T, X[:, j : j + TILE], out=product)
+            tile -= product
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
@@ -236,16 +324,13 @@ def _backward_error(size: Any, x: np.ndarray, b: np.ndarray, out: np.ndarray) ->
 
 
 def _once(factor: Factor, b: np.ndarray) -> np.ndarray:
-    from scipy.linalg import get_lapack_funcs
-
     if not factor.steps:  # nothing is free
         return b
-    y = b.astype(factor.steps[0].lu.dtype)
-    (solve,) = get_lapack_funcs(("getrs",), (factor.steps[0].lu,))
-    for own, after, lu, pivots, X in factor.steps:
-        near = y[own]
-        y[after] -= near @ X
-        y[own] = solve(lu, pivots, near)[0]
-    for own, after, _, _, X in reversed(factor.steps):
-        y[own] -= X @ y[after]
+    y = b.astype(factor.steps[0].X.dtype)
+    for step in factor.steps:
+        near = y[step.own]
+        y[step.after] -= near @ step.X
+        y[step.own] = step.inverse @ near
+    for step in reversed(factor.steps):
+        y[step.own] -= step.X @ y[step.after]
     return y

@@ -6,13 +6,13 @@ matrix, follows where that fails.
 """
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Number
 from liverjax.solvers import multifrontal
 from liverjax.solvers.direct import across
 from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_part
@@ -23,6 +23,7 @@ Motions = Motion
 KEPT = 2e9
 
 _factors: dict[bytes, multifrontal.Factor] = {}
+_orders: dict[bytes, "_Order"] = {}
 
 
 def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> Motions:
@@ -74,57 +75,101 @@ def at_every(A: Operator, factors: jax.Array, omegas: jax.Array, x: Motions) -> 
     return jax.lax.map(lambda at: forces_of_motion(A, *at), (factors, omegas, x))
 
 
-class _Sparse(NamedTuple):
-    """Places of the entries, and what is free; all x of the nodes come first, the pressures last."""
+class _Order(NamedTuple):
+    """Places of the entries, and which unknowns are eliminated when: the same for all moduli and frequencies.
 
-    parts: list  # values as functions of m and omega
-    lines: np.ndarray
-    columns: np.ndarray
-    keep: np.ndarray  # numbers of the free unknowns
-    normals: Any  # n n^T of nodes that slide, or None
-    size: int
+    x, y, z of a node stand together here, and the pressures last.
+    """
+
+    pairs: np.ndarray  # (n n E,) place of each two nodes of an element among the blocks
+    blocks: Any  # csr (V, V): two nodes of an element
+    free: np.ndarray  # numbers of the free unknowns
+    plan: list[multifrontal.Front]
 
 
 def _host(*given: object) -> np.ndarray:
     A, factors, omegas, b = jax.tree.map(np.asarray, given)
-    system, plan, matrix, x = _system(A, b.shape[1]), None, _digest(A), np.zeros_like(b)
+    V, size = len(A.points), b.shape[1]
+    by_node = np.concatenate([np.arange(3 * V).reshape(3, V).T.ravel(), np.arange(3 * V, size)])
+    free = _free_unknowns(A)
+    order, matrix, x = None, _digest(A), np.zeros_like(b)
     for f, omega in enumerate(omegas):
-        key, load = matrix + factors[f].tobytes() + np.float64(omega).tobytes(), b[f, system.keep]
+        key, load = matrix + factors[f].tobytes() + np.float64(omega).tobytes(), b[f, by_node[free]]
         found, error = (None, np.inf) if key not in _factors else multifrontal.refined_solution(_factors[key], load)
         if error > multifrontal.WRONG:
-            K = _matrix(system, factors[f], omega)
-            plan = _plan(A, system, K) if plan is None else plan
-            found = _first_solution(K, plan, load, key)
-        x[f, system.keep] = found
+            order = _order(A, free) if order is None else order
+            found = _first_solution(_matrix(A, order, factors[f], omega), order.plan, load, key)
+        x[f, by_node[free]] = found
     return x
+
+
+def _free_unknowns(A: Any) -> np.ndarray:
+    keep = A.free.mask.ravel()
+    return np.flatnonzero(keep if A.pressures is None else np.concatenate([keep, A.pressures.mask]))
 
 
 def _digest(A: Any) -> bytes:
     """The same for the same numbers."""
-    found = hashlib.blake2b(digest_size=16)
-    for leaf in jax.tree.leaves(A):
-        found.update(np.ascontiguousarray(leaf).tobytes())
-    return found.digest()
+
+    def of_leaf(leaf: np.ndarray) -> bytes:
+        return hashlib.blake2b(np.ascontiguousarray(leaf).data, digest_size=16).digest()
+
+    with ThreadPoolExecutor() as pool:
+        return hashlib.blake2b(b"".join(pool.map(of_leaf, jax.tree.leaves(A))), digest_size=16).digest()
 
 
-def _matrix(system: _Sparse, factor: np.ndarray, omega: float) -> Any:
+def _order(A: Any, free: np.ndarray) -> _Order:
+    """The order of this mesh: the last one, if it is the same."""
     import scipy.sparse  # a fifth of the time that importing the package takes: only where it is used
 
-    values = np.concatenate([part(factor, omega) for part in system.parts])
-    K = scipy.sparse.coo_array((values, (system.lines, system.columns)), shape=(system.size,) * 2).tocsr()
-    if system.normals is not None:
-        inside = scipy.sparse.eye_array(system.size) - system.normals
-        K = inside @ K @ inside + abs(K.diagonal()).mean() * system.normals
-    return K[system.keep][:, system.keep]
-
-
-def _plan(A: Any, system: _Sparse, K: Any) -> list[multifrontal.Front]:
-    """Which unknowns are eliminated when."""
     V, widths = len(A.points), [A.nodes, *(own.nodes for own in A.attached)]
-    most = max(len(nodes) for nodes in widths)
-    elements = np.concatenate([np.pad(nodes, ((0, most - len(nodes)), (0, 0)), "edge") for nodes in widths], axis=1)
-    node = np.where(system.keep < 3 * V, system.keep % V, system.keep - 3 * V)
-    return multifrontal.fronts(K, multifrontal.dissected(elements, np.asarray(A.points)), node)
+    key = _digest((widths, A.points, free))
+    if key not in _orders:
+        lines, columns = (a.ravel() for a in np.broadcast_arrays(A.nodes[:, None], A.nodes[None]))
+        known, pairs = np.unique(lines.astype(np.int64) * V + columns, return_inverse=True)
+        ends = np.searchsorted(known, V * np.arange(V + 1))
+        blocks = scipy.sparse.csr_array((np.ones(len(known)), known % V, ends), shape=(V, V))
+        near = blocks
+        for nodes in widths[1:]:
+            at = tuple(a.ravel() for a in np.broadcast_arrays(nodes[:, None], nodes[None]))
+            near = near + scipy.sparse.coo_array((np.ones(len(at[0])), at), shape=(V, V))
+        most = max(len(nodes) for nodes in widths)
+        elements = np.concatenate([np.pad(nodes, ((0, most - len(nodes)), (0, 0)), "edge") for nodes in widths], axis=1)
+        groups = multifrontal.dissected(elements, np.asarray(A.points))
+        plan = multifrontal.fronts(near.tocsr(), groups, np.where(free < 3 * V, free // 3, free - 3 * V))
+        _orders.clear()
+        _orders[key] = _Order(pairs, blocks, free, plan)
+    return _orders[key]
+
+
+def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
+    """K(omega) - omega^2 M of the free unknowns."""
+    import scipy.sparse
+
+    V, blocks = len(A.points), order.blocks
+    size, data = 3 * V, np.empty((blocks.nnz, 3, 3), complex)
+    for r, s in np.ndindex(3, 3):
+        own = factor * A.relaxing[:, r, :, s]
+        if A.rest is not None:
+            own += A.rest[:, r, :, s]
+        if r == s and A.mass is not None and A.mass.ndim == 3:
+            own -= omega**2 * A.mass
+        for part, to in ((own.real, data.real), (own.imag, data.imag)):
+            to[:, r, s] = np.bincount(order.pairs, part.ravel(), blocks.nnz)
+    K = scipy.sparse.bsr_array((data, blocks.indices, blocks.indptr), shape=(size, size)).tocsr()
+    more = _entries_beside(A, omega)
+    if more:
+        size += 0 if A.pressures is None else len(A.pressures.mask)
+        values, lines, columns = (np.concatenate(a) for a in zip(*more, strict=True))
+        K.resize((size, size))
+        K = (K + scipy.sparse.coo_array((values, (lines, columns)), shape=(size, size))).tocsr()
+    if A.free.normals is not None:
+        # Nodes that slide: n n^T of each.
+        by_node = np.concatenate([np.arange(3 * V).reshape(3, V).T.ravel(), np.arange(3 * V, size)])
+        normals = _with_empty_lines(across(A.free.normals, 3 * V), size)[by_node][:, by_node]
+        inside = scipy.sparse.eye_array(size) - normals
+        K = (inside @ K @ inside + abs(K.diagonal()).mean() * normals).tocsr()
+    return K if len(order.free) == size else K[order.free][:, order.free]
 
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, key: bytes) -> np.ndarray:
@@ -160,55 +205,28 @@ def _pivoted(K: Any, b: np.ndarray) -> np.ndarray:
         return np.full(len(b), np.nan)
 
 
-def _system(A: Any, size: int) -> _Sparse:
-    V = len(A.points)
-    at = A.nodes[:, None] + V * np.arange(3)[None, :, None]  # (n, 3, E)
-    places = [_places_of_blocks(at)]
-    rest = 0.0 if A.rest is None else A.rest
-    mass: Any = 0.0
-    if A.mass is not None and A.mass.ndim == 3:
-        mass = A.mass[:, None, :, None] * np.eye(3)[None, :, None, :, None]
-    parts: list = [lambda m, w: (m * A.relaxing + rest - w**2 * mass).reshape(-1)]
-    every = np.arange(V)
+def _entries_beside(A: Any, omega: float) -> list[tuple]:
+    """Values, lines and columns of all but the elements' motion: masses and springs of nodes, what is attached,
+    pressures."""
+    every, found = 3 * np.arange(len(A.points)), []
     if A.mass is not None and A.mass.ndim == 1:
-        places.append([np.arange(3 * V)] * 2)
-        parts.append(lambda m, w: -(w**2) * np.tile(A.mass, 3) + 0j)
+        found += [(-(omega**2) * A.mass + 0j, every + r, every + r) for r in range(3)]
     for r, c in np.ndindex(3, 3):
         if A.springs is not None and A.springs[r][c] is not None:
-            places.append([r * V + every, c * V + every])
-            parts.append(lambda m, w, K=A.springs[r][c]: K + 0j)
+            found.append((A.springs[r][c] + 0j, every + r, every + c))
     for K in A.attached:
-        places.append(_places_of_blocks(K.nodes[:, None] + V * np.arange(3)[None, :, None]))
-        parts.append(lambda m, w, K=K: K.blocks.ravel() + 0j)
-    keep = A.free.mask.T.ravel()
+        at = 3 * K.nodes[:, None] + np.arange(3)[None, :, None]
+        lines, columns = (a.ravel() for a in np.broadcast_arrays(at[:, :, None, None], at[None, None]))
+        found.append((K.blocks.ravel() + 0j, lines, columns))
     if A.pressures is not None:
-        more, where = _of_pressures(A.pressures, at, V)
-        parts, places = parts + more, places + where
-        keep = np.concatenate([keep, A.pressures.mask])
-    normals = None if A.free.normals is None else _with_empty_lines(across(A.free.normals, 3 * V), size)
-    lines, columns = (np.concatenate(a) for a in zip(*places, strict=True))
-    return _Sparse(parts, lines, columns, np.flatnonzero(keep), normals, size)
-
-
-def _places_of_blocks(at: np.ndarray) -> list[np.ndarray]:
-    """Lines and columns of matrices (n, 3, n, 3, E)."""
-    return [a.ravel() for a in np.broadcast_arrays(at[:, :, None, None], at[None, None])]
-
-
-def _of_pressures(own: Any, at: np.ndarray, V: int) -> tuple[list, list]:
-    """Values and places of what couples motions and pressures, and pressures among themselves."""
-    p = 3 * V + own.nodes
-    line, column = (a.ravel() for a in np.broadcast_arrays(at[:, :, None], p[None, None]))
-    among = [a.ravel() for a in np.broadcast_arrays(p[:, None], p[None])]
-
-    def pulled(m: Number, w: float) -> np.ndarray:
-        return own.pull.ravel() + 0j
-
-    def stored(m: Number, w: float) -> np.ndarray:
-        flow = 0.0 if own.flow is None else own.flow / (1j * w)
-        return -(own.store + flow).ravel() + 0j
-
-    return [pulled, pulled, stored], [[line, column], [column, line], among]
+        own, p = A.pressures, 3 * len(A.points) + A.pressures.nodes
+        at = 3 * A.nodes[:, None] + np.arange(3)[None, :, None]
+        line, column = (a.ravel() for a in np.broadcast_arrays(at[:, :, None], p[None, None]))
+        flow = 0.0 if own.flow is None else own.flow / (1j * omega)
+        among = [a.ravel() for a in np.broadcast_arrays(p[:, None], p[None])]
+        pull = own.pull.ravel() + 0j
+        found += [(pull, line, column), (pull, column, line), (-(own.store + flow).ravel() + 0j, *among)]
+    return found
 
 
 def _with_empty_lines(N: Any, size: int) -> Any:
