@@ -34,7 +34,9 @@ def main(arguments: list[str] | None = None) -> int:
     """The command; 0 if every script ended well."""
     parser = argparse.ArgumentParser(prog="python -m experiments", description="Run experiments and write the pages.")
     parser.add_argument("names", nargs="+", choices=["all", "pages", *ROWS], metavar="all | pages | NAME")
-    parser.add_argument("--quick", action="store_true", help="smaller cases, into results/quick: all in 25 minutes")
+    parser.add_argument(
+        "--quick", action="store_true", help="smaller cases, into results/quick: all in about 40 minutes"
+    )
     options = parser.parse_args(arguments)
     scripts = list(ROWS) if "all" in options.names else [n for n in options.names if n != "pages"]
     good = [run(script, options.quick) for script in scripts]

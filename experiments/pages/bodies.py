@@ -18,7 +18,7 @@ def in_place() -> str:
 def indented() -> str:
     """One line: how wrong a half-space is, and what fits find."""
     (data,) = load("indentation")
-    soft = {r["thickness"]: r for r in data["layers"] if r["poisson"] == 0.499}
+    soft = {r["thickness"]: r for r in data["layers"] if r["poisson"] == 0.5}
     fits = data["fits"]
     moduli, covered = [r["modulus_off"] for r in fits], [r["modulus_covered"] for r in fits]
     return (
@@ -118,14 +118,18 @@ def _layers() -> list[str]:
     ratios = sorted({r["thickness"] for r in data["layers"]})
     rows = [
         "A sphere on a bonded layer: modulus that Hertz's half-space finds over the true one, by the layer's thickness",
-        "over the contact's radius sqrt(R d); in brackets the error of the force by the series of Dimitriadis et al.:",
+        "over the contact's radius sqrt(R d); in brackets the error of the force by the series of Dimitriadis et al.",
+        "(equation 12, for an incompressible layer):",
         "",
-        "| Poisson's ratio | " + " | ".join(f"{t:g}" for t in ratios) + " |",
+        "| Poisson's ratio | " + " | ".join(f"thickness {t:g}" for t in ratios) + " |",
         "|---" * (1 + len(ratios)) + "|",
     ]
     for poisson in sorted({r["poisson"] for r in data["layers"]}):
         own = {r["thickness"]: r for r in data["layers"] if r["poisson"] == poisson}
-        cells = (f"{own[t]['hertz']:.3g} ({100 * own[t]['series_error']:+.2g} %)" for t in ratios)
+        cells = (
+            f"{own[t]['hertz']:.3g}" + (f" ({100 * own[t]['series_error']:+.2g} %)" if "series_error" in own[t] else "")
+            for t in ratios
+        )
         rows.append(f"| {poisson:g} | " + " | ".join(cells) + " |")
     rows += [
         "",

@@ -51,7 +51,7 @@ def table() -> str:
         "the upper corner of the clamp, where the stress has no bound. The truth of the twisted column is that of",
         "mixed elements on 5 x 5 x 15 cells with their own estimate added: mixed rows are judged by their own kind.",
         f"That of Land's beam is 3,840 quadratic elements with theirs, {beam:.3f} mm. Run: on one free core, without",
-        "and with the estimate; rows without the latter are of an older run.",
+        "and with the estimate; where the latter is empty it was not timed.",
         "",
         "| body, K/mu | elements | number | error | effectivity | corrected | iterations | run | corrected run |",
         "|---" * 9 + "|",

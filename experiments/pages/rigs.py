@@ -14,7 +14,7 @@ def rigs() -> str:
         "Readings of the rigs at small strain, against an axisymmetric solver that shares no line with the project",
         "(`axisymmetric_reference.py`): error, run time of a step; height = radius, K/mu = 20 and 1e4. A whole",
         "cylinder has cells of one size, a sector is graded to the rims and to the punch's edge; the default is in",
-        "bold. Times are of one core, beside other work on the other:",
+        "bold. Times are of one of two cores; the other was busy:",
         "",
         "| mesh | elements (tension) | " + " | ".join(f"{t}, {k}" for t in TESTS for k in ("20", "1e4")) + " |",
         "|---" * (2 + 2 * len(TESTS)) + "|",

@@ -30,6 +30,8 @@ def meshes() -> str:
     for r in known["land"]:
         row("Land's beam, end", r, r["end_mm"], "4.0-4.2 mm, Land et al. 2015 (against 4.1)", 4.1)
     for r in known["cantilever"]:
+        if r["mazier_y_m"] is None:
+            continue
         theirs = -1e3 * r["mazier_y_m"]
         body = "silicone cantilever" + (", volumes at the nodes" if r["volumetric"] == "nodal" else "")
         row(body, r, -1e3 * r["tip_m"][0], f"{theirs:.1f} mm, Mazier et al. 2021 on as many; measured 116", theirs)

@@ -26,7 +26,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--plates", choices=("parallel", "cone"), default="parallel", help="default parallel")
     command.add_argument("--max-strain", type=float, metavar="X", help="leave out points above it; 0.1 is 10 %%")
     command.add_argument("--table", metavar="NAME", help="of a file with several tables: a part of its name")
-    command.add_argument("--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results")
+    command.add_argument(
+        "--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results (amplitude)"
+    )
     return command
 
 

@@ -24,7 +24,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--half-angle", type=float, default=45.0, metavar="DEG", help="of the cone, axis to side")
     command.add_argument("--thickness", type=float, required=True, metavar="M", help="of the layer [m]")
     command.add_argument("--poisson", type=float, default=0.5, metavar="NU", help="Poisson's ratio (default 0.5)")
-    command.add_argument("--out", type=Path, default=Path("indentation"), metavar="DIR", help="folder of the results")
+    command.add_argument(
+        "--out", type=Path, default=Path("indentation"), metavar="DIR", help="folder of the results (indentation)"
+    )
     return command
 
 

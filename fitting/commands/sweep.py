@@ -29,14 +29,16 @@ def parser(prog: str) -> argparse.ArgumentParser:
         description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
         epilog=f"Tests in time: {prog} relaxation --help, {prog} creep --help. "
         f"Stress-stretch curves: {prog} curves --help. Displacements of a body: {prog} field --help. "
-        f"Strain sweeps: {prog} amplitude --help. Waves on voxels: {prog} waves --help. " + EXIT_CODES,
+        f"Indentation: {prog} indentation --help. Strain sweeps: {prog} amplitude --help. "
+        f"Waves on voxels: {prog} waves --help. " + EXIT_CODES,
     )
     command.add_argument(
         "sweep",
         type=Path,
         nargs="+",
         metavar="SWEEP.csv",
-        help="frequency sweep: CSV, TRIOS or RheoCompass text; several files are samples of one material",
+        help="frequency sweep: CSV or an export of a rheometer (fitting/README.md); several files are samples of one "
+        "material",
     )
     command.add_argument(
         "--with",

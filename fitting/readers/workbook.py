@@ -29,7 +29,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
         import python_calamine
     except ImportError:
         raise InputError(
-            f"{path} is a spreadsheet workbook, which needs python-calamine: pip install python-calamine, or export "
+            f"{path} is a spreadsheet workbook, which needs python-calamine: pip install '.[excel]', or export "
             f"{wanted} as CSV"
         ) from None
     try:

@@ -11,7 +11,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("range", nargs="+", metavar="NAME=LOW:HIGH", help="e.g. law.mu=500:1000")
     command.add_argument("--kind", default="sobol", metavar="KIND", help="grid | latin | sobol (sobol)")
     command.add_argument("--rows", type=int, default=64, metavar="N", help="how many (64)")
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="of the random ones (0)")
+    command.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of the random numbers of latin and sobol (0)"
+    )
     command.set_defaults(run=run)
 
 

@@ -5,7 +5,9 @@ import argparse
 
 def add(parsers: argparse._SubParsersAction) -> None:
     """Declare the command for --help; `fitting` declares and reads its arguments."""
-    parsers.add_parser("fit", help="parameters from a frequency sweep, curves or displacements", add_help=False)
+    parsers.add_parser(
+        "fit", help="parameters from sweeps, tests in time, indentation, curves, displacements or waves", add_help=False
+    )
 
 
 def run(arguments: list[str], prog: str) -> int:

@@ -24,7 +24,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
     )
     command.add_argument("--field", default="displacement", metavar="NAME", help="of a result: cauchy_stress, …")
     command.add_argument("--step", type=int, metavar="N", help="of a result, from 1; default the last")
-    command.add_argument("--stretch", nargs=2, type=float, default=(0.6, 1.6), metavar=("LOW", "HIGH"), help="0.6 1.6")
+    command.add_argument(
+        "--stretch", nargs=2, type=float, default=(0.6, 1.6), metavar=("LOW", "HIGH"), help="of a law (0.6 1.6)"
+    )
     add_out(command)
     command.set_defaults(run=run)
 
