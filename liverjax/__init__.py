@@ -39,7 +39,7 @@ from liverjax.reduced.bias import reduced_bias
 from liverjax.reduced.estimate import reduced_error
 from liverjax.reduced.files import load_reduced, save_reduced
 from liverjax.reduced.model import ReducedModel, reduced_identity
-from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced, stated_error
+from liverjax.reduced.run import ReducedResult, reduced_positions, reduced_pressure, simulate_reduced, stated_error
 from liverjax.reduced.separated import SeparatedModel, separate, separated_displacement
 from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.regions import Region
@@ -96,6 +96,7 @@ __all__ = [
     "reduced_error",
     "reduced_identity",
     "reduced_positions",
+    "reduced_pressure",
     "reference",
     "refined",
     "rim",

@@ -12,7 +12,7 @@ from liverjax.core.struct import replace
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
 from liverjax.reduced.run import _updated
-from liverjax.reduced.sampling import MOST_STATES, nonnegative_weights, sampled, states_of
+from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -150,8 +150,9 @@ def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained)
     q = lj.simulate_reduced(model, scene).coordinates
     # Mirrored elements, of which this law has no force, and a body that has not moved.
     bad = jnp.stack([jnp.zeros_like(q[0]), -1e3 * q[1], 1e3 * q[2]])
-    alone = sampled(whole, scene, {"law.mu": np.array([mu])}, q[None], 1e-3)
-    beside = sampled(whole, scene, {"law.mu": np.array([mu, mu])}, jnp.stack([q, bad]), 1e-3)
+    alone = sampled(whole, scene, {"law.mu": np.array([mu])}, Coordinates(q[None], None), 1e-3)
+    both = Coordinates(jnp.stack([q, bad]), None)
+    beside = sampled(whole, scene, {"law.mu": np.array([mu, mu])}, both, 1e-3)
     assert len(alone.points) > 1
     assert np.array_equal(alone.points, beside.points) and np.allclose(alone.weights, beside.weights, rtol=1e-9)
 
@@ -301,8 +302,9 @@ def test_derivatives_and_lanes(trained):
 def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     scene, model = trained
     q = np.random.default_rng(6).normal(size=(12, 6, 3))
-    fields = np.ones((2, 7, 3)) * np.arange(2)[:, None, None]
-    model = replace(model, correction=learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(7), 0.1)))
+    V = len(scene.mesh.points)
+    fields = np.ones((2, V, 3)) * np.arange(2)[:, None, None]
+    model = replace(model, correction=learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(V), 0.1)))
     lj.save_reduced(model, tmp_path / "model.h5")
     again = lj.load_reduced(tmp_path / "model.h5")
     assert again.identity == model.identity and np.array_equal(again.slopes, model.slopes)
@@ -315,13 +317,73 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
         lj.reduce_scene(scene, {"law.mu": np.linspace(700, 900, 9)}, runs=3)
     with pytest.raises(lj.InputError, match=r"was made for scene .* run python -m liverjax reduce"):
         lj.simulate_reduced(again, _bar((1, 1, 1)))
-    with pytest.raises(lj.InputError, match="no pore pressures"):
+    with pytest.raises(lj.InputError, match="was made for scene"):
         porous = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
         lj.simulate_reduced(again, replace(scene, porosity=porous))
     with pytest.raises(lj.InputError, match="is no reduced model"):
         lj.load_reduced(tmp_path / "none.h5")
     with pytest.raises(lj.InputError, match="between 0 and 1"):
         lj.reduce_scene(scene, {"law.mu": [800.0]}, tolerance=2.0)
+
+
+def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
+    _, model = trained
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["positions"] = np.zeros((2, 3))
+    with h5py.File(tmp_path / "groups.h5", "w") as file:
+        for name in ("modes", "slopes", "weights", "points"):
+            file.create_group(name)
+    for name in ("text", "foreign", "groups"):
+        with pytest.raises(lj.InputError, match=rf"{name}.h5 is no reduced model"):
+            lj.load_reduced(tmp_path / f"{name}.h5")
+    q = np.random.default_rng(6).normal(size=(12, 6, 3))
+    fields = np.ones((2, 7, 3)) * np.arange(2)[:, None, None]
+    learnt = learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(7), 0.1))
+    learnt = replace(learnt, fields=jnp.zeros((len(learnt.fields), model.modes.shape[1], 3)))
+    whole = replace(model, correction=learnt)
+    lj.save_reduced(whole, tmp_path / "whole.h5")
+    lj.load_reduced(tmp_path / "whole.h5")
+    damaged = {
+        "slopes has shape": replace(whole, weights=whole.weights[:-1]),
+        "points has shape": replace(whole, points=whole.points[1:]),
+        "modes has values that are no numbers": replace(whole, modes=whole.modes.at[0, 0, 0].set(jnp.nan)),
+        "inverse has shape": replace(whole, correction=replace(learnt, inverse=learnt.inverse[1:])),
+    }
+    for sentence, spoiled in damaged.items():
+        lj.save_reduced(spoiled, tmp_path / "spoiled.h5")
+        with pytest.raises(lj.InputError, match=rf"spoiled.h5 is damaged: {sentence}"):
+            lj.load_reduced(tmp_path / "spoiled.h5")
+    # A part of a file, as a copy that broke off leaves it.
+    (tmp_path / "short.h5").write_bytes((tmp_path / "whole.h5").read_bytes()[:3000])
+    with pytest.raises(lj.InputError, match="is no reduced model"):
+        lj.load_reduced(tmp_path / "short.h5")
+
+
+@pytest.mark.slow
+def test_a_stiff_lesion_is_identified_through_a_reduced_model():
+    """The modulus of a region, from data of a full run: as far off as one more full run states."""
+    scene = _bar((4, 2, 2), solve=lj.Solve(steps=2))
+    middle = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)].mean(axis=1)
+    inside = jnp.asarray(np.flatnonzero(np.abs(middle[:, 0] - 0.01) < 0.005))
+    scene = replace(scene, region=(lj.Region(elements=inside, law={"mu": 2000.0}),))
+    name, rng, true = "region.0.law.mu", np.random.default_rng(9), 2600.0
+    rows = {name: np.linspace(1000.0, 4000.0, 8), "law.mu": rng.uniform(700.0, 900.0, 8)}
+    model = replace(lj.reduce_scene(scene, rows, most_modes=3), correction=None)
+
+    def positions(mu):
+        own = lj.with_parameters(scene, {name: mu})
+        return lj.reduced_positions(model, own, lj.simulate_reduced(model, own))
+
+    data = lj.simulate(lj.with_parameters(scene, {name: true})).check().positions
+    both, mu = jax.jit(lambda mu: (positions(mu), jax.jacfwd(positions)(mu))), 1500.0
+    for _ in range(12):
+        x, J = both(mu)
+        mu = mu - float(jnp.vdot(J, x - data) / jnp.vdot(J, J))
+    off = mu - true
+    bias = float(lj.reduced_bias(model, scene, {name: mu}, lambda x: x)[name])
+    assert 1e-4 * true < abs(off) < 0.2 * true
+    assert abs(off - bias) < 0.2 * abs(off)
 
 
 SCENE = """
@@ -366,6 +428,15 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
     # The weight hangs on the held nodes, whichever model: 3 g of tissue.
     assert np.allclose(found["full"][1], [0, 0, 3e-3], rtol=0, atol=1e-9)
+
+
+def test_one_row_makes_a_model_without_correction(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text("law.mu\n800\n")
+    arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path / "model.h5")]
+    assert main(["reduce", *arguments]) == 0
+    assert "1 modes" in (said := capsys.readouterr().out) and "no correction: too few rows" in said
+    assert lj.load_reduced(tmp_path / "model.h5").correction is None
 
 
 REFUSED = """

@@ -15,7 +15,7 @@ from liverjax.jobs.sweep import read_sweep
 from liverjax.reduced.estimate import reduced_error
 from liverjax.reduced.files import load_reduced, save_reduced
 from liverjax.reduced.model import ReducedModel
-from liverjax.reduced.run import ReducedResult, reduced_positions, simulate_reduced
+from liverjax.reduced.run import ReducedResult, reduced_positions, reduced_pressure, simulate_reduced
 from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result
@@ -77,17 +77,27 @@ def tried(scene: Scene) -> Tried:
         f"reduced model: {model.number_of_modes} modes, {len(model.points)} of {scene.mesh.weights.size} points; "
         f"estimated error {error.max():.2g} m, {error.max() / moved:.2%} of the largest displacement"
     )
+    if found.pressure_error is not None:
+        said += f", and {float(found.pressure_error.max()):.2g} Pa of pressure"
     if np.any(np.asarray(first.status)) or not error.max() <= solve.reduced_tolerance * moved:
         limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
         return Tried(None, f"{said}: above {limit}, or a step failed, so the full model runs")
-    ran = Ran(_as_result(found, x), len(found.times), run_time, again - begin - run_time)
+    P = None if model.pressures is None else reduced_pressure(model, plain, found)
+    ran = Ran(_as_result(found, x, P), len(found.times), run_time, again - begin - run_time)
     return Tried(ran, said)
 
 
-def _as_result(found: ReducedResult, x: jax.Array) -> Result:
+def _as_result(found: ReducedResult, x: jax.Array, P: jax.Array | None) -> Result:
     zeros = jnp.zeros(len(found.times), jnp.int32)
     values = {"iterations": found.iterations, "residual": found.residual, "status": found.status}
     took = StepStatistics(**{name: values.get(name, zeros) for name in StepStatistics._fields})
     assert found.reactions is not None
-    result = Result(times=found.times, positions=x, reactions=found.reactions, status=found.status, statistics=took)
+    result = Result(
+        times=found.times,
+        positions=x,
+        reactions=found.reactions,
+        pressure=P,
+        status=found.status,
+        statistics=took,
+    )
     return jax.tree.map(np.asarray, result)

@@ -9,9 +9,14 @@ with the stiffness K of the reference shape and the same recursions in time. K a
 step costs the forces of the full mesh and one solve, and no iterations of Newton's method. In the static case the
 energy norm of e is the dual norm of r. The estimate leaves out terms of second order in e and the change of the
 stiffness by the deformation.
+
+Of a porous scene the pressures of the full mesh are solved for along the reduced motion, so that only forces are out
+of balance. Their error drives motion and pressure (`liverjax.reduced.fluid_error`). The pressure's own error is the
+distance of the reduced pressure from the one that was solved for, with what the error of the motion adds.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +30,9 @@ from liverjax.physics.base import End
 from liverjax.physics.inertia import FACTOR
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import coefficients, relaxing
+from liverjax.reduced.fluid_error import ErrorBefore, LinearFluid, coupled_solver, linear_fluid
 from liverjax.reduced.model import ReducedModel
-from liverjax.reduced.run import ReducedResult, reduced_positions
+from liverjax.reduced.run import ReducedResult, reduced_positions, reduced_pressure
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import (
     State,
@@ -40,6 +46,9 @@ from liverjax.simulation.equations import (
 )
 from liverjax.simulation.run import prepared
 
+if TYPE_CHECKING:
+    import scipy.sparse
+
 
 class _Body(NamedTuple):
     """The linear body that the error moves: sparse matrices (f, f) of the free degrees of freedom."""
@@ -50,31 +59,38 @@ class _Body(NamedTuple):
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
-    """The result with its estimated error (T,) [m] and reactions (T, V, 3) [N]; host side, beside the run of one scene.
+    """The result with its estimated errors (T,) [m], [Pa] and reactions (T, V, 3) [N]; host side, beside the run of one
+    scene.
 
     Args:
         model, scene, result: as of `simulate_reduced`.
     """
     own = prepared(scene)
-    residuals, reactions = _out_of_balance(own, reduced_positions(model, scene, result))
-    e = _errors(own, np.asarray(residuals))
-    return replace(result, error=jnp.asarray(np.linalg.norm(e, axis=-1).max(axis=1)), reactions=reactions)
+    residuals, reactions, P = _out_of_balance(own, reduced_positions(model, scene, result))
+    e, p = _errors(own, np.asarray(residuals))
+    error = jnp.asarray(np.linalg.norm(e, axis=-1).max(axis=1))
+    if P is None or p is None:
+        return replace(result, error=error, reactions=reactions)
+    off = np.abs(np.asarray(reduced_pressure(model, scene, result))[:, : P.shape[1]] - np.asarray(P) - p).max(axis=1)
+    return replace(result, error=error, reactions=reactions, pressure_error=jnp.asarray(off))
 
 
 @jax.jit
-def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces and reactions (T, V, 3) [N] of the full model along given positions (T, V, 3)."""
+def _out_of_balance(scene: Scene, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Out-of-balance forces and reactions (T, V, 3) [N] of the full model along given positions (T, V, 3), and the
+    fluid's pressure there (T, V) [Pa]."""
     sizes = force_sizes(scene)
 
-    def advance(state: State, given: tuple) -> tuple[State, tuple[jax.Array, jax.Array]]:
+    def advance(state: State, given: tuple) -> tuple[State, tuple]:
         k, own = given
         e = equations(scene, state, k, sizes)
         f = forces(e, unknowns(e, own), jnp.ones((), own.dtype))
         r = e.free.vectors(f.total, f.x)
-        return advanced(e, End(f.x, f.F, f.pressure)), (r, f.total - r)
+        return advanced(e, End(f.x, f.F, f.pressure)), (r, f.total - r, f.pressure)
 
     numbers = jnp.arange(1, len(x) + 1, dtype=x.dtype)
-    return jax.lax.scan(advance, initial_state(scene), (numbers, x))[1]
+    found: tuple = jax.lax.scan(advance, initial_state(scene), (numbers, x))[1]
+    return found
 
 
 def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
@@ -94,36 +110,51 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
     return _Body(stiffness(law), rest, mass)
 
 
-def _errors(scene: Scene, residuals: np.ndarray) -> np.ndarray:
-    """Motions (T, V, 3) [m] of the linear body under minus the residuals (T, V, 3) [N]."""
+def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Motions (T, V, 3) [m] of the linear body under minus the residuals (T, V, 3) [N], and pressures (T, V) [Pa]."""
     import scipy.sparse
-    from scipy.sparse.linalg import splu
 
     free = np.flatnonzero(np.asarray(free_directions(scene).mask).ravel())
     body, dt = _linear_body(scene, free), scene.solve.dt
+    fluid = None if scene.porosity is None else linear_fluid(scene, free)
     a, b, c = _recursion(scene)
     factor = FACTOR[scene.solve.integrator]
     inertia = 0.0 if body.mass is None else scipy.sparse.diags(factor / dt**2 * body.mass)
     still = 0.0 if body.rest is None else body.rest
-    solve = splu(((1 - a.sum()) * body.relaxing + still + inertia).tocsc()).solve
-    e, v, acceleration, stress = (np.zeros(len(free)) for _ in range(4))
-    gamma = np.zeros((len(a), len(free)))
+    solve = _solver((1 - a.sum()) * body.relaxing + still + inertia, fluid)
+    e, v, acceleration, stress, before = (np.zeros(len(free)) for _ in range(5))
+    gamma, p = np.zeros((len(a), len(free))), np.zeros(0 if fluid is None else len(fluid.unknown))
     found = np.zeros((len(residuals), residuals[0].size))
+    pressures = None if fluid is None else np.zeros((len(residuals), scene.mesh.number_of_vertices))
     for k, r in enumerate(residuals):
         load = -r.ravel()[free] + b @ gamma + c.sum() * stress
         if body.mass is not None:
             carried = acceleration if scene.solve.integrator == "newmark" else 0.0
             load = load + body.mass * (factor / dt**2 * (e + dt * v) + carried)
-        new = solve(load)
+        new, p = solve(load, ErrorBefore(e, before, p))
         if body.mass is not None:
             now = factor * ((new - e) / dt - v) / dt - carried
             v = v + 0.5 * dt * (acceleration + now) if scene.solve.integrator == "newmark" else (new - e) / dt
             acceleration = now
-        S = body.relaxing @ new
+        S = np.asarray(body.relaxing @ new)
         gamma = a[:, None] * S + b[:, None] * gamma + c[:, None] * stress
-        e, stress = new, S
+        e, before, stress = new, e, S
         found[k, free] = e
-    return found.reshape(residuals.shape)
+        if fluid is not None and pressures is not None:
+            pressures[k, fluid.unknown] = p
+    return found.reshape(residuals.shape), pressures
+
+
+def _solver(
+    K: "scipy.sparse.csr_array", fluid: LinearFluid | None
+) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
+    """As `coupled_solver`, or with K alone where there is no fluid."""
+    from scipy.sparse.linalg import splu
+
+    if fluid is not None:
+        return coupled_solver(K, fluid)
+    solve = splu(K.tocsc()).solve
+    return lambda load, last: (solve(load), last.pressure)
 
 
 def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

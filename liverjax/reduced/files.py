@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +12,16 @@ from liverjax.core.files import whole
 from liverjax.core.versions import versions
 from liverjax.reduced.correction import Correction
 from liverjax.reduced.model import ReducedModel
+from liverjax.reduced.pressure_modes import PressureModes
+
+if TYPE_CHECKING:
+    import h5py
 
 #: Arrays of a correction.
 _LEARNT = ("fields", "factors", "inverse", "scale", "statement", "left", "ratios")
 _UNITS = {"modes": "1", "slopes": "1/m", "weights": "m^3", "points": "1"}
+#: Arrays of modes of the pressure.
+_PRESSURES = {"modes": "1", "values": "1", "parts": "1", "slopes": "1/m"}
 
 
 def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") -> None:
@@ -38,6 +44,10 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
             for name in _LEARNT:
                 out[f"correction/{name}"] = np.asarray(getattr(model.correction, name))
             out["correction"].attrs["products"] = model.correction.products
+        if model.pressures is not None:
+            for name, unit in _PRESSURES.items():
+                out[f"pressures/{name}"] = np.asarray(getattr(model.pressures, name))
+                out[f"pressures/{name}"].attrs["unit"] = unit
         for name, value in model.ranges.items():
             out[f"ranges/{name}"] = np.asarray(value)
         out.attrs["identity"], out.attrs["scene"] = model.identity, scene_text
@@ -48,7 +58,7 @@ def load_reduced(file: str | Path) -> ReducedModel:
     """Read a reduced model that `save_reduced` wrote.
 
     Raises:
-        InputError: no file, or one of something else.
+        InputError: no file, one of something else, or a damaged one.
     """
     import h5py
 
@@ -59,15 +69,50 @@ def load_reduced(file: str | Path) -> ReducedModel:
             arrays = {name: jnp.asarray(array) for name, array in arrays.items()}
             ranges = {name: jnp.asarray(value[()]) for name, value in stored.get("ranges", {}).items()}
             identity = str(stored.attrs["identity"])
-            return ReducedModel(**arrays, ranges=ranges, correction=_correction(stored), identity=identity)
-    except (OSError, KeyError) as error:
+            correction, fluid = _correction(stored), _pressures(stored)
+        model = ReducedModel(**arrays, ranges=ranges, correction=correction, pressures=fluid, identity=identity)
+        wrong = _wrong(model)
+    except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{file} is no reduced model ({error}): make one with python -m liverjax reduce") from None
+    if wrong:
+        raise InputError(f"{file} is damaged: {wrong}; make it again with python -m liverjax reduce")
+    return model
 
 
-def _correction(stored: Any) -> Correction | None:
+def _wrong(model: ReducedModel) -> str:
+    """The first array of another shape than the others ask for, or that has no numbers; empty: none."""
+    n, V, S = *jnp.shape(model.modes)[:2], *jnp.shape(model.weights)[:1]
+    shapes: dict[str, tuple] = {"modes": (n, V, 3), "slopes": (9, S, n), "weights": (S,), "points": (S,)}
+    arrays = {name: getattr(model, name) for name in shapes}
+    own, fluid = model.correction, model.pressures
+    if own is not None:
+        k, m = jnp.shape(own.factors)
+        shapes |= {"fields": (m, V, 3), "factors": (k, m), "inverse": (k, k), "scale": (), "statement": (4,)}
+        arrays |= {name: getattr(own, name) for name in ("fields", "factors", "inverse", "scale", "statement")}
+    if fluid is not None:
+        m, vertices = jnp.shape(fluid.modes)
+        of_fluid = {"modes": (m, vertices), "values": (S, m), "parts": (m, 4, S), "slopes": (m, 3, S)}
+        shapes |= {f"pressures.{name}": shape for name, shape in of_fluid.items()}
+        arrays |= {f"pressures.{name}": getattr(fluid, name) for name in of_fluid}
+    for name, array in arrays.items():
+        if jnp.shape(array) != shapes[name]:
+            return f"{name} has shape {jnp.shape(array)}, not {shapes[name]}"
+        if not np.all(np.isfinite(np.asarray(array))):
+            return f"{name} has values that are no numbers"
+    return ""
+
+
+def _correction(stored: "h5py.File") -> Correction | None:
     """The correction of an open file, where it has one."""
     if "correction" not in stored:
         return None
     own = stored["correction"]
     arrays = {name: jnp.asarray(own[name][()]) for name in _LEARNT}
     return Correction(**arrays, products=int(own.attrs["products"]))
+
+
+def _pressures(stored: "h5py.File") -> PressureModes | None:
+    """Modes of the pressure of an open file, where it has some."""
+    if "pressures" not in stored:
+        return None
+    return PressureModes(**{name: jnp.asarray(stored["pressures"][name][()]) for name in _PRESSURES})

@@ -20,8 +20,10 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Physics
 from liverjax.physics.elasticity import Elasticity
 from liverjax.physics.loads import follows
+from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.reduced.correction import Correction
+from liverjax.reduced.pressure_modes import PressureModes, pressure_modes
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Scene
@@ -38,6 +40,7 @@ class ReducedModel:
     points: jax.Array = param("1", "number q E + e of point q of element e (S,)")
     ranges: dict[str, Any] = param("1", "parameters of the training: name -> lowest and highest value")
     correction: Correction | None = param("1", "of what modes and points leave out, or none", default=None)
+    pressures: PressureModes | None = param("1", "of a porous scene", default=None)
     identity: str = static(default="", about="digest of what modes and points are made for")
 
     @property
@@ -57,8 +60,9 @@ def as_matrix(flat: jax.Array) -> Matrix:
     return tuple(tuple(flat[3 * i + j] for j in range(3)) for i in range(3))
 
 
-def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
-    """The model of these modes (n, V, 3) that takes the stress at every point: Galerkin's projection."""
+def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None = None) -> ReducedModel:
+    """The model of these modes (n, V, 3), and (m, V) of pressures, that takes the stress at every point: Galerkin's
+    projection."""
     mesh = scene.mesh
     slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
     w = mesh.weights.ravel()
@@ -68,6 +72,7 @@ def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
         weights=w,
         points=jnp.arange(w.size, dtype=jnp.int32),
         ranges={},
+        pressures=None if pressures is None else pressure_modes(mesh, pressures),
         identity=reduced_identity(scene),
     )
 
@@ -75,7 +80,7 @@ def with_all_points(scene: Scene, modes: jax.Array) -> ReducedModel:
 def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
     """The physics in the elements of the full model; its law has the numbers of the sampled points."""
     E = scene.mesh.number_of_elements
-    law = law_of_elements(scene.law, scene.region, E)
+    law = law_of_elements(law_at_rest(scene), scene.region, E)
     elements = model.points % E
     law = jax.tree.map(lambda a: jnp.asarray(a)[elements] if jnp.shape(a) in ((E,), (E, 3)) else a, law)
     assert isinstance(law, Law)
@@ -83,7 +88,7 @@ def solid_at_points(model: ReducedModel, scene: Scene) -> Physics:
 
 
 def reduced_identity(scene: Scene) -> str:
-    """Digest of mesh, held and moved nodes, kind of law, viscosity and run: other numbers leave it as it is."""
+    """Digest of mesh, held, moved and drained nodes, kind of law, viscosity, porosity and run, not of numbers."""
     whole = hashlib.sha256()
     for array in (scene.mesh.points, scene.mesh.tetrahedra):
         whole.update(np.ascontiguousarray(np.asarray(array)).tobytes())
@@ -92,6 +97,10 @@ def reduced_identity(scene: Scene) -> str:
     parts.append(None if prony is None else (prony.part, prony.scheme, len(jnp.atleast_1d(jnp.asarray(prony.ratios)))))
     parts += [(np.asarray(c.nodes).tolist(), c.axes) for held in (scene.fixed, scene.displaced) for c in held]
     parts += [scene.solve.kind, scene.solve.dt is None]
+    sponge = scene.porosity
+    if sponge is not None:
+        drained = None if sponge.drained is None else np.asarray(sponge.drained).tolist()
+        parts.append((sponge.scheme, sponge.keep_bulk, drained))
     whole.update(repr(parts).encode())
     return whole.hexdigest()[:16]
 
@@ -100,15 +109,15 @@ def refuse_unknown_physics(scene: Scene) -> None:
     """Refuse a scene whose physics reduced models do not have.
 
     Raises:
-        InputError: porosity, supports and other named physics, a loaded mesh, pressures that follow, averaged or mixed
-            volumes.
+        InputError: inlets of a fluid, supports and other named physics, a loaded mesh, pressures that follow, averaged
+            or mixed volumes.
     """
     if any(region.viscosity for region in scene.region):
         raise InputError("a reduced model has one viscosity: leave that of regions out, or run the full model")
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError("a reduced model has one kind of law: give regions other numbers of it, or run the full model")
-    if scene.porosity is not None:
-        raise InputError("a reduced model has no pore pressures: leave [porosity] out, or run the full model")
+    if scene.porosity is not None and scene.porosity.inlet:
+        raise InputError("a reduced model has no [[porosity.inlet]]: leave it out, or run the full model")
     if scene.points_are == "loaded":
         raise InputError('[mesh] is = "loaded" is not for reduced models: take the scene of lj.unloaded(scene)')
     if scene.physics:

@@ -12,6 +12,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh.promotion import on_middles
 from liverjax.physics.base import End, Free, Solid, Step
 from liverjax.physics.elasticity import Elastic, Elasticity
 from liverjax.physics.inertia import FACTOR
@@ -19,6 +20,17 @@ from liverjax.physics.loads import Loads, dead_loads
 from liverjax.physics.prescribed import prescribed
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.correction import correction_at, stated_at
+from liverjax.reduced.fluid import (
+    Flowing,
+    advanced_fluid,
+    flowing,
+    fluid_at_rest,
+    porosity_at_points,
+    pressure_coordinates,
+    stiffness_of_pressures,
+    volume_blocks,
+    volume_stress,
+)
 from liverjax.reduced.model import (
     ReducedModel,
     as_matrix,
@@ -28,7 +40,7 @@ from liverjax.reduced.model import (
 )
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_before_run
-from liverjax.tensors.matrices import IDENTITY, determinant
+from liverjax.tensors.matrices import IDENTITY, add_matrices, determinant
 
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -42,17 +54,28 @@ class ReducedResult:
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     iterations: jax.Array = param("1", "(T,) of Newton's method")
     residual: jax.Array = param("1", "(T,) of the reduced equations over the forces at work")
+    pressures: jax.Array | None = param("Pa", "coordinates of the pressure's modes (T, m)", default=None)
     error: jax.Array | None = param(
         "m", "(T,) estimated largest distance of a node from the full model, where asked for", default=None
     )
     reactions: jax.Array | None = param("N", "(T, V, 3) as of the full model, where error is", default=None)
+    pressure_error: jax.Array | None = param(
+        "Pa", "(T,) estimated largest error of the fluid's pressure, of a porous scene where error is", default=None
+    )
 
 
 class ReducedMotion(NamedTuple):
-    """Velocity and acceleration of the coordinates (n,)."""
+    """Velocity and acceleration of the coordinates (n,), or of gradients at the points (9, S)."""
 
-    velocity: jax.Array  # [m/s]
-    acceleration: jax.Array  # [m/s^2]
+    velocity: jax.Array  # [m/s], [1/s]
+    acceleration: jax.Array  # [m/s^2], [1/s^2]
+
+
+class _Points(NamedTuple):
+    """Gradients of the modes' motion at the points; without derivatives, they serve guesses."""
+
+    G: jax.Array  # slopes times coordinates (9, S)
+    motion: ReducedMotion | None
 
 
 class _Given(NamedTuple):
@@ -71,22 +94,32 @@ class _Equations(NamedTuple):
     gradient: jax.Array
     mass: jax.Array | None  # (n, n) [kg]
     q: jax.Array  # at the beginning
+    points: _Points  # likewise
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
     spread: jax.Array | None  # sizes of the slopes (9, S, n) [1/m] where a part of the body is moved
     noise: jax.Array  # size of forces whose roundoff is the tolerance [N]: no load leaves only these
+    fluid: Flowing | None  # of a porous scene
 
 
-def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
-    """As `liverjax.physics.inertia.Moving.kinematics`."""
-    assert e.motion is not None
-    velocity = (q - e.q) / e.dt
-    acceleration = (velocity - e.motion.velocity) / e.dt
+def _kinematics(e: _Equations, motion: ReducedMotion, before: jax.Array, after: jax.Array) -> ReducedMotion:
+    """As `liverjax.physics.inertia.Moving.kinematics`, of coordinates or gradients before and after the step."""
+    velocity = (after - before) / e.dt
+    acceleration = (velocity - motion.velocity) / e.dt
     if e.newmark:
-        acceleration = 4 * acceleration - e.motion.acceleration
-        velocity = e.motion.velocity + 0.5 * e.dt * (e.motion.acceleration + acceleration)
+        acceleration = 4 * acceleration - motion.acceleration
+        velocity = motion.velocity + 0.5 * e.dt * (motion.acceleration + acceleration)
     return ReducedMotion(velocity, acceleration)
+
+
+def _straight_on(e: _Equations, motion: ReducedMotion | None, before: jax.Array) -> jax.Array:
+    """Coordinates or gradients at the end of the step, foretold from its beginning."""
+    if motion is None:
+        return before
+    after = before + e.dt * motion.velocity
+    # A parabola through the last ones. Accelerations of Newmark's method ring: they foretell nothing.
+    return after if e.newmark else after + e.dt**2 * motion.acceleration
 
 
 def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
@@ -111,13 +144,17 @@ def _noise(model: ReducedModel, scene: Scene) -> jax.Array:
 def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Out-of-balance forces (n,) and the size of all forces, with the deformation gradients F (9, S) of q."""
     P = _stresses(e.acting, F)
+    if e.fluid is not None:
+        p = pressure_coordinates(e.fluid, determinant(as_matrix(F)))
+        P = P + volume_stress(e.model, e.fluid.porosity, p, F)
     internal = jnp.tensordot(e.model.weights[None] * P, e.model.slopes, axes=2)
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
         # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
         size = size + jnp.linalg.norm(jnp.tensordot(e.model.weights[None] * jnp.abs(P), e.spread, axes=2))
     if e.mass is not None:
-        inertia = e.mass @ _kinematics(e, q).acceleration
+        assert e.motion is not None
+        inertia = e.mass @ _kinematics(e, e.motion, e.q, q).acceleration
         r, size = r + inertia, size + jnp.linalg.norm(inertia)
     return r, size
 
@@ -126,6 +163,9 @@ def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
     """Derivative of the residual (n, n): the elements' own blocks, with the axes for shape vectors."""
     B, F = e.model.slopes, _deformation(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
+    if e.fluid is not None:
+        more = volume_blocks(e.model, e.fluid, as_matrix(F), _PAIRS)
+        blocks = [add_matrices(a, b) for a, b in zip(blocks, more, strict=True)]
     A: list[list[Any]] = [[None] * 9 for _ in range(9)]
     for (i, j), K in zip(_PAIRS, blocks, strict=True):
         for r in range(3):
@@ -134,6 +174,8 @@ def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
     moduli = e.model.weights[None, None] * jnp.stack([jnp.stack(row) for row in A])
     AB = jnp.sum(moduli[..., None] * B[None], axis=1)
     elastic = jnp.tensordot(B, AB, axes=((0, 1), (0, 1)))
+    if e.fluid is not None:
+        elastic = elastic + stiffness_of_pressures(e.model, e.fluid, as_matrix(F))
     if e.mass is None:
         return elastic
     return elastic + FACTOR["newmark" if e.newmark else "euler"] / e.dt**2 * e.mass
@@ -255,14 +297,11 @@ def _solved(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse:
         own = jnp.linalg.inv(_reduced_tangent(e, at.q))
         return at._replace(inverse=own, fresh=jnp.array(True), tangents=at.tangents + 1)
 
-    start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
-    if e.motion is not None and not newmark:
-        # A parabola through the last coordinates. Accelerations of Newmark's method ring: they foretell nothing.
-        start = start + e.dt**2 * e.motion.acceleration
-    foretold, none = _deformation(e, start), jnp.zeros((), jnp.int32)
+    start, none = _straight_on(e, e.motion, e.q), jnp.zeros((), jnp.int32)
+    # Gradients are linear in the coordinates: no product with the modes.
+    foretold, there = (e.gradient + G for G in (_straight_on(e, e.points.motion, e.points.G), e.points.G))
     good = _upright(foretold)
-    start = jnp.where(good, start, e.q)
-    F = jax.lax.cond(good, lambda: foretold, lambda: _deformation(e, e.q))
+    start, F = jnp.where(good, start, e.q), jnp.where(good, foretold, there)
     r, size = _judged(e, start, F)
     begin = _ReducedIterate(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
     at = inner(begin)
@@ -326,18 +365,28 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """What a run begins with: coordinates, memory, motion at rest, an empty inverse, mass matrix. Without inertia
-    motion and mass are None."""
+    """What a run begins with: coordinates, memory, fluid, motion at rest, an empty inverse, mass matrix. Without
+    inertia motion and mass are None."""
     n, S = model.number_of_modes, model.weights.shape[0]
-    q = jnp.zeros(n, model.modes.dtype)
+    q, G = jnp.zeros(n, model.modes.dtype), jnp.zeros((9, S), model.modes.dtype)
     inverse = jnp.zeros((n, n), q.dtype)
     memory = None if scene.viscosity is None else initial_history(scene.viscosity, S, q.dtype)
+    fluid = None if scene.porosity is None else fluid_at_rest(model, scene)
     if scene.solve.kind != "dynamic" or scene.body is None:
-        return q, memory, None, inverse, None
+        return q, _Points(G, None), memory, fluid, None, inverse, None
     nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
     mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
     newmark = scene.solve.integrator == "newmark"
-    return q, memory, ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q), inverse, mass
+    motion = ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q)
+    points = jax.lax.stop_gradient(_Points(G, ReducedMotion(G, model.slopes @ motion.acceleration)))
+    return q, points, memory, fluid, motion, inverse, mass
+
+
+def _moved_on(e: _Equations, F: jax.Array) -> _Points:
+    """The gradients at the end of a step, from deformation gradients F (9, S)."""
+    before, G = e.points, jax.lax.stop_gradient(F - e.gradient)
+    motion = None if before.motion is None else _kinematics(e, before.motion, before.G, G)
+    return jax.lax.stop_gradient(_Points(G, motion))
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
@@ -346,24 +395,29 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
-    noise = _noise(model, scene)
+    noise, sponge = _noise(model, scene), None if scene.porosity is None else porosity_at_points(model, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:
-        q, memory, motion, inverse = carry
+        q, points, memory, fluid, motion, inverse = carry
         acting = solid.freeze(memory, step)
         newmark = solve.integrator == "newmark"
         load, gradient = given
-        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise)
+        flow = None if sponge is None else flowing(model, sponge, fluid, solve.dt)
+        e = _Equations(model, acting, load, gradient, mass, q, points, motion, solve.dt, None, spread, noise, flow)
         found = _newton(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
-        F = as_matrix(_deformation(e, found.q))
+        flat = _deformation(e, found.q)
+        F = as_matrix(flat)
         memory = solid.advance(memory, acting, End(points, F, None))
-        motion = None if motion is None else _kinematics(e, found.q)
+        points = _moved_on(e, flat)
+        motion = None if motion is None else _kinematics(e, motion, q, found.q)
+        fluid = None if flow is None else advanced_fluid(flow, flat)
         code = jnp.where(found.residual <= solve.tolerance, status.CONVERGED, status.STALLED)
         code = jnp.where(jnp.min(determinant(F)) <= 0, status.INVERTED, code)
         code = jnp.where(jnp.all(jnp.isfinite(found.q)), code, status.NOT_FINITE)
-        return (found.q, memory, motion, found.inverse), (found.q, code, found.iterations, found.residual)
+        row = found.q, code, found.iterations, found.residual, None if fluid is None else fluid.pressure
+        return (found.q, points, memory, fluid, motion, found.inverse), row
 
     return advance
 
@@ -379,9 +433,10 @@ def _reduced_run(model: ReducedModel, scene: Scene) -> ReducedResult:
     else:
         F = given.gradient[0]
         _, out = jax.lax.scan(lambda carry, load: advance(carry, (load, F)), tuple(begin), given.load)
-    q, code, iterations, residual = out
+    q, code, iterations, residual, p = out
     times = jnp.arange(1, T + 1, dtype=q.dtype) * (1.0 if scene.solve.dt is None else scene.solve.dt)
-    return ReducedResult(times=times, coordinates=q, status=code, iterations=iterations, residual=residual)
+    took = {"status": code, "iterations": iterations, "residual": residual}
+    return ReducedResult(times=times, coordinates=q, pressures=p, **took)
 
 
 def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
@@ -407,6 +462,17 @@ def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) 
         numbers = jnp.arange(1, solve.steps + 1, dtype=u.dtype)
         u = u + jax.vmap(lambda k, t: prescribed(mesh, scene.displaced, t, k / solve.steps))(numbers, result.times)
     return mesh.points[None] + u
+
+
+def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
+    """Pressure (T, V) [Pa] of the fluid at the nodes of a porous scene.
+
+    Raises:
+        InputError: a scene without porosity.
+    """
+    if model.pressures is None or result.pressures is None:
+        raise InputError("this reduced model has no pressures: its scene has no [porosity]")
+    return jax.vmap(partial(on_middles, scene.mesh))(result.pressures @ model.pressures.modes)
 
 
 def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:

@@ -5,8 +5,8 @@ Weights xi >= 0 with few entries above 0 are the least-squares solution of G xi 
 the largest singular vectors of G alone: there are at most as many points as vectors (Hernandez, Caicedo, Ferrer 2017).
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +17,12 @@ from liverjax.elements import mjed
 from liverjax.physics.base import End, Free, Step
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
+from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points, storage_and_flow, volume_stress
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
 from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.tensors.matrices import determinant
 
 #: The most states whose forces are taken: memory and time grow with them.
 MOST_STATES = 240
@@ -28,10 +30,17 @@ MOST_STATES = 240
 LEAST_MOTION = 1e-9
 
 
+class Coordinates(NamedTuple):
+    """Coordinates of R runs of T steps."""
+
+    q: np.ndarray | jax.Array  # of the modes (R, T, n) [m]
+    p: np.ndarray | jax.Array | None  # of those of the pressure (R, T, m) [Pa]
+
+
 def sampled(
-    whole: ReducedModel, scene: Scene, values: Mapping[str, Any], q: jax.Array, tolerance: float
+    whole: ReducedModel, scene: Scene, values: Mapping[str, Any], runs: Coordinates, tolerance: float
 ) -> ReducedModel:
-    """The model with few points, from one of all points and coordinates q (R, T, n) of runs with R rows of values.
+    """The model with few points, from one of all points and coordinates of runs with R rows of values.
 
     States are left out if they are at rest, or if an element is inside out there and its law then has no force.
 
@@ -39,26 +48,42 @@ def sampled(
         whole: as `with_all_points` makes it.
         scene: `Scene`.
         values: dotted names -> (R, …).
-        q: coordinates [m].
+        runs: their coordinates.
         tolerance: part of the motions by these forces that may be left out [1].
     """
-    compliance, rows = _reduced_compliance(whole, scene), []
+    compliance, rows, q = _reduced_compliance(whole, scene), [], runs.q
     for r, times in states_of(*q.shape[:2]):
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
+        p = None if runs.p is None else jnp.asarray(runs.p[r])
+        forces, volumes = _contributions(whole, own, (jnp.asarray(q[r]), p), jnp.asarray(times))
         # As motions: forces of stiff modes are large and move little.
-        G = compliance @ np.asarray(_contributions(whole, own, q[r], jnp.asarray(times)))
+        G = compliance @ np.asarray(forces)
         size = np.linalg.norm(G.sum(axis=2), axis=1)
         # Where modes alone turn an element inside out, some laws have no force; a state at rest has none to share.
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
         rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
+        if volumes is not None:
+            rows.append(_balances(np.asarray(volumes)[:, good], np.asarray(p)[times[good]]))
     xi = nonnegative_weights(np.concatenate(rows), np.asarray(whole.weights), tolerance)
     points = np.flatnonzero(xi)
-    return replace(
-        whole,
-        slopes=whole.slopes[:, points],
-        weights=whole.weights[points] * xi[points],
-        points=whole.points[points],
-    )
+    return _at(whole, points, whole.weights[points] * xi[points])
+
+
+def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Rows (…, P) of both sides of the fluid's balance (2, K, m, P), as pressures, over their size and that of p
+    (K, m)."""
+    size = np.linalg.norm(volumes[0].sum(axis=2), axis=1) + np.linalg.norm(p, axis=1)
+    return (volumes / np.where(size > 0, size, 1.0)[:, None, None]).reshape(-1, volumes.shape[-1])
+
+
+def _at(whole: ReducedModel, points: np.ndarray, weights: jax.Array) -> ReducedModel:
+    """The model at some of its points, with other weights."""
+    fluid = whole.pressures
+    if fluid is not None:
+        fluid = replace(
+            fluid, values=fluid.values[points], parts=fluid.parts[:, :, points], slopes=fluid.slopes[:, :, points]
+        )
+    return replace(whole, slopes=whole.slopes[:, points], weights=weights, points=whole.points[points], pressures=fluid)
 
 
 def states_of(runs: int, steps: int) -> list[tuple[int, np.ndarray]]:
@@ -81,23 +106,63 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 
 
 @jax.jit
-def _contributions(whole: ReducedModel, scene: Scene, q: jax.Array, times: jax.Array) -> jax.Array:
-    """Contribution of each point to each reduced force along a run, at some times: (K, n, P)."""
+def _contributions(
+    whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
+) -> tuple[jax.Array, jax.Array | None]:
+    """Contributions of each point along a run (T, n), (T, m), at some times: to each reduced force (K, n, P), and those
+    of `_balance`, of a porous scene."""
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
-    F0 = prescribed_gradients(whole, scene)
+    F0, (q, p) = prescribed_gradients(whole, scene), run
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, False, None, Free(jnp.ones_like(points)))
     memory = None if scene.viscosity is None else initial_history(scene.viscosity, whole.weights.size, q.dtype)
+    sponge = None if p is None else porosity_at_points(whole, scene)
 
-    def advance(memory: Any, given: tuple) -> tuple:
-        k, own = given
-        F = as_matrix(F0[k if len(F0) > 1 else 0] + whole.slopes @ own)
+    def gradient(k: jax.Array) -> jax.Array:
+        return F0[k if len(F0) > 1 else 0] + whole.slopes @ q[k]
+
+    def advance(memory: Any, k: jax.Array) -> tuple:
+        F = gradient(k)
         acting = solid.freeze(memory, step)
-        P = jnp.stack([entry for row in acting.stress(F) for entry in row])
-        return solid.advance(memory, acting, End(points, F, None)), P
+        P = jnp.stack([entry for row in acting.stress(as_matrix(F)) for entry in row])
+        if sponge is not None and p is not None:
+            P = P + volume_stress(whole, sponge, p[k], F)
+        return solid.advance(memory, acting, End(points, as_matrix(F), None)), P
 
     P: jax.Array
-    _, P = jax.lax.scan(advance, memory, (jnp.arange(len(q)), q))
-    return jnp.einsum("kip,ipn->knp", whole.weights[None, None] * P[times], whole.slopes)
+    _, P = jax.lax.scan(advance, memory, jnp.arange(len(q)))
+    forces = jnp.einsum("kip,ipn->knp", whole.weights[None, None] * P[times], whole.slopes)
+    return forces, None if p is None else _balance(whole, scene, gradient, p, times)
+
+
+def _balance(
+    whole: ReducedModel, scene: Scene, gradient: Callable[[jax.Array], jax.Array], p: jax.Array, times: jax.Array
+) -> jax.Array:
+    """Contributions of each point to both sides of the fluid's balance, as pressures (2, K, m, P): by the change of
+    volume, and by storage and flow.
+
+    Args:
+        whole, scene: as of `sampled`.
+        gradient: number of a step, from 0 -> deformation gradients (9, P) at its end.
+        p: coordinates of the pressure (T, m) [Pa].
+        times: numbers of K steps.
+    """
+    sponge, rest, modes = porosity_at_points(whole, scene), fluid_at_rest(whole, scene), whole.pressures
+    assert modes is not None
+    dt = jnp.asarray(scene.solve.dt)
+    inverse = flowing(whole, sponge, rest, dt).inverse
+
+    def of_step(k: jax.Array) -> jax.Array:
+        first, last = k == 0, jnp.maximum(k - 1, 0)
+        F, F_before = gradient(k), jnp.where(first, rest.F, gradient(last))
+        J, J_before = (determinant(as_matrix(each)) for each in (F, F_before))
+        store, flow = storage_and_flow(whole, sponge, F_before, dt)
+        more = p[k] - jnp.where(first, rest.pressure, p[last])
+        stored = jnp.einsum("kas,as->ks", store, jnp.tensordot(more, store, axes=1))
+        flows = jnp.einsum("kas,as->ks", flow, jnp.tensordot(p[k], flow, axes=1))
+        change = (whole.weights * (J - J_before))[None] * modes.values.T
+        return jnp.stack([inverse @ change, inverse @ (stored + flows)])
+
+    return jnp.moveaxis(jax.lax.map(of_step, times), 0, 1)
 
 
 def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:

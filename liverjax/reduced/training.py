@@ -10,15 +10,18 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
-from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.prescribed import free_degrees
 from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
 from liverjax.reduced.model import ReducedModel, refuse_unknown_physics, with_all_points
 from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import simulate_reduced
-from liverjax.reduced.sampling import sampled
+from liverjax.reduced.sampling import Coordinates, sampled
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
+
+#: A porous scene has at most one mode of pressure for so many modes of motion.
+PRESSURES = 2
 
 
 class _Runs(NamedTuple):
@@ -26,6 +29,7 @@ class _Runs(NamedTuple):
 
     values: dict[str, np.ndarray]  # the numbers of their rows (R, ...)
     u: np.ndarray  # displacements (R, T, V, 3) [m]
+    P: np.ndarray | None  # pressures of the vertices (R, T, V) [Pa], of a porous scene
 
 
 def reduce_scene(
@@ -71,7 +75,9 @@ def reduce_scene(
     far = np.argsort(_errors_of_rows(model, scene, others))[::-1][: runs - first]
     more = _full_runs(scene, _some(others, far))
     values = {name: np.concatenate([own.values[name], more.values[name]]) for name in values}
-    return _model_of(scene, _Runs(values, np.concatenate([own.u, more.u])), tolerance, most_modes, point_tolerance)
+    P = None if own.P is None or more.P is None else np.concatenate([own.P, more.P])
+    both = _Runs(values, np.concatenate([own.u, more.u]), P)
+    return _model_of(scene, both, tolerance, most_modes, point_tolerance)
 
 
 def _some(values: Mapping[str, np.ndarray], which: slice | np.ndarray) -> dict[str, np.ndarray]:
@@ -87,18 +93,27 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)
     u *= np.asarray(mask)
-    return _Runs(_some(values, good), u)
+    P = None if result.pressure is None else np.asarray(result.pressure)[good, :, : scene.mesh.number_of_vertices]
+    return _Runs(_some(values, good), u, P)
 
 
 def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, point_tolerance: float) -> ReducedModel:
     u, volumes = runs.u, np.asarray(nodal_volumes(scene.mesh))
     modes = proper_modes(u.reshape(-1, *u.shape[-2:]), volumes, tolerance)[:most_modes]
-    whole = with_all_points(scene, jnp.asarray(modes))
+    fields, p = (None, None) if runs.P is None else _pressure_fields(scene, runs.P, tolerance, most_modes)
+    whole = with_all_points(scene, jnp.asarray(modes), fields)
     q = jnp.einsum("rtvc,nvc->rtn", u * volumes[:, None], whole.modes)
-    model = sampled(whole, scene, runs.values, q, point_tolerance)
+    model = sampled(whole, scene, runs.values, Coordinates(q, p), point_tolerance)
     ranges = {name: jnp.asarray(np.stack([v.min(axis=0), v.max(axis=0)])) for name, v in runs.values.items()}
     model = replace(model, ranges=ranges)
     return replace(model, correction=_learnt_from(model, scene, runs))
+
+
+def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -> tuple[jax.Array, np.ndarray]:
+    """Modes (m, V) of pressures P (R, T, V), at most half as many as `most`, and their coordinates (R, T, m) [Pa]."""
+    volumes = np.asarray(integrals(scene.mesh, jnp.ones_like(scene.mesh.weights)))
+    modes = proper_modes(P.reshape(-1, P.shape[-1], 1), volumes, tolerance)[: max(1, most // PRESSURES), :, 0]
+    return jnp.asarray(modes), (P * volumes) @ modes.T
 
 
 def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
@@ -140,6 +155,6 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
 
 
 def proper_modes(u: np.ndarray, volumes: np.ndarray, tolerance: float) -> np.ndarray:
-    """Modes (n, V, 3) that leave out at most `tolerance` of fields u (N, V, 3), in the norm of lumped volumes (V,)."""
+    """Modes (n, V, c) that leave out at most `tolerance` of fields u (N, V, c), in the norm of lumped volumes (V,)."""
     modes = principal_fields((u * np.sqrt(volumes)[:, None]).reshape(len(u), -1), tolerance)
     return modes.reshape(-1, *u.shape[1:]) / np.sqrt(volumes)[:, None]

@@ -1,0 +1,141 @@
+"""The fluid of a porous reduced model: pressures as sums of a few modes, and Darcy's law for their coordinates.
+
+The pressure is P = sum_k p_k psi_k. The discrete equation of the full model (`liverjax.physics.porosity`) is tested
+with the same modes, and its integrals are sums over the weighted points of the model:
+
+    A p = S p_before - c,    A = S + dt D,    c_k = sum_p w_p psi_k (J - J_before),
+    S_kl = sum_p w_p J_before / K_lim sum_a N_a psi_ka psi_la,
+    D_kl = sum_p w_p kappa / J_before (cof F_before grad psi_k) . (cof F_before grad psi_l),
+
+with the functions N_a of the vertices a. Storage is lumped at the vertices, as there. As A is positive, p is
+eliminated: what is left for the motion has an energy. With all modes and all points the equations are the full ones.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from liverjax.core.struct import Number, replace
+from liverjax.laws.terms import invariant_terms
+from liverjax.laws.terms.invariant_terms import Scalars
+from liverjax.mesh.nodal import integrals
+from liverjax.physics import darcy
+from liverjax.physics.porosity import Porosity, volumetric_slope, volumetric_stress
+from liverjax.reduced.model import ReducedModel, as_matrix
+from liverjax.scenes.by_element import porosity_of_elements
+from liverjax.scenes.regions import POROUS
+from liverjax.scenes.scene import Scene
+from liverjax.tensors.matrices import IDENTITY, Matrix, cofactor, determinant, matvec
+
+
+class ReducedFluid(NamedTuple):
+    """What a step hands to the next."""
+
+    pressure: jax.Array  # coordinates p (m,) [Pa]
+    F: jax.Array  # deformation gradients (9, S)
+    J_before: jax.Array | None  # volume ratios of the step before (S,); the lagged scheme
+
+
+class Flowing(NamedTuple):
+    """The fluid during a step."""
+
+    porosity: Porosity  # numbers at the points
+    inverse: jax.Array  # of A (m, m) [Pa/m^3]
+    stored: jax.Array  # S p_before, with the volumes that are known before the step's end (m,) [m^3]
+    averages: jax.Array  # modes at the points, times their weights (S, m) [m^3]
+    J: jax.Array  # volume ratios at the beginning (S,)
+
+
+def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
+    """The porosity, its numbers by element (S,) at the points."""
+    assert scene.porosity is not None
+    own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
+    elements = model.points % scene.mesh.number_of_elements
+    whole = {name: jnp.asarray(getattr(own, name)) for name in POROUS}
+    numbers: dict = {name: a.ravel()[elements] if a.ndim else a for name, a in whole.items()}
+    return replace(own, **numbers)
+
+
+def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
+    """The initial pressure in reference volumes."""
+    modes, porosity, S = model.pressures, scene.porosity, model.weights.shape[0]
+    assert modes is not None and porosity is not None
+    volumes = integrals(scene.mesh, jnp.ones_like(scene.mesh.weights))
+    start = 0.0 if porosity.initial_pressure is None else porosity.initial_pressure
+    rest = jnp.tile(jnp.eye(3).reshape(9, 1), S).astype(model.slopes.dtype)
+    J = jnp.ones(S, rest.dtype) if porosity.scheme == "lagged" else None
+    return ReducedFluid(modes.modes @ (start * volumes), rest, J)
+
+
+def flowing(model: ReducedModel, porosity: Porosity, memory: ReducedFluid, dt: Number) -> Flowing:
+    """The fluid of a step of dt [s]; `porosity` as `porosity_at_points` gives it."""
+    assert model.pressures is not None
+    J = determinant(as_matrix(memory.F))
+    store, flow = (_squares(parts) for parts in storage_and_flow(model, porosity, memory.F, dt))
+    averages, stored = model.weights[:, None] * model.pressures.values, store @ memory.pressure
+    if memory.J_before is not None:
+        stored = stored - (J - memory.J_before) @ averages
+    return Flowing(porosity, jnp.linalg.inv(store + flow), stored, averages, J)
+
+
+def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: Number) -> tuple[jax.Array, jax.Array]:
+    """Vectors (m, 4, S) and (m, 3, S) [m^1.5/Pa^0.5] whose products are S and dt D; the step begins at F (9, S)."""
+    modes, w = model.pressures, model.weights
+    assert modes is not None
+    matrix = as_matrix(F)
+    volume = w * jnp.maximum(determinant(matrix), darcy.LEAST_J)
+    # grad psi = cof(F) G / J per current volume J w, as in `darcy.flow`.
+    root = jnp.sqrt(dt * porosity.permeability * w**2 / volume)
+    scaled = tuple(tuple((root * entry)[None] for entry in row) for row in cofactor(matrix))
+    g = matvec(scaled, tuple(jnp.moveaxis(modes.slopes, 1, 0)))
+    return jnp.sqrt(volume / porosity.limit_bulk)[None, None] * modes.parts, jnp.stack(g, axis=1)
+
+
+def _squares(a: jax.Array) -> jax.Array:
+    """Products of vectors a (m, k, S) with each other: (m, m)."""
+    flat = a.reshape(a.shape[0], -1)
+    return flat @ flat.T
+
+
+def pressure_coordinates(own: Flowing, J: jax.Array) -> jax.Array:
+    """Coordinates p (m,) [Pa] at the end of a step that ends with volume ratios J (S,)."""
+    if own.porosity.scheme == "lagged":
+        return own.inverse @ own.stored
+    return own.inverse @ (own.stored - (J - own.J) @ own.averages)
+
+
+def volume_stress(model: ReducedModel, porosity: Porosity, p: jax.Array, F: jax.Array) -> jax.Array:
+    """(sigma_Heq(J) - P) cof F (9, S) [Pa] at coordinates p (m,) [Pa] and deformation gradients F (9, S)."""
+    matrix = as_matrix(F)
+    stress = _scalars(model, porosity, p, matrix).first["J"]
+    return jnp.stack([stress * entry for row in cofactor(matrix) for entry in row])
+
+
+def _scalars(model: ReducedModel, porosity: Porosity, p: jax.Array, F: Matrix) -> Scalars:
+    assert model.pressures is not None
+    J = determinant(F)
+    stress = volumetric_stress(porosity, J) - model.pressures.values @ p
+    return Scalars({"J": stress}, {("J", "J"): volumetric_slope(porosity, J)})
+
+
+def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tuple[int, int], ...]) -> list[Matrix]:
+    """Derivative of `volume_stress` at given pressures, as `invariant_terms.blocks` with the axes as shape vectors."""
+    scalars = _scalars(model, own.porosity, pressure_coordinates(own, determinant(F)), F)
+    return invariant_terms.blocks(invariant_terms.state_of(scalars, F), list(IDENTITY), pairs)
+
+
+def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
+    """What the change of the pressures with the coordinates adds to the tangent (n, n) [N/m]."""
+    n = model.number_of_modes
+    if own.porosity.scheme == "lagged":
+        return jnp.zeros((n, n), model.slopes.dtype)
+    cof = jnp.stack([entry for row in cofactor(F) for entry in row])
+    change = own.averages.T @ jnp.sum(cof[..., None] * model.slopes, axis=0)
+    return change.T @ own.inverse @ change
+
+
+def advanced_fluid(own: Flowing, F: jax.Array) -> ReducedFluid:
+    """The fluid after a step that ends with deformation gradients F (9, S)."""
+    lagged = own.porosity.scheme == "lagged"
+    return ReducedFluid(pressure_coordinates(own, determinant(as_matrix(F))), F, own.J if lagged else None)

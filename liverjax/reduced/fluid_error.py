@@ -1,0 +1,125 @@
+"""The error of a porous reduced run: what the forces out of balance do to the linear sponge and its fluid.
+
+To first order the errors e of the motion and p of the pressure follow the linear equations at the reference shape,
+
+    (K + K_sponge) e - B^T p = load,    A p + B (e - e_before) = S p_before,
+
+with the matrices of `liverjax.reduced.fluid` on the whole mesh (lagged: the change of volume of the step before).
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.struct import Number
+from liverjax.mesh.basis import basis
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.darcy import unknown_pressures
+from liverjax.physics.porosity import volumetric_slope
+from liverjax.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    import scipy.sparse
+
+
+class LinearFluid(NamedTuple):
+    """Sparse matrices of the linear sponge: f free degrees of freedom, v unknown pressures."""
+
+    stiffness: "scipy.sparse.csr_array"  # of the drained sponge (f, f) [N/m]
+    volumes: "scipy.sparse.csr_array"  # B, change of the volume at the vertices (v, f) [m^2]
+    storage: "scipy.sparse.csr_array"  # S, diagonal (v, v) [m^3/Pa]
+    flow: "scipy.sparse.csr_array"  # dt D (v, v) [m^3/Pa]
+    unknown: np.ndarray  # numbers of the vertices (v,)
+    lagged: bool
+
+
+class ErrorBefore(NamedTuple):
+    """Errors at the ends of the last steps."""
+
+    motion: np.ndarray  # (f,) [m]
+    motion_before: np.ndarray  # of the step before (f,) [m]
+    pressure: np.ndarray  # (v,) [Pa]
+
+
+def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
+    """The linear sponge of a scene whose numbers are by element, at the reference shape."""
+    import scipy.sparse
+
+    mesh, porosity, dt = scene.mesh, scene.porosity, scene.solve.dt
+    assert porosity is not None
+    values, slopes, vertex_slopes = _point_operators(mesh)
+
+    def at_points(number: Number) -> "scipy.sparse.dia_array":
+        return scipy.sparse.diags(np.broadcast_to(np.asarray(number) * np.asarray(mesh.weights), shape).ravel())
+
+    shape = mesh.weights.shape
+    J = scipy.sparse.hstack([slopes[i] for i in range(3)]).tocsc()
+    # Columns of x, y, z one after another become 3 node + component.
+    J = J[:, np.arange(3 * mesh.number_of_nodes).reshape(3, -1).T.ravel()][:, free]
+    unknown = np.flatnonzero(np.asarray(unknown_pressures(porosity, mesh, mesh.points.dtype)))
+    values, vertex_slopes = values[:, unknown], [g[:, unknown] for g in vertex_slopes]
+    store = values.T @ at_points(1 / np.asarray(porosity.limit_bulk)) @ np.ones(values.shape[0])
+    rate = at_points(np.asarray(dt) * np.asarray(porosity.permeability))
+    return LinearFluid(
+        stiffness=J.T @ at_points(volumetric_slope(porosity, jnp.ones(()))) @ J,
+        volumes=values.T @ at_points(1.0) @ J,
+        storage=scipy.sparse.diags(store),
+        flow=sum(g.T @ rate @ g for g in vertex_slopes),
+        unknown=unknown,
+        lagged=porosity.scheme == "lagged",
+    )
+
+
+def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list]":
+    """Sparse matrices from fields of the vertices to values at the points, from those of the nodes to their three
+    slopes, and from those of the vertices to theirs."""
+    import scipy.sparse
+
+    E, D = mesh.number_of_elements, np.asarray(mesh.shape_vectors)
+    D = np.concatenate([-D.sum(axis=0, keepdims=True), D])
+    L, c = (np.full((4, 1), 0.25), np.eye(4)[:, :, None]) if mesh.order == 1 else (basis(2).L, basis(2).c)
+    Q = L.shape[1]
+    rows = np.arange(Q * E).reshape(Q, E)
+
+    def matrix(entries: np.ndarray, count: int) -> "scipy.sparse.csr_array":
+        """From entries (n, Q, E) of the n nodes of every element."""
+        nodes = np.stack([np.broadcast_to(np.asarray(n), (Q, E)) for n in mesh.element_nodes[: len(entries)]])
+        at = (np.broadcast_to(rows, entries.shape).ravel(), nodes.ravel())
+        return scipy.sparse.csr_matrix((entries.ravel(), at), shape=(Q * E, count))
+
+    values = matrix(np.broadcast_to(L[:, :, None], (4, Q, E)), mesh.number_of_vertices)
+    slopes = [matrix(np.einsum("akq,ke->aqe", c, D[:, i]), mesh.number_of_nodes) for i in range(3)]
+    corners = np.broadcast_to(D[:, :, None], (4, 3, Q, E))
+    return values, slopes, [matrix(corners[:, i], mesh.number_of_vertices) for i in range(3)]
+
+
+def coupled_solver(
+    K: "scipy.sparse.csr_array", fluid: LinearFluid
+) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
+    """A function of a load (f,) [N] and the errors before to those at the end of the step: (f,) [m] and (v,) [Pa].
+
+    Args:
+        K: stiffness and inertia without the sponge (f, f) [N/m].
+        fluid: `LinearFluid`.
+    """
+    import scipy.sparse
+    from scipy.sparse.linalg import splu
+
+    K, A, B, f = K + fluid.stiffness, fluid.storage + fluid.flow, fluid.volumes, K.shape[0]
+    if fluid.lagged:
+        motion, pressure = splu(K.tocsc()).solve, splu(A.tocsc()).solve
+
+        def lagged(load: np.ndarray, last: ErrorBefore) -> tuple[np.ndarray, np.ndarray]:
+            p = pressure(fluid.storage @ last.pressure - B @ (last.motion - last.motion_before))
+            return motion(load + B.T @ p), p
+
+        return lagged
+    both = splu(scipy.sparse.block_array([[K, -B.T], [-B, -A]]).tocsc()).solve
+
+    def implicit(load: np.ndarray, last: ErrorBefore) -> tuple[np.ndarray, np.ndarray]:
+        found = both(np.concatenate([load, -(fluid.storage @ last.pressure + B @ last.motion)]))
+        return found[:f], found[f:]
+
+    return implicit

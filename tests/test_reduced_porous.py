@@ -1,0 +1,226 @@
+"""Reduced models of porous scenes: the full equations in other coordinates, their tangent, errors and files."""
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.__main__ import main
+from liverjax.core.struct import replace
+from liverjax.mesh.nodal import integrals
+from liverjax.physics.porosity import Inlet
+from liverjax.reduced import run
+from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points
+from liverjax.reduced.model import with_all_points
+
+pytestmark = pytest.mark.quick_to_compile
+
+PRONY = lj.Prony(ratios=jnp.array([0.3, 0.2]), relaxation_times=jnp.array([0.3, 0.03]))
+MOVING = lj.Solve(kind="dynamic", dt=0.05, steps=3)
+
+
+def _sponge(cells: tuple, order: int = 1, solve: lj.Solve = MOVING, **numbers) -> lj.Scene:
+    """A viscous sponge of 3 x 1 x 1 cm held at x = 0 under its weight, drained at the other end."""
+    mesh = lj.shapes.box([0.03, 0.01, 0.01], list(cells))
+    mesh = lj.quadratic(mesh) if order == 2 else mesh
+    held, drained = (jnp.asarray(lj.boundary.select(mesh, w, None, "ends")) for w in ({"x_max": 0.0}, {"x_min": 0.03}))
+    numbers = {"bulk": 400.0, "limit_bulk": 2200.0, "fluid_fraction": 0.5, "permeability": 2e-7} | numbers
+    return lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=800.0, bulk=3000.0),
+        fixed=(lj.Fixed(nodes=held),),
+        body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -1.0])),
+        viscosity=PRONY,
+        porosity=lj.Porosity(drained=drained, **numbers),
+        solve=solve,
+    )
+
+
+def _whole(scene: lj.Scene) -> lj.ReducedModel:
+    """One mode a free degree of freedom, one a pressure that is unknown, and all points."""
+    mesh = scene.mesh
+    free = lj.boundary.free_degrees(mesh, scene.fixed, ())
+    modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
+    unknown = np.setdiff1d(np.arange(mesh.number_of_vertices), np.asarray(scene.porosity.drained))
+    volumes = np.asarray(integrals(mesh, jnp.ones_like(mesh.weights)))
+    pressures = np.eye(mesh.number_of_vertices)[unknown] / np.sqrt(volumes[unknown])[:, None]
+    return with_all_points(scene, jnp.asarray(modes), jnp.asarray(pressures))
+
+
+CASES = [
+    pytest.param(1, "implicit", MOVING, id="implicit"),
+    pytest.param(1, "lagged", lj.Solve(dt=0.1, steps=3), id="lagged-at-rest", marks=pytest.mark.slow),
+    pytest.param(2, "implicit", replace(MOVING, integrator="newmark"), id="quadratic", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("order", "scheme", "solve"), CASES)
+def test_all_motions_pressures_and_points_are_the_full_model(order, scheme, solve):
+    scene = _sponge((1, 1, 1), order, solve, scheme=scheme, initial_pressure=5.0)
+    # Numbers of a region go to its points.
+    soft = lj.Region(elements=jnp.arange(2), porosity={"permeability": 2e-8, "bulk": 300.0})
+    scene = replace(scene, region=(soft,))
+    full, model = lj.simulate(scene).check(), _whole(scene)
+    found = lj.simulate_reduced(model, scene)
+    assert not np.any(found.status)
+    moved, size = np.abs(full.positions - scene.mesh.points[None]).max(), np.abs(full.pressure).max()
+    assert size > 1.0
+    # The solver's tolerance of 1e-8 of the forces, through a condition number of some thousands.
+    assert np.abs(lj.reduced_positions(model, scene, found) - full.positions).max() < 1e-5 * moved
+    assert np.abs(lj.reduced_pressure(model, scene, found) - full.pressure).max() < 1e-5 * size
+
+
+@pytest.mark.parametrize("scheme", ["implicit", "lagged"])
+def test_the_tangent_is_the_derivative_of_the_forces(scheme):
+    scene = _sponge((1, 1, 1), scheme=scheme)
+    model = _whole(scene)
+    rng, n = np.random.default_rng(2), model.number_of_modes
+    memory = fluid_at_rest(model, scene)
+    memory = memory._replace(pressure=jnp.asarray(rng.normal(size=len(memory.pressure))), F=memory.F + 0.01)
+    fluid = flowing(model, porosity_at_points(model, scene), memory, 0.05)
+    elastic = replace(scene, viscosity=None, porosity=None)
+    acting = run.solid_at_points(model, elastic).freeze(None, None)
+    rest, none = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)), jnp.zeros(n)
+    e = run._Equations(
+        model,
+        acting,
+        none,
+        rest,
+        None,
+        none,
+        run._Points(0 * rest, None),
+        None,
+        jnp.asarray(0.05),
+        None,
+        None,
+        0.0,
+        fluid,
+    )
+    q = jnp.asarray(1e-4 * rng.normal(size=n))
+    exact = jax.jacfwd(lambda q: run._residual(e, q, run._deformation(e, q))[0])(q)
+    found = run._reduced_tangent(e, q)
+    assert np.allclose(found, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+    assert np.allclose(found, found.T, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+@pytest.fixture(scope="module")
+def trained() -> tuple:
+    """A sponge in motion, its reduced model of few rows, and their numbers."""
+    scene = _sponge((4, 1, 1))
+    rng = np.random.default_rng(1)
+    gravity = 0.2 * np.stack([rng.uniform(-2, 2, 8), rng.uniform(-2, 2, 8), rng.uniform(-5.0, -2.0, 8)], axis=1)
+    rows = {"porosity.permeability": rng.uniform(1e-7, 3e-7, 8), "body.gravity": gravity}
+    return scene, lj.reduce_scene(scene, rows, most_modes=6, point_tolerance=1e-3)
+
+
+def test_points_serve_motion_and_pressure_and_the_errors_are_stated(trained):
+    scene, model = trained
+    assert len(model.points) < scene.mesh.weights.size and model.pressures.modes.shape[0] == 3
+    assert not np.any(np.asarray(model.pressures.modes)[:, np.asarray(scene.porosity.drained)])
+    for permeability, gravity in ((2e-7, (0.1, -0.2, -0.8)), (6e-7, (0.0, 0.6, 0.4))):
+        own = lj.with_parameters(scene, {"porosity.permeability": permeability, "body.gravity": gravity})
+        full = lj.simulate(own).check()
+        for m in (replace(model, correction=None), model):
+            found = lj.simulate_reduced(m, own)
+            found = lj.reduced_error(m, own, found)
+            true = np.linalg.norm(lj.reduced_positions(m, own, found) - full.positions, axis=-1).max(axis=1)
+            off = np.abs(lj.reduced_pressure(m, own, found) - full.pressure).max(axis=1)
+            # Few modes are not the answer: there is an error to state.
+            assert true.max() > 1e-6 and off.max() > 0.02
+            assert np.all((true < 2 * found.error) & (found.error < 2 * true + 1e-7))
+            assert np.all((off < 2 * found.pressure_error) & (found.pressure_error < 2 * off + 2e-3))
+
+
+@pytest.mark.slow
+def test_derivatives_by_numbers_of_the_fluid(trained):
+    scene, model = trained
+
+    def tip(k):
+        own = lj.with_parameters(scene, {"porosity.permeability": 1e-7 * k, "porosity.bulk": 200.0 * k})
+        found = lj.simulate_reduced(model, own)
+        p = lj.reduced_pressure(model, own, found)[-1, 0]
+        return 1e3 * lj.reduced_positions(model, own, found)[-1, -1, 2] + p
+
+    found = jax.grad(tip)(2.0)
+    assert found == pytest.approx(float(jax.jacfwd(tip)(2.0)), rel=1e-10)
+    steps = 10.0 ** -np.arange(1, 8)
+    lanes = jax.jit(jax.vmap(tip))(jnp.concatenate([2.0 + steps, 2.0 - steps]))
+    errors = np.abs((lanes[:7] - lanes[7:]) / (2 * steps) / found - 1)
+    # Second order, then the run's tolerance: the curve falls and rises.
+    assert errors.min() < 1e-6 and errors[0] > 1e3 * errors.min() and errors[-1] > errors.min()
+
+
+def test_files_keep_the_pressure_and_other_fluids_are_refused(trained, tmp_path):
+    scene, model = trained
+    lj.save_reduced(model, tmp_path / "model.h5")
+    again = lj.load_reduced(tmp_path / "model.h5")
+    for name in ("modes", "values", "parts", "slopes"):
+        assert np.array_equal(getattr(again.pressures, name), getattr(model.pressures, name))
+    inlet = Inlet(nodes=jnp.arange(2), pressure=10.0)
+    with pytest.raises(lj.InputError, match=r"no \[\[porosity.inlet\]\]"):
+        lj.simulate_reduced(again, replace(scene, porosity=replace(scene.porosity, inlet=(inlet,))))
+    for other in (None, replace(scene.porosity, drained=None), replace(scene.porosity, scheme="lagged")):
+        with pytest.raises(lj.InputError, match="was made for scene"):
+            lj.simulate_reduced(again, replace(scene, porosity=other))
+    dry = replace(scene, porosity=None)
+    solid = with_all_points(dry, model.modes)
+    with pytest.raises(lj.InputError, match="no pressures"):
+        lj.reduced_pressure(solid, dry, lj.simulate_reduced(solid, dry))
+
+
+SCENE = """
+[mesh]
+shape = "box"
+size = [0.03, 0.01, 0.01]
+cells = [3, 1, 1]
+
+[law]
+name = "neo_hookean"
+mu = 800.0
+bulk = 3000.0
+
+[viscosity]
+ratios = [0.3]
+relaxation_times = [0.1]
+
+[porosity]
+bulk = 400.0
+limit_bulk = 2200.0
+fluid_fraction = 0.5
+permeability = 2e-7
+drained = {x_min = 0.03}
+
+[body]
+density = 1000.0
+gravity = [0.0, 0.0, -1.0]
+
+[[fixed]]
+where = {x_max = 0.0}
+
+[solve]
+kind = "dynamic"
+dt = 0.05
+steps = 3
+"""
+
+
+def test_the_commands_make_and_use_a_porous_model(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    rows = "porosity.permeability,body.gravity.2\n1e-7,-1.2\n3e-7,-0.8\n2e-7,-0.4\n2e-7,-1.0\n"
+    (tmp_path / "rows.csv").write_text(rows)
+    model = ["--out", str(tmp_path / "model.h5"), "--tolerance", "1e-4"]
+    assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "rows.csv"), *model]) == 0
+    found = {}
+    for name, line in (("full", ""), ("used", 'reduced = "model.h5"')):
+        (tmp_path / f"{name}.toml").write_text(SCENE + line)
+        assert main(["simulate", str(tmp_path / f"{name}.toml"), "--out", str(tmp_path / name)]) == 0
+        said = capsys.readouterr().out
+        assert ("estimated error" in said) == (name == "used") and "the full model runs" not in said
+        assert ("Pa of pressure" in said) == (name == "used")
+        with h5py.File(tmp_path / name / "result.h5") as file:
+            found[name] = file["positions"][()], file["pressure"][()]
+    moved = np.abs(found["full"][0] - found["full"][0][0, :1]).max()
+    assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
+    assert 0 < np.abs(found["used"][1] - found["full"][1]).max() < 0.02 * np.abs(found["full"][1]).max()
