@@ -74,10 +74,15 @@ def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
 
 
 @cache
-def triangle_rule() -> tuple[np.ndarray, np.ndarray]:
-    """Weights (Q,) and barycentric coordinates (3, Q) on a triangle, exact to degree 4 (Dunavant 1985)."""
-    columns, weights = [], []
-    for a, w in ((0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)):
-        columns += [np.where(np.arange(3) == k, 1 - 2 * a, a) for k in range(3)]
-        weights += 3 * [w]
+def triangle_rule(degree: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (Q,) and barycentric coordinates (3, Q) on a triangle, exact to degree 4 (Dunavant 1985) or 5 (Radon
+    1948)."""
+    pairs = [(0.445948490915965, 0.223381589678011), (0.091576213509771, 0.109951743655322)]
+    if degree == 5:
+        root = np.sqrt(15)
+        pairs = [((6 + sign * root) / 21, (155 + sign * root) / 1200) for sign in (-1, 1)]
+    columns = [np.where(np.arange(3) == k, 1 - 2 * a, a) for a, _ in pairs for k in range(3)]
+    weights = [w for _, w in pairs for _ in range(3)]
+    if degree == 5:
+        columns, weights = [*columns, np.full(3, 1 / 3)], [*weights, 9 / 40]
     return np.array(weights) / np.sum(weights), np.stack(columns, axis=1)

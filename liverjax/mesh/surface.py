@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from liverjax.core.struct import Indices
 from liverjax.mesh.basis import triangle_rule
@@ -10,6 +11,8 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle, in the order of its middles.
 _EDGES = ((0, 1), (1, 2), (2, 0))
+#: The same edges as functions of order 3 run along them, from the lower of two vertices in order.
+_THIRD = ((0, 1), (1, 2), (0, 2))
 
 
 def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
@@ -61,12 +64,27 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         twice = jnp.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
-        nodes = jnp.stack(triangle_nodes(mesh, triangles)[:6])
-        weights, l = triangle_rule()
-        N, along = _quadratic(l)
-        first, second = (jnp.tensordot(jnp.asarray(slope.T, x.dtype), x[nodes], axes=1) for slope in along)
+        nodes = jnp.stack(triangle_nodes(mesh, triangles))
+        # Exact of quadratic positions, and so is the derivative of the unmoved shape.
+        weights, l = triangle_rule(4 if mesh.order == 2 else 5)
+        N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
+        signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
+        at = x[nodes] if signs is None else signs * x[nodes]
+        first, second = (jnp.tensordot(jnp.asarray(slope.T, x.dtype), at, axes=1) for slope in along)
         own = jnp.tensordot(jnp.asarray(-0.5 * weights * N, x.dtype), jnp.cross(first, second), axes=1)
+        own = own if signs is None else signs * own
     return jnp.zeros_like(x).at[nodes].add(own)
+
+
+def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
+    """Signs (10, m, 1) of the ten functions of triangles (m, 4) whose normals count, so that vertices are in no order.
+
+    A function of order 3 of an edge points to the higher vertex: it has the other sign where the triangle runs down.
+    """
+    signs = jnp.ones((10, len(triangles), 1), dtype)
+    for k, (a, b) in enumerate(_THIRD):
+        signs = signs.at[6 + k, :, 0].set(jnp.where(triangles[:, a] < triangles[:, b], 1, -1))
+    return signs
 
 
 def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +120,7 @@ def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []
-    for a, b in ((0, 1), (1, 2), (0, 2)):
+    for a, b in _THIRD:
         more.append(l[a] * l[b] * (l[a] - l[b]))
         own = {a: (2 * l[a] - l[b]) * l[b], b: (l[a] - 2 * l[b]) * l[a]}
         by.append([own.get(m, zero) for m in range(3)])
