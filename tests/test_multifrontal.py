@@ -40,17 +40,25 @@ def neighbours(tets: np.ndarray) -> scipy.sparse.csr_array:
     return scipy.sparse.coo_array((np.ones(len(at[0])), at)).tocsr()
 
 
-@pytest.mark.parametrize("kind", [float, complex])
-@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "single", "small"),
+    [
+        (float, False, False),
+        (float, True, False),
+        (complex, False, False),
+        (complex, True, False),
+        (complex, True, True),
+    ],
+)
 @pytest.mark.parametrize("together", [512, 7])
-def test_against_a_dense_solution(kind, single, together, monkeypatch):
+def test_against_a_dense_solution(kind, single, small, together, monkeypatch):
     """With groups eliminated at once, and by seven unknowns at a time."""
     monkeypatch.setattr(multifrontal, "PIVOTS", together)
     monkeypatch.setattr(multifrontal, "TILE", 2 * together)
     A, plan = system(kind)
     assert len(plan) > 8 and sorted(np.concatenate([front.own for front in plan])) == list(range(A.shape[0]))
     known = np.random.default_rng(2).normal(size=A.shape[0]).astype(kind)
-    found, error = multifrontal.refined_solution(multifrontal.factorised(A, plan, single), A @ known)
+    found, error = multifrontal.refined_solution(multifrontal.factorised(A, plan, single, small), A @ known)
     assert error < 1e-15
     dense = np.linalg.solve(A.toarray(), A @ known)
     # As far from the truth as a dense solution may be.
@@ -72,6 +80,17 @@ def test_groups_whose_nodes_are_all_held(single, monkeypatch):
     known = np.random.default_rng(2).normal(size=len(keep)) + 0j
     _, error = multifrontal.refined_solution(multifrontal.factorised(free, plan, single), free @ known)
     assert error < 1e-15
+
+
+def test_whole_numbers_of_16_bits_are_half_as_large():
+    A, plan = system(complex)
+    plain, small = (multifrontal.factorised(A, plan, True, own) for own in (False, True))
+    sizes = [sum(step.X.nbytes for step in own.steps) for own in (plain, small)]
+    assert sizes[0] == 2 * sizes[1]
+    assert plain.nbytes - plain.matrix.data.nbytes == multifrontal.single_bytes(plan, A.dtype)
+    rounded = [step.times(np.eye(len(step.after), dtype=np.complex64)[0]) for step in small.steps if len(step.after)]
+    exact = [step.X[:, 0] for step in plain.steps if len(step.after)]
+    assert all(np.abs(a - b).max() < 1e-3 * np.abs(b).max() for a, b in zip(rounded, exact, strict=True))
 
 
 def test_a_matrix_without_an_inverse_is_told():
@@ -98,17 +117,29 @@ def scene() -> lj.Scene:
 def test_derivatives_take_the_factors_of_the_values(monkeypatch):
     made = []
 
-    def counted(A, plan, single):
-        made.append(single)
-        return original(A, plan, single)
+    def counted(A, plan, single, small):
+        made.append((single, small))
+        return original(A, plan, single, small)
 
     original = multifrontal.factorised
     monkeypatch.setattr(multifrontal, "factorised", counted)
     body = scene()
-    jax.value_and_grad(
+    slope = jax.value_and_grad(
         lambda mu: jnp.sum(lj.harmonic(lj.with_parameters(body, {"law.mu": mu}), [40.0, 60.0]).displacement.imag)
-    )(3100.0)
-    assert made == [False, False]
+    )
+    slope(3100.0)
+    assert made == [(False, False)] * 2
+    # Two factors that only fit in 16 bits.
+    monkeypatch.setattr(multifrontal, "SINGLE_FROM", 0)
+    monkeypatch.setattr(multifrontal, "LEAF", 8)
+    sparse._factors.clear()
+    sparse._orders.clear()
+    lj.harmonic(body, [40.0, 60.0])
+    both = sum(own.nbytes for own in sparse._factors.values())
+    made.clear()
+    monkeypatch.setattr(sparse, "KEPT", 0.99 * both)
+    slope(3200.0)
+    assert made == [(True, True)] * 2
     monkeypatch.setattr(sparse, "KEPT", 0.0)
     sparse._factors.clear()
     lj.harmonic(body, [40.0])

@@ -19,7 +19,8 @@ from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_par
 
 #: Motions of every frequency: (F, V, 3), and (F, P) or None.
 Motions = Motion
-#: Memory [bytes] of the factors that are kept for derivatives; those of other matrices are given up first.
+#: Memory [bytes] of the factors that are kept for derivatives; those of other matrices are given up first. Where those
+#: of all frequencies do not fit, they are kept as whole numbers of 16 bits, half as large.
 KEPT = 2e9
 
 _factors: dict[bytes, multifrontal.Factor] = {}
@@ -98,7 +99,9 @@ def _host(*given: object) -> np.ndarray:
         found, error = (None, np.inf) if key not in _factors else multifrontal.refined_solution(_factors[key], load)
         if error > multifrontal.WRONG:
             order = _order(A, free) if order is None else order
-            found = _first_solution(_matrix(A, order, factors[f], omega), order.plan, load, key)
+            K = _matrix(A, order, factors[f], omega)
+            small = len(omegas) * (K.data.nbytes + multifrontal.single_bytes(order.plan, K.dtype)) > KEPT
+            found = _first_solution(K, order.plan, load, (key, small))
         x[f, by_node[free]] = found
     return x
 
@@ -172,18 +175,18 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
     return K if len(order.free) == size else K[order.free][:, order.free]
 
 
-def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, key: bytes) -> np.ndarray:
-    """The solution, with the factor kept for the next one."""
+def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:
+    """The solution, with the factor kept for the next one: under which key, and whether in 16 bits."""
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue
         try:
-            factor = multifrontal.factorised(K, plan, single)
+            factor = multifrontal.factorised(K, plan, single, kept[1])
         except np.linalg.LinAlgError:
             break
         x, error = multifrontal.refined_solution(factor, b)
         if error < multifrontal.WRONG:
-            _keep(key, factor)
+            _keep(kept[0], factor)
             return x
     return _pivoted(K, b)
 
