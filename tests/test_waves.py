@@ -222,6 +222,30 @@ def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
     np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
 
 
+def test_an_array_of_hdf5_may_name_its_own_unit_spacing_and_frequencies(tmp_path):
+    field = plane_waves((5, 5, 5))
+    with h5py.File(tmp_path / "own.h5", "w") as file:
+        file["displacement"] = 1e6 * field.displacement
+        file["frequencies"] = HERTZ
+        file["displacement"].attrs.update({"unit": "um", "spacing": [H] * 3})
+        file["frequencies"].attrs["unit"] = "Hz"
+    found = wave_field.read_waves(tmp_path / "own.h5")
+    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
+    np.testing.assert_allclose(found.spacing, H)
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz"])
+def test_text_and_objects_in_place_of_arrays_get_a_sentence_about_numbers(tmp_path, ending):
+    path = tmp_path / f"waves{ending}"
+    path.write_text("no array")
+    with pytest.raises(InputError, match="no arrays of numbers"):
+        wave_field.read_waves(path, [60.0], spacing=[H] * 3)
+    saved = np.array([{"u": 1}], dtype=object)
+    np.save(path, saved) if ending == ".npy" else np.savez(path, displacement=saved)
+    with pytest.raises(InputError, match="no arrays of numbers"):
+        wave_field.read_waves(path, [60.0], spacing=[H] * 3)
+
+
 def wrapped_file(path, radians_per_metre=2.8e5):
     """Phases of waves that go over 2 pi several times, as a scanner stores them: a corner is not measured."""
     field = plane_waves((12, 12, 14))
@@ -320,6 +344,27 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "waves.json").read_text())
     assert again["map"]["chi2_per_component"] <= 1.001 * first["map"]["chi2_per_component"]
     assert "map: chi2" in capsys.readouterr().out
+
+
+def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
+    """Text, and HDF5 of another program."""
+    for write in (lambda file: file.write_text("no progress"), lambda file: h5py.File(file, "w").close()):
+        file = tmp_path / "progress.h5"
+        write(file)
+        with pytest.raises(InputError, match="of another fit: leave out --resume"):
+            stiffness_map._first_or_resumed(None, file)
+
+
+def test_columns_of_the_table_stay_apart_where_nothing_fits():
+    own = {"phase_velocity_m_s": [7.8], "chi2_per_component": [2.67e11]}
+    own |= {key: [1.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}
+    direct = {"whole": {"storage_Pa": [None], "loss_Pa": [None]}}
+    blank = {"regions": None, "springpots": None, "map": None, "frequencies_Hz": [60.0]}
+    assert waves_report.table({"whole": own, "direct_inversion": direct, **blank}).split()[-3:] == [
+        "7.8",
+        "2.7e+11",
+        "none",
+    ]
 
 
 def test_changes_over_a_brick_are_those_of_a_linear_field():

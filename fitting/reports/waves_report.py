@@ -209,9 +209,14 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     return told
 
 
+def _short(chi2: float) -> str:
+    """Two digits behind the point, where so many mean something."""
+    return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"
+
+
 def table(content: Content) -> str:
     """Moduli of the whole and of the regions at every frequency, with the direct inversion beside them."""
-    rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>7s}   direct [Pa]"]
+    rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>9s}   direct [Pa]"]
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
         direct = content["direct_inversion"][name]
         for f, hertz in enumerate(content["frequencies_Hz"]):
@@ -220,7 +225,7 @@ def table(content: Content) -> str:
             cells = [f"{own[f'{part}_Pa'][f]:.5g} ± {own[f'error_{part}_Pa'][f]:.2g}" for part in ("storage", "loss")]
             rows.append(
                 f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
-                f"{own['chi2_per_component'][f]:7.2f}   {pair}"
+                f"{_short(own['chi2_per_component'][f]):>9s}   {pair}"
             )
     for name, own in (content["springpots"] or {}).items():
         said = ", ".join(

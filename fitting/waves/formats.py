@@ -26,6 +26,7 @@ NAMES = (
     "labels",
     "unit",
 )
+WAVES = ("displacement", "real", "imag", "phases", "wrapped")
 HDF5 = (".h5", ".hdf5", ".mat")
 
 
@@ -73,10 +74,13 @@ def single(path: Path, name: str) -> np.ndarray:
 
 
 def _numpy(path: Path) -> Content:
-    if path.suffix.lower() == ".npy":
-        return {"displacement": np.load(path, allow_pickle=False)}
-    with np.load(path, allow_pickle=False) as file:
-        found = {name: file[name] for name in file}
+    try:
+        if path.suffix.lower() == ".npy":
+            return {"displacement": np.load(path, allow_pickle=False)}
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name] for name in file}
+    except ValueError:  # NumPy speaks of pickled objects then, of text too
+        raise InputError(f"{path}: holds no arrays of numbers: write it again with numpy.save or numpy.savez") from None
     return found | ({"unit": str(found["unit"])} if "unit" in found else {})
 
 
@@ -85,7 +89,9 @@ def _hdf5(path: Path) -> Content:
 
     with h5py.File(path) as file:
         found: Content = {name: file[name][()] for name in NAMES if name in file}
-        found |= {name: file.attrs[name] for name in NAMES if name in file.attrs}
+        # Attributes of the file, or of the waves.
+        for own in (file, *(file[name] for name in WAVES if name in file)):
+            found = {name: own.attrs[name] for name in NAMES if name in own.attrs} | found
     for name, value in found.items():
         a = np.asarray(value)
         if a.dtype.names and set(a.dtype.names) >= {"real", "imag"}:  # complex numbers of MATLAB

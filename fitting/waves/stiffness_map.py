@@ -302,9 +302,14 @@ def _first_or_resumed(course: Course, file: Path | None) -> tuple[_Reached, list
     """A uniform organ, or the point of an earlier run."""
     if file is None or not file.is_file():
         return _reached(course, np.zeros(len(course.p.root_mass), complex), 0), []
-    with h5py.File(file) as f:
-        same = f.attrs["balances"] == course.m.balances and len(f["z"]) == len(course.p.root_mass)
-        if not (same and np.isclose(f.attrs["size"], np.linalg.norm(course.waves.motion))):
-            raise InputError(f"{file} is of another fit: leave out --resume or name another --out")
-        history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
-        return _reached(course, f["z"][:], int(f["k"][()])), history
+    other = InputError(f"{file} is of another fit: leave out --resume or name another --out")
+    try:
+        with h5py.File(file) as f:
+            of_same = f.attrs["balances"] == course.m.balances and len(f["z"]) == len(course.p.root_mass)
+            if not (of_same and np.isclose(f.attrs["size"], np.linalg.norm(course.waves.motion))):
+                raise other
+            history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
+            z, k = f["z"][:], int(f["k"][()])
+    except (OSError, KeyError):  # no HDF5, or of another program
+        raise other from None
+    return _reached(course, z, k), history
