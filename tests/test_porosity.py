@@ -135,6 +135,32 @@ def test_bulk_is_not_counted_twice():
     assert porosity.law_in_force(None, scene.law).bulk == 1.0
 
 
+def test_no_summand_keeps_a_volumetric_energy_of_its_own():
+    """Swollen by 1 % along every axis a law has but the energy that it holds in one with its shear."""
+    F, e = 1.01 * jnp.eye(3), 0.5 * (1.01**2 - 1)
+    fluid = lj.laws.Volumetric(bulk=5e4)
+    rubber = lj.laws.NeoHookean(mu=770.0, bulk=5e4)
+    costa = lj.laws.Costa(c=200.0, b_ff=8.0, b_ss=4.0, b_nn=3.0, b_fs=5.0, b_fn=4.0, b_sn=2.0, bulk=7700.0)
+    kirchhoff = lj.laws.SaintVenantKirchhoff(mu=10.0, lame_lambda=20.0)
+    of_costa, of_kirchhoff = 0.5 * 200.0 * np.expm1(15.0 * e**2), 0.5 * 20.0 * (3 * e) ** 2 + 10.0 * 3 * e**2
+    cases = (
+        (costa, of_costa, "Costa has"),
+        (rubber + kirchhoff, of_kirchhoff, "SaintVenantKirchhoff has"),
+        (costa + rubber + fluid, of_costa, "Costa has"),
+        (lj.laws.continued(rubber + fluid + kirchhoff, 0.1), of_kirchhoff, "SaintVenantKirchhoff has"),
+    )
+    for law, expected, named in cases:
+        acts = porosity.law_in_force(SPONGE, law)
+        assert np.isclose(acts.energy(F), expected, rtol=1e-10)
+        assert np.allclose(acts.first_piola(F), jax.grad(acts.energy)(F), rtol=1e-8)
+        assert acts.bulk_modulus() < 1e3 < law.bulk_modulus()
+        said = porosity.bulk_in_force(SPONGE, law)
+        assert f"what {named} in one with its shear; the volumetric energy that stands apart is off" in said
+    assert porosity.law_in_force(SPONGE, fluid).energy(F) == 0.0
+    assert porosity.bulk_in_force(SPONGE, kirchhoff).endswith("what SaintVenantKirchhoff has in one with its shear")
+    assert porosity.bulk_in_force(SPONGE, rubber).endswith("; the law's own volumetric energy is off")
+
+
 @pytest.mark.slow
 def test_sealed_and_tight_keeps_all_fluid():
     # Sealed: the pressure's mean follows the mean change of volume, P = -K_lim (J - 1) to first order.

@@ -134,6 +134,14 @@ class Law:
         """U(J) as a law of its own, or `None` where there is none."""
         return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
+    def without_volume(self) -> Any:
+        """The law without every U(J) that stands apart in it, or `None` where nothing is left."""
+        split = self.isochoric_part()
+        if split is not None:
+            return split
+        apart = self.bulk is not None and type(self).strain_energy is Law.strain_energy
+        return replace(self, bulk=None) if apart else self
+
     # -- what a law can then do --------------------------------------------------------------------------------------
 
     def measures(self, F: Matrix) -> Invariants:
@@ -198,6 +206,10 @@ class Sum(Law):
         """The sum over all laws."""
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
+    def without_volume(self):
+        """That of each law, added."""
+        return _added([part for part in (law.without_volume() for law in self.laws) if part is not None])
+
     def check(self):
         """Check every summand."""
         for law in self.laws:
@@ -249,6 +261,10 @@ class Volumetric(Law):
         """The law itself."""
         return self
 
+    def without_volume(self):
+        """Nothing is left."""
+        return None
+
     def strain_energy(self, I):
         """U(J)."""
         if self.below is None:
@@ -266,6 +282,10 @@ class Volumetric(Law):
     def shear_modulus(self):
         """A fluid has none."""
         return 0.0
+
+    def bulk_modulus(self):
+        """K [Pa]: every form of U has this curvature at rest."""
+        return self.bulk
 
 
 def _added(parts: list) -> Any:

@@ -37,6 +37,11 @@ class Continued(Law):
         part = self.law.volumetric_part()
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
+    def without_volume(self) -> Law | None:
+        """That of the law, continued."""
+        part = self.law.without_volume()
+        return self if part is self.law else None if part is None else Continued(law=part, below=self.below)
+
     def measures(self, F):
         """Invariants of the law with J replaced, and J itself."""
         J = determinant(F)

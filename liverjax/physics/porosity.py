@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Number, Numbers, param, static, struct
-from liverjax.laws.base import Law, isochoric_part
+from liverjax.laws.base import Law, Volumetric, isochoric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import integrals, interpolated
 from liverjax.mesh.surface import areas
@@ -136,11 +136,11 @@ def check_sponge(porosity: Porosity) -> None:
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law beside the sponge. It has no volumetric energy of its own, unless asked for, since bulk would count
-    twice."""
+    """The law beside the sponge. It has no volumetric energy U(J) of its own, unless asked for, since bulk would count
+    twice: every summand is without it. What has its volume in one with its shear stays whole."""
     if porosity is None or porosity.keep_bulk:
         return law
-    return law.each(lambda own: own if isochoric_part(own) is None else isochoric_part(own))
+    return law.each(lambda own: own.without_volume() or Volumetric(bulk=0.0))
 
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:
@@ -148,9 +148,14 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
     sponge = f"bulk modulus in force: the sponge's, {float(porosity.bulk):g} Pa"
     if porosity.keep_bulk:
         return f"{sponge}, and the law's own (keep_bulk)"
-    if isochoric_part(law) is None:
-        return f"{sponge}, and what {type(law).__name__} has in one with its shear"
-    return f"{sponge}; the law's own volumetric energy is off"
+    parts = [part for own in law.pieces() for part in own.summands()]
+    whole = [part for part in parts if isochoric_part(part) is None and part.without_volume() is not None]
+    if not whole:
+        return f"{sponge}; the law's own volumetric energy is off"
+    names = " and ".join(dict.fromkeys(type(getattr(part, "law", part)).__name__ for part in whole))
+    changed = any(part.without_volume() is not part for part in parts)
+    off = "; the volumetric energy that stands apart is off" if changed else ""
+    return f"{sponge}, and what {names} has in one with its shear{off}"
 
 
 def volumetric_stress(porosity: Porosity, J: Number) -> Number:

@@ -61,7 +61,7 @@ class Costa(Law):
 
     def bulk_modulus(self):
         """Voigt's: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
-        return self.bulk + self.c * sum(self._weights()[:3]) / 9
+        return (0.0 if self.bulk is None else self.bulk) + self.c * sum(self._weights()[:3]) / 9
 
     def check(self):
         """InputError where a direction has no length or the sheet lies along the fibre."""
