@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core.struct import Number
+from liverjax.core.struct import Number, replace
 from liverjax.elements import mjed
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
@@ -106,6 +106,9 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
     def force() -> jax.Array:
         """Forces on the nodes at x without inertia; the first acceleration follows from them."""
+        if start is not None or (scene.porosity is not None and scene.porosity.initial_pressure is not None):
+            return _forces_at_beginning(scene, x)
+        # At rest in the reference positions only nodal forces act.
         begin = _first_step(scene, x, free)
         acting = [p.freeze(None, begin) for p in physics if type(p).begin is Physics.begin]
         forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce)]
@@ -113,6 +116,16 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
     begin = Start(scene.mesh, x, free, force)
     return State(x, tuple(p.begin(begin) for p in physics))
+
+
+def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
+    """Forces (V, 3) [N] of all physics but inertia at positions x (V, 3), with the memory of the reference."""
+    still = replace(scene, solve=replace(scene.solve, kind="static"))
+    none = jnp.zeros((), x.dtype)
+    at_rest = initial_state(still)._replace(x=x)
+    e = _of_physics(scene, physics_of(still), at_rest, jnp.ones((), x.dtype), Sizes(none, none))
+    q = unknowns(e, x)
+    return forces(e, q if e.mixed is None else settled(e, q, none), none).total
 
 
 def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
@@ -137,7 +150,11 @@ def force_sizes(scene: Scene) -> Sizes:
 def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None) -> Equations:
     """The equations of step k = 1 … steps from `state`; `sizes` is `force_sizes(scene)`, the same for all."""
     sizes = force_sizes(scene) if sizes is None else sizes
-    physics, free = physics_of(scene), free_directions(scene)
+    return _of_physics(scene, physics_of(scene), state, k, sizes)
+
+
+def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Number, sizes: Sizes) -> Equations:
+    free = free_directions(scene)
     tolerance = jax.lax.stop_gradient(scene.solve.tolerance)
     step = _first_step(scene, state.x, free)._replace(k=k, tolerance=tolerance)
     free = free._replace(tied=tuple(nodes for nodes in (p.tied(step) for p in physics) if nodes is not None))
@@ -218,9 +235,10 @@ def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
-def settled(e: Equations, q: jax.Array) -> jax.Array:
-    """Unknowns q with the pressures that balance the volumes at the end of the step, where they are unknowns."""
-    n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype))
+def settled(e: Equations, q: jax.Array, s: Number | None = None) -> jax.Array:
+    """Unknowns q with the pressures that balance the volumes at part s of the step (its end), where they are
+    unknowns."""
+    n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype) if s is None else s)
     pressure = e.mixed.settled(e.mesh, determinant(deformation_gradient(e.mesh, x)))
     return jnp.concatenate([q[:n], pressure / e.mixed.unit])
 
