@@ -65,17 +65,10 @@ class ReducedResult:
 
 
 class ReducedMotion(NamedTuple):
-    """Velocity and acceleration of the coordinates (n,), or of gradients at the points (9, S)."""
+    """Velocity and acceleration of the coordinates (n,)."""
 
-    velocity: jax.Array  # [m/s], [1/s]
-    acceleration: jax.Array  # [m/s^2], [1/s^2]
-
-
-class _Points(NamedTuple):
-    """Gradients of the modes' motion at the points; without derivatives, they serve guesses."""
-
-    G: jax.Array  # slopes times coordinates (9, S)
-    motion: ReducedMotion | None
+    velocity: jax.Array  # [m/s]
+    acceleration: jax.Array  # [m/s^2]
 
 
 class _Given(NamedTuple):
@@ -94,7 +87,6 @@ class _Equations(NamedTuple):
     gradient: jax.Array
     mass: jax.Array | None  # (n, n) [kg]
     q: jax.Array  # at the beginning
-    points: _Points  # likewise
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
@@ -103,23 +95,15 @@ class _Equations(NamedTuple):
     fluid: Flowing | None  # of a porous scene
 
 
-def _kinematics(e: _Equations, motion: ReducedMotion, before: jax.Array, after: jax.Array) -> ReducedMotion:
-    """As `liverjax.physics.inertia.Moving.kinematics`, of coordinates or gradients before and after the step."""
-    velocity = (after - before) / e.dt
-    acceleration = (velocity - motion.velocity) / e.dt
+def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
+    """As `liverjax.physics.inertia.Moving.kinematics`."""
+    assert e.motion is not None
+    velocity = (q - e.q) / e.dt
+    acceleration = (velocity - e.motion.velocity) / e.dt
     if e.newmark:
-        acceleration = 4 * acceleration - motion.acceleration
-        velocity = motion.velocity + 0.5 * e.dt * (motion.acceleration + acceleration)
+        acceleration = 4 * acceleration - e.motion.acceleration
+        velocity = e.motion.velocity + 0.5 * e.dt * (e.motion.acceleration + acceleration)
     return ReducedMotion(velocity, acceleration)
-
-
-def _straight_on(e: _Equations, motion: ReducedMotion | None, before: jax.Array) -> jax.Array:
-    """Coordinates or gradients at the end of the step, foretold from its beginning."""
-    if motion is None:
-        return before
-    after = before + e.dt * motion.velocity
-    # A parabola through the last ones. Accelerations of Newmark's method ring: they foretell nothing.
-    return after if e.newmark else after + e.dt**2 * motion.acceleration
 
 
 def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
@@ -153,8 +137,7 @@ def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax
         # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
         size = size + jnp.linalg.norm(jnp.tensordot(e.model.weights[None] * jnp.abs(P), e.spread, axes=2))
     if e.mass is not None:
-        assert e.motion is not None
-        inertia = e.mass @ _kinematics(e, e.motion, e.q, q).acceleration
+        inertia = e.mass @ _kinematics(e, q).acceleration
         r, size = r + inertia, size + jnp.linalg.norm(inertia)
     return r, size
 
@@ -297,11 +280,14 @@ def _solved(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse:
         own = jnp.linalg.inv(_reduced_tangent(e, at.q))
         return at._replace(inverse=own, fresh=jnp.array(True), tangents=at.tangents + 1)
 
-    start, none = _straight_on(e, e.motion, e.q), jnp.zeros((), jnp.int32)
-    # Gradients are linear in the coordinates: no product with the modes.
-    foretold, there = (e.gradient + G for G in (_straight_on(e, e.points.motion, e.points.G), e.points.G))
+    start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
+    if e.motion is not None and not newmark:
+        # A parabola through the last coordinates. Accelerations of Newmark's method ring: they foretell nothing.
+        start = start + e.dt**2 * e.motion.acceleration
+    foretold, none = _deformation(e, start), jnp.zeros((), jnp.int32)
     good = _upright(foretold)
-    start, F = jnp.where(good, start, e.q), jnp.where(good, foretold, there)
+    start = jnp.where(good, start, e.q)
+    F = jax.lax.cond(good, lambda: foretold, lambda: _deformation(e, e.q))
     r, size = _judged(e, start, F)
     begin = _ReducedIterate(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
     at = inner(begin)
@@ -368,25 +354,17 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     """What a run begins with: coordinates, memory, fluid, motion at rest, an empty inverse, mass matrix. Without
     inertia motion and mass are None."""
     n, S = model.number_of_modes, model.weights.shape[0]
-    q, G = jnp.zeros(n, model.modes.dtype), jnp.zeros((9, S), model.modes.dtype)
+    q = jnp.zeros(n, model.modes.dtype)
     inverse = jnp.zeros((n, n), q.dtype)
     memory = None if scene.viscosity is None else initial_history(scene.viscosity, S, q.dtype)
     fluid = None if scene.porosity is None else fluid_at_rest(model, scene)
     if scene.solve.kind != "dynamic" or scene.body is None:
-        return q, _Points(G, None), memory, fluid, None, inverse, None
+        return q, memory, fluid, None, inverse, None
     nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
     mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
     newmark = scene.solve.integrator == "newmark"
     motion = ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q)
-    points = jax.lax.stop_gradient(_Points(G, ReducedMotion(G, model.slopes @ motion.acceleration)))
-    return q, points, memory, fluid, motion, inverse, mass
-
-
-def _moved_on(e: _Equations, F: jax.Array) -> _Points:
-    """The gradients at the end of a step, from deformation gradients F (9, S)."""
-    before, G = e.points, jax.lax.stop_gradient(F - e.gradient)
-    motion = None if before.motion is None else _kinematics(e, before.motion, before.G, G)
-    return jax.lax.stop_gradient(_Points(G, motion))
+    return q, memory, fluid, motion, inverse, mass
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
@@ -399,25 +377,24 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:
-        q, points, memory, fluid, motion, inverse = carry
+        q, memory, fluid, motion, inverse = carry
         acting = solid.freeze(memory, step)
         newmark = solve.integrator == "newmark"
         load, gradient = given
         flow = None if sponge is None else flowing(model, sponge, fluid, solve.dt)
-        e = _Equations(model, acting, load, gradient, mass, q, points, motion, solve.dt, None, spread, noise, flow)
+        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise, flow)
         found = _newton(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
         flat = _deformation(e, found.q)
         F = as_matrix(flat)
         memory = solid.advance(memory, acting, End(points, F, None))
-        points = _moved_on(e, flat)
-        motion = None if motion is None else _kinematics(e, motion, q, found.q)
+        motion = None if motion is None else _kinematics(e, found.q)
         fluid = None if flow is None else advanced_fluid(flow, flat)
         code = jnp.where(found.residual <= solve.tolerance, status.CONVERGED, status.STALLED)
         code = jnp.where(jnp.min(determinant(F)) <= 0, status.INVERTED, code)
         code = jnp.where(jnp.all(jnp.isfinite(found.q)), code, status.NOT_FINITE)
         row = found.q, code, found.iterations, found.residual, None if fluid is None else fluid.pressure
-        return (found.q, points, memory, fluid, motion, found.inverse), row
+        return (found.q, memory, fluid, motion, found.inverse), row
 
     return advance
 
