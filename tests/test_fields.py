@@ -81,6 +81,11 @@ def test_uniform_strain_has_the_fields_of_one_point(order, volumetric):
         )
 
 
+def test_a_field_named_twice_is_there_once():
+    scene = scene_from(content())
+    assert shown(scene, np.asarray(scene.mesh.points)[None], ["energy", "energy"])["energy"].shape[0] == 1
+
+
 def test_a_held_viscous_body_relaxes():
     """Strained at once and held: the stress of the second step is that of the first, relaxed by the series."""
     prony = {"ratios": [0.5], "relaxation_times": [0.1]}

@@ -15,8 +15,10 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core import programs
-from liverjax.jobs import resumable_parts
+from liverjax.jobs import output, resumable_parts
 from liverjax.scenes import scene_file
+from liverjax.simulation.run import Result
+from liverjax.solvers.problem import StepStatistics
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -52,6 +54,28 @@ dt = 0.02
 steps = 10
 """
 
+#: One cell that hangs, for 9,000 steps.
+LONG = """
+[mesh]
+shape = "box"
+size = [0.1, 0.1, 0.1]
+cells = [1, 1, 1]
+[law]
+name = "neo_hookean"
+mu = 770.0
+bulk = 2200.0
+[body]
+density = 1060.0
+gravity = [0, 0, -1.0]
+[[fixed]]
+set = "z_min"
+[solve]
+kind = "dynamic"
+dt = 0.001
+steps = 9000
+tolerance = 1e-4
+"""
+
 
 @pytest.fixture(autouse=True, scope="module")
 def _kept(tmp_path_factory):
@@ -76,7 +100,8 @@ def scene(tmp_path) -> Path:
 
 def _numbers(file: Path) -> dict[str, np.ndarray]:
     with h5py.File(file) as result:
-        return {name: value[()] for name, value in result.items()} | {"status": result.attrs["status"]}
+        own = {name: value[()] for name, value in result.items() if isinstance(value, h5py.Dataset)}
+        return own | {name: output.read_by_step(result, name) for name in output.BY_STEP}
 
 
 def _stop_after(monkeypatch, count: int) -> None:
@@ -138,6 +163,41 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
     assert "of another run (its numbers differ)" in capsys.readouterr().err
     assert main(["simulate", str(scene), "--every", "0"]) == 2
     assert "--every 0 must be above 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("steps", [5, 8125, 8126, 40_000])
+def test_runs_of_any_length_are_written(steps, tmp_path):
+    """HDF5 takes no attribute of more than 64 kB, which is 8,190 residuals."""
+    scene = lj.Scene(mesh=lj.shapes.box((1, 1, 1), (1, 1, 1)), law=lj.laws.create("neo_hookean", mu=1.0, bulk=1.0))
+    number = np.arange(steps)
+    codes = number.astype(np.int32) % 2
+    taken = dict.fromkeys(StepStatistics._fields, number) | {"residual": 1e-9 * number, "status": codes}
+    nowhere = np.broadcast_to(np.zeros(()), (steps, 8, 3))
+    rows = {"times": number, "positions": nowhere, "reactions": nowhere, "status": codes}
+    result = Result(**rows, statistics=StepStatistics(**taken))
+    output.write_hdf5(tmp_path / "result.h5", scene, result, {"scene": "x" * 100_000})
+    found = _numbers(tmp_path / "result.h5")
+    assert found["status"].tolist() == codes.tolist() and found["residual"].tolist() == (1e-9 * number).tolist()
+    assert all(found[name].tolist() == number.tolist() for name in ("iterations", "linear_iterations", "cuts"))
+    with h5py.File(tmp_path / "result.h5") as file:
+        assert ("residual" in file.attrs) == (steps <= 8125) and len(file.attrs["scene"]) == 100_000
+
+
+@pytest.mark.slow
+def test_a_long_run_whose_parts_are_all_there_ends_well(tmp_path, monkeypatch):
+    (tmp_path / "scene.toml").write_text(LONG)
+    command = ["simulate", str(tmp_path / "scene.toml"), "--every", "4500", "--out", str(tmp_path)]
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(output, "write_hdf5", stopped)
+        assert main(command) == 130
+    assert main([*command, "--resume"]) == 0
+    found = _numbers(tmp_path / "result.h5")
+    assert found["positions"].shape == (9000, 8, 3) and not found["status"].any() and len(found["residual"]) == 9000
+    assert main(["plot", str(tmp_path / "result.h5"), "--step", "9000", "--out", str(tmp_path)]) == 0
 
 
 @pytest.mark.slow

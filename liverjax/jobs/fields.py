@@ -60,7 +60,7 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
         InputError: see `check`.
     """
     check(names, scene)
-    scene = prepared(scene)
+    scene, names = prepared(scene), list(dict.fromkeys(names))
     sizes, state = force_sizes(scene), initial_state(scene)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for k, x in enumerate(np.asarray(result.positions)):

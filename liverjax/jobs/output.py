@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,14 @@ from liverjax.physics.boundary import boundary_triangles
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result
 
+if TYPE_CHECKING:
+    import h5py
+
+#: What a result has one number a step of.
+BY_STEP = ("status", "iterations", "linear_iterations", "cuts", "residual")
+#: HDF5 takes 64 kB in an attribute, with its name and shape.
+_MOST_IN_ATTRIBUTE = 65_000
+
 
 def write_hdf5(
     file: Path,
@@ -26,7 +35,8 @@ def write_hdf5(
 ) -> None:
     """Rows, mesh and `fields` (T, E, …) as datasets; status, iterations and `attributes` as attributes.
 
-    The nodes of quadratic tetrahedra (E, 10) stand in the order of VTK.
+    What is one number a step becomes a dataset where it is too long for an attribute: `read_by_step` finds both. The
+    nodes of quadratic tetrahedra (E, 10) stand in the order of VTK.
     """
     import h5py
 
@@ -50,12 +60,17 @@ def write_hdf5(
         out["reference"].attrs["unit"] = "m"
         out["tetrahedra"] = meshio_cells(scene.mesh)[1]
         codes = np.asarray(result.status)
-        out.attrs["status"] = codes
         out.attrs["advice"] = [status.advice(c) for c in sorted(set(codes.tolist()))]
-        for name in ("iterations", "linear_iterations", "cuts", "residual"):
-            out.attrs[name] = np.asarray(getattr(result.statistics, name))
+        taken = {name: np.asarray(getattr(result.statistics, name)) for name in BY_STEP if name != "status"}
+        for name, numbers in {"status": codes, **taken}.items():
+            (out.attrs if numbers.nbytes <= _MOST_IN_ATTRIBUTE else out)[name] = numbers
         for name, value in attributes.items():
             out.attrs[name] = value if isinstance(value, (str, int, float)) else json.dumps(value)
+
+
+def read_by_step(file: "h5py.File", name: str) -> np.ndarray:
+    """The numbers (T,) of a result.h5 under one of `BY_STEP`: an attribute, or in long runs a dataset."""
+    return np.asarray(file.attrs[name] if name in file.attrs else file[name][()])
 
 
 def write_reactions(file: Path, scene: Scene, result: Result) -> None:
