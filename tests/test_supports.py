@@ -8,6 +8,8 @@ import pytest
 import liverjax as lj
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
+from liverjax.jobs.reactions import reaction_table
+from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.sliding_support import on_plane
 from liverjax.scenes.scene_file import scene_from
@@ -135,6 +137,50 @@ def test_reactions_of_a_slide_are_along_its_normal():
     reactions = np.asarray(lj.simulate(scene).check().reactions[-1]) @ TURN
     assert np.allclose(reactions.sum(axis=0), [0.0, 0.0, 1000.0 * SIDE**3], atol=1e-7)
     assert np.abs(reactions[:, :2]).max() < 1e-12
+
+
+def _forces(scene: lj.Scene) -> dict[str, np.ndarray]:
+    """Force [N] of every part at the end of a run, from the table of reactions; (3,) each."""
+    names, rows = reaction_table(scene, lj.simulate(scene).check())
+    last = dict(zip(names, rows[-1], strict=True))
+    parts = dict.fromkeys(name.rpartition(".")[0] for name in names if name.endswith("_N"))
+    return {part: np.array([last[f"{part}.{axis}_N"] for axis in "xyz"]) for part in parts}
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_three_planes_of_symmetry_carry_what_pulls_at_them(order):
+    """Uniaxial tension by 1 N: the plane across the pull carries it all, the planes along it nothing."""
+    mesh = box() if order == 1 else lj.quadratic(box())
+    planes = tuple(on_plane(mesh, part(mesh, **{f"{axis}_max": 0.0})) for axis in "xyz")
+    scene = pulled(mesh, [0.0, 0.0, 100.0], physics=planes)
+    found = _forces(scene)
+    assert np.allclose([found[f"support.{k}"] for k in range(3)], [[0, 0, 0], [0, 0, 0], [0, 0, -1.0]], atol=1e-6)
+    # The same with one plane held by its axis instead, and sideways: what two hold counts once.
+    shear = replace(
+        pulled(mesh, [30.0, 0.0, 100.0], physics=planes[:2]),
+        fixed=(
+            lj.Fixed(nodes=jnp.asarray(part(mesh, z_max=0.0)), axes="xz"),
+            lj.Fixed(nodes=planes[0].nodes, axes="xy"),
+        ),
+    )
+    found = _forces(shear)
+    assert np.allclose(sum(found.values()), [-0.3, 0.0, -1.0], atol=1e-6)
+    assert (
+        abs(found["fixed.0"][2] + 1.0) < 1e-6 and not found["support.0"].any() and not found["support.1"][[0, 2]].any()
+    )
+
+
+def test_an_oblique_plane_has_a_force_along_its_normal_alone():
+    """A cube turned by 30 degrees about z, between planes: the oblique ones share edges with the base."""
+    mesh, c, s = box(), np.cos(np.pi / 6), np.sin(np.pi / 6)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    turned = with_points(mesh, mesh.points @ turn.T)
+    planes = [on_plane(turned, part(mesh, **{f"{axis}_max": 0.0})) for axis in "xz"]
+    corner = lj.Fixed(nodes=jnp.asarray(part(mesh, y_max=0.0, x_max=0.0, z_max=0.0)))
+    pull = pulled(mesh, (turn @ [20.0, 0.0, 100.0]).tolist()).traction
+    found = _forces(lj.Scene(mesh=turned, law=LAW, traction=pull, physics=tuple(planes), fixed=(corner,)))
+    assert np.allclose(np.cross(found["support.0"], turn[:, 0]), 0, atol=1e-12) and not found["support.1"][:2].any()
+    assert np.allclose(sum(found.values()), -turn @ [0.2, 0.0, 1.0], atol=1e-6)
 
 
 def scene_text(*support) -> dict:

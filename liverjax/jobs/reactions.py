@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.mesh.selection import AXES
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.base import Free, Physics, Step
 from liverjax.physics.elastic_support import ElasticSupport
@@ -26,19 +27,8 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
         names.extend(f"{name}.{axis}_{unit}" for axis in "xyz")
         columns.extend(np.asarray(vectors).T)
 
-    held = {
-        f"{kind}.{k}": np.unique(np.asarray(part.nodes))
-        for kind in ("fixed", "displaced")
-        for k, part in enumerate(getattr(scene, kind))
-    }
-    # A node that slides and is held as well counts where it is held.
-    taken = np.concatenate([*held.values(), np.zeros(0, int)])
-    for k, place in enumerate(scene.named("support")):
-        physics = scene.physics[place]
-        if isinstance(physics, SlidingSupport):
-            held[f"support.{k}"] = np.setdiff1d(np.asarray(physics.nodes), taken)
-    for name, nodes in held.items():
-        add(name, np.asarray(result.reactions)[:, nodes].sum(axis=1), "N")
+    for name, held in _held_forces(scene, np.asarray(result.reactions)).items():
+        add(name, held, "N")
     for name, force in spring_forces(scene, result).items():
         add(name, force, "N")
     if scene.named("obstacle"):
@@ -49,6 +39,40 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
             names.append(f"obstacle.{k}.depth_m")
             columns.append(np.asarray(contact.depth[k]))
     return names, np.stack(columns, axis=1)
+
+
+def _held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
+    """Forces (T, 3) [N] of every fixed, displaced and sliding part, from those at the nodes (T, V, 3), by name.
+
+    A part has the force along the axes that it holds, a sliding one along its normal. What two parts hold at a node
+    counts in the first, so the parts add up to the force on the body.
+    """
+    taken, found = np.zeros(reactions.shape[1:], bool), {}
+
+    def along(nodes: np.ndarray, axes: list[int]) -> np.ndarray:
+        own = np.zeros((len(nodes), 3), bool)
+        own[:, axes] = ~taken[nodes][:, axes]
+        taken[nodes] |= own
+        return np.where(own, reactions[:, nodes], 0.0).sum(axis=1)
+
+    for kind in ("fixed", "displaced"):
+        for k, part in enumerate(getattr(scene, kind)):
+            axes = [AXES.index(axis) for axis in part.axes]
+            found[f"{kind}.{k}"] = along(np.unique(np.asarray(part.nodes)), axes)
+    held = taken.copy()
+    for k, place in enumerate(scene.named("support")):
+        physics = scene.physics[place]
+        if not isinstance(physics, SlidingSupport):
+            continue
+        nodes = np.unique(np.asarray(physics.nodes))
+        if physics.axis:
+            found[f"support.{k}"] = along(nodes, [AXES.index(physics.axis)])
+            continue
+        # An oblique normal counts where it is free to act: elsewhere all of its axes are held already.
+        normal = np.asarray(physics.normal)
+        loose = nodes[~held[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
+        found[f"support.{k}"] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal
+    return found
 
 
 def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
