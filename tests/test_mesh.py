@@ -10,6 +10,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.mesh.files import meshio_cells
 from liverjax.simulation.automatic import qualities
 from liverjax.tensors.matrices import deformation_gradient, pack
 
@@ -189,3 +190,55 @@ def test_a_gmsh_file_is_read_without_a_word(tmp_path, capsys):
     lj.read_mesh(tmp_path / "box.msh")
     printed = capsys.readouterr()
     assert printed.out == printed.err == ""
+
+
+def _with_surface(file, order: int, cells: str, names: dict, **more) -> lj.TetMesh:
+    """Write a cube with its lower face as triangles, grouped and named as in Gmsh, and read it again."""
+    mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
+    triangles = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
+    if order == 2:
+        mesh = lj.quadratic(mesh)
+        ends = np.sort(triangles[:, [[0, 1], [1, 2], [0, 2]]], axis=2)
+        edges = {tuple(e): mesh.number_of_vertices + k for k, e in enumerate(np.asarray(mesh.pattern.edges).T.tolist())}
+        middles = [[edges[tuple(e)] for e in three] for three in ends.tolist()]
+        triangles = np.hstack([triangles, middles]) if cells == "triangle6" else triangles
+    blocks, count = [(cells, triangles), meshio_cells(mesh)], mesh.number_of_elements
+    groups = {
+        key: [np.full(len(triangles), k), np.full(count, 3)]
+        for key, k in (("gmsh:physical", 7), ("gmsh:geometrical", 1))
+    }
+    meshio.Mesh(np.asarray(mesh.points), blocks, cell_data=groups, field_data=names, **more).write(file, "gmsh22")
+    return lj.read_mesh(file)
+
+
+@pytest.mark.parametrize("order, cells", [(1, "triangle"), (2, "triangle6"), (2, "triangle")])
+def test_a_named_group_of_triangles_is_a_place(order, cells, tmp_path):
+    """All nodes of the face, middles of edges too: also where the file has them in the tetrahedra alone."""
+    names = {"bottom": np.array([7, 2]), "liver": np.array([3, 3])}
+    mesh = _with_surface(tmp_path / "m.msh", order, cells, names)
+    below = np.flatnonzero(np.asarray(mesh.points)[:, 2] == 0)
+    assert len(below) == (9 if order == 1 else 25)
+    assert sorted(np.asarray(mesh.node_sets["bottom"]).tolist()) == below.tolist()
+    assert len(mesh.element_sets["liver"]) == 48 and "bottom" not in mesh.element_sets
+    assert set(_with_surface(tmp_path / "m.msh", order, cells, {}).node_sets) == set()
+
+
+def test_sets_of_triangles_in_other_files_and_names_that_collide(tmp_path):
+    mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
+    below = np.asarray(mesh.node_sets["z_min"])
+    blocks = [("triangle", lj.boundary.boundary_triangles(mesh, below)), meshio_cells(mesh)]
+    mask = [np.ones(8, int), np.zeros(48, int)]
+    own = {f"set:{name}": np.isin(np.arange(27), nodes).astype(int) for name, nodes in (("a", below), ("b", below[:3]))}
+    for name in ("a", "c"):
+        meshio.Mesh(np.asarray(mesh.points), blocks, own, {f"set:{name}": mask}).write(tmp_path / "m.vtu")
+        read = lj.read_mesh(tmp_path / "m.vtu")
+        assert sorted(np.asarray(read.node_sets[name]).tolist()) == below.tolist() and len(read.node_sets["b"]) == 3
+    meshio.Mesh(np.asarray(mesh.points), blocks, own, {"set:b": mask}).write(tmp_path / "m.vtu")
+    with pytest.raises(lj.InputError, match="'b' is a set of 3 nodes and a group of triangles with 9 nodes: rename"):
+        lj.read_mesh(tmp_path / "m.vtu")
+    sets = {"sole": [np.arange(8), []], "half": [[], np.arange(24)]}
+    meshio.Mesh(np.asarray(mesh.points), blocks, cell_sets=sets).write(tmp_path / "m.inp")
+    read = lj.read_mesh(tmp_path / "m.inp")
+    assert (
+        sorted(np.asarray(read.node_sets["sole"]).tolist()) == below.tolist() and len(read.element_sets["half"]) == 24
+    )

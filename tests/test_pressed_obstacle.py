@@ -157,6 +157,7 @@ def test_scene_files_press_an_obstacle():
         ({"force": [0, 0, -1], "by": [0, 0, 1]}, "obstacle.0 has force beside by: leave one"),
         ({"force": [0, 0, -1], "friction": 0.5}, "obstacle.0 has force beside friction: leave one"),
         ({"history": [[0, 0, 0, 1]]}, "history"),
+        ({"history": [[0, 1], [1, -0.5]]}, "factor -0.5: a force presses"),
     ],
 )
 def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):

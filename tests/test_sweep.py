@@ -125,6 +125,25 @@ def test_a_sweep_holds_the_rows_of_single_runs(files):
         assert not (files / "rows.h5.parts").exists()
 
 
+def test_rows_of_a_loaded_mesh_are_measured_from_their_own_shapes(files):
+    """Each row lies as given under its loads: so it has moved from a reference shape of its own."""
+    (files / "scene.toml").write_text(SCENE.replace("[mesh]", '[mesh]\nis = "loaded"'))
+    (files / "rows.csv").write_text("law.mu\n700\n1400\n2000\n")
+    assert main(command(files, "--store", "largest_displacement", "final_positions")) == 0
+    scene = lj.load_scene(files / "scene.toml")
+    with h5py.File(files / "rows.h5") as out:
+        assert out["reference"].shape == (3, 27, 3) and out["reference"].attrs["unit"] == "m"
+        for k, mu in enumerate((700.0, 1400.0, 2000.0)):
+            own = np.asarray(lj.unloaded(lj.with_parameters(scene, {"law.mu": mu})).scene.mesh.points)
+            moved = np.linalg.norm(np.asarray(scene.mesh.points) - own, axis=1).max()
+            # Both end as given, to the tolerance of Newton's method.
+            assert np.abs(out["reference"][k] - own).max() < 1e-6 * moved
+            assert np.isclose(out["largest_displacement"][k], moved, rtol=1e-6)
+            assert np.abs(out["final_positions"][k] - np.asarray(scene.mesh.points)).max() < 1e-6 * moved
+    table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
+    assert "reference" in table.identity["outputs"]
+
+
 @pytest.mark.slow
 def test_resumed_results_have_the_same_bytes(files):
     assert main(command(files, "--out", str(files / "whole.h5"))) == 0
@@ -191,6 +210,62 @@ def test_failed_rows_are_listed_and_run_again_alone(files, capsys):
     with h5py.File(files / "rows.h5") as all_rows, h5py.File(files / "again.h5") as again:
         assert again["row"][:].tolist() == [3] and np.allclose(again["parameters"][0], all_rows["parameters"][2])
         assert np.abs(again["final_positions"][0] - all_rows["final_positions"][2]).max() < 1e-12
+
+
+def test_failed_rows_are_told_by_the_process_that_comes_last(files, monkeypatch):
+    """Another process has joined the parts between the last chunk of this one and its own try."""
+    (files / "rows.csv").write_text("law.mu,body.density\n700,1000\n700,1e12\n720,1000\n")
+    table, out = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2), files / "rows.h5"
+
+    def joined_before(sweep_now, file, folder, computed):
+        join(sweep_now, file, folder, computed)
+        folder.mkdir()
+        return join(sweep_now, file, folder, computed)
+
+    join = sweep._joined
+    monkeypatch.setattr(sweep, "_joined", joined_before)
+    done = sweep.run(table, out)
+    assert done.file == out and list(done.failed) == [2] and done.computed == 3
+
+
+#: Parts that a row may change, beside the cube.
+PARTS = """
+[[obstacle]]
+shape = "plane"
+position = [0, 0, 0.1]
+axis = [0, 0, -1]
+by = [0, 0, -0.01]
+[[vessel]]
+line = [[0.02, 0.05, 0.0], [0.05, 0.05, 0.1]]
+radius = 3e-3
+wall = 5e-4
+[vessel.law]
+name = "neo_hookean"
+mu = 1e5
+[[ligament]]
+where = {z_min = 0.1}
+to = [0.05, 0.05, 0.15]
+stiffness = 20.0
+pre_tension = 0.05
+"""
+
+
+@pytest.mark.parametrize(
+    "column, value, words",
+    [
+        ("obstacle.0.axis.2", -2.0, "of length 1"),
+        ("obstacle.0.position.2", 0.05, "begins 0.05 m inside the body"),
+        ("vessel.0.wall", 0.005, "thicker than the radius"),
+        # A fibre is at least 5 cm long and has no length at rest at 20 N/m times that.
+        ("ligament.0.pre_tension", 50.0, "more than it could have, 1 N"),
+    ],
+)
+def test_rows_are_checked_as_the_scene_is(files, column, value, words):
+    (files / "scene.toml").write_text(SCENE.replace("z_min = 0.1", "z_max = 0.0") + PARTS)
+    good = lj.load_scene(files / "scene.toml")
+    (files / "rows.csv").write_text(f"{column}\n{float(lj.scenes.scene.numbers_at(good, column))}\n{value}\n")
+    with pytest.raises(lj.InputError, match=f"row 2: {column[:10]}.*{words}"):
+        sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 
 def test_what_cannot_be_resumed_is_refused(files, capsys):

@@ -11,6 +11,8 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 
+#: Fields of regions that may be dictionaries of numbers, which are checked with those of the scene.
+_DICTIONARIES = ("law", "viscosity", "porosity")
 #: A list of more numbers is not written out in a sentence: the first bad one is named by its place.
 _FEW = 8
 
@@ -34,7 +36,7 @@ def _fields(thing: Any, name: str, leave: tuple[str, ...]) -> Iterator[tuple[str
     """Dotted name, metadata and value of every field that has a bound or a unit."""
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
-        if value is None or field.name in leave or isinstance(value, dict):
+        if value is None or field.name in leave or (isinstance(value, dict) and field.name in _DICTIONARIES):
             continue
         # Names are those of the scene file: `law.0.mu`, not `law.laws.0.mu`.
         dotted = name if field.metadata.get("unnamed") else ".".join(filter(None, (name, field.name)))
@@ -69,7 +71,7 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         leaves, numbers = [value], None
         least = most = value
     else:
-        leaves = jax.tree.leaves(value, is_leaf=lambda v: v is None)
+        leaves = jax.tree.leaves(value, is_leaf=lambda v: v is None or isinstance(v, dict))
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # a number only under jit or grad
             return
         numbers = _numbers_of(where, metadata, value, leaves)
@@ -106,7 +108,7 @@ def _refuse(where: str, metadata: Mapping, value: object, numbers: np.ndarray) -
 def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> np.ndarray:
     """The numbers of all leaves (n,)."""
     try:
-        if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):
+        if any(isinstance(leaf, (str, bytes, bool, dict)) for leaf in leaves):
             raise TypeError
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves]) if leaves else np.empty(0)
     except (TypeError, ValueError):
@@ -138,3 +140,13 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
     if value is not None and np.shape(value) not in allowed:
         words = " or ".join("one number" if shape == () else f"shape {shape}" for shape in allowed)
         raise InputError(f"{where} has shape {np.shape(value)}: give {words}")
+
+
+def check_one(where: str, value: object) -> None:
+    """Refuse a value of a scene file that is not one finite number.
+
+    Raises:
+        InputError: one sentence that begins with `where`.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{where} = {value!r} is not a number: give one")

@@ -1,7 +1,9 @@
-"""The hint at the end of a sentence that refuses an unknown word."""
+"""Words of users: what is no word, and the hint at the end of a sentence that refuses an unknown one."""
 
 import difflib
 from collections.abc import Iterable
+
+from liverjax.core.errors import InputError
 
 
 def hint(word: str, known: Iterable[str]) -> str:
@@ -10,3 +12,18 @@ def hint(word: str, known: Iterable[str]) -> str:
     longer = [name for name in words if len(word) > 2 and name.startswith(word)]
     near = longer or difflib.get_close_matches(word, words, n=1, cutoff=0.5 if len(word) < 4 else 0.6)
     return f"did you mean {near[0]}?" if near else f"use one of {', '.join(words)}"
+
+
+def as_word(value: object, where: str) -> str:
+    """The value, where it is text; asked before a word is looked up.
+
+    Args:
+        value: of a scene file.
+        where: how it is called.
+
+    Raises:
+        InputError: anything else.
+    """
+    if not isinstance(value, str):
+        raise InputError(f"{where} = {value!r} is no text: write one word in quotes")
+    return value

@@ -27,19 +27,19 @@ from liverjax.core.versions import versions
 from liverjax.jobs import resumable_parts
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
-from liverjax.scenes.scene_checks import check_numbers
+from liverjax.scenes.scene_checks import check_numbers, check_physics
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import simulate_batch
 
-#: What may be stored of every row, from its result and the reference positions.
+#: What may be stored of every row, from its result and its reference positions (V, 3).
 OUTPUTS: dict[str, Callable] = {
-    "final_positions": lambda result, scene: result.positions[-1],
-    "positions": lambda result, scene: result.positions,
-    "largest_displacement": lambda result, scene: jnp.max(
-        jnp.linalg.norm(result.positions - scene.mesh.points[None], axis=-1)
+    "final_positions": lambda result, reference: result.positions[-1],
+    "positions": lambda result, reference: result.positions,
+    "largest_displacement": lambda result, reference: jnp.max(
+        jnp.linalg.norm(result.positions - reference[None], axis=-1)
     ),
-    "final_reactions": lambda result, scene: result.reactions[-1],
-    "largest_pressure": lambda result, scene: jnp.max(result.pressure),
+    "final_reactions": lambda result, reference: result.reactions[-1],
+    "largest_pressure": lambda result, reference: jnp.max(result.pressure),
 }
 _UNITS = {"final_reactions": "N", "largest_pressure": "Pa"}
 
@@ -83,10 +83,13 @@ def read_sweep(
     for name in names:
         if np.shape(numbers_at(scene, name)):
             raise InputError(f"parameter {name!r} is no number of the scene file: it is a list, name one number of it")
+    parts = {".".join(name.split(".")[:2]) for name in names}
     for k, row in enumerate(rows.tolist()):
         values = dict(zip(names, row, strict=True))
         try:
-            check_numbers(with_parameters(scene, values))
+            own = with_parameters(scene, values)
+            check_numbers(own)
+            check_physics(own, parts)
         except InputError as error:
             raise InputError(f"{parameters}: row {k + 1}: {error}") from None
     for name in outputs:
@@ -106,12 +109,13 @@ def read_sweep(
     if only:
         numbers = np.array(sorted(set(only)))
     chunk = min(chunk, len(numbers))
+    own_shapes = ["reference"] if scene.points_are == "loaded" else []
     identity = {
         "scene": scene_file.read_text(encoding="utf-8"),
         "numbers": resumable_parts.digest(*jax.tree.leaves(scene)),
         "parameters": resumable_parts.digest(rows) + " " + " ".join(names),
         "rows": resumable_parts.digest(numbers),
-        "outputs": [*outputs, *(f"probe {p}" for p in probes)],
+        "outputs": [*outputs, *(f"probe {p}" for p in probes), *own_shapes],
         "chunk": chunk,
         "versions": versions(),
     }
@@ -206,8 +210,13 @@ def _program(outputs: tuple, probes: tuple) -> Callable:
 
 
 def _rows(outputs: tuple, probes: tuple, scene: Scene, values: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    result = simulate_batch(scene, values).result
-    stored = {name: jax.vmap(lambda r, name=name: OUTPUTS[name](r, scene))(result) for name in outputs}
+    batch = simulate_batch(scene, values)
+    result, reference = batch.result, batch.reference
+    loaded = reference is not None
+    every = jax.vmap(lambda r, own, name: OUTPUTS[name](r, own), in_axes=(0, 0 if loaded else None, None))
+    stored = {name: every(result, reference if loaded else scene.mesh.points, name) for name in outputs}
+    if loaded:
+        stored["reference"] = reference
     if probes:
         stored["probes"] = result.positions[:, :, np.array(probes, dtype=int)]
     return stored | {"status": result.status, "residual": result.statistics.residual}
@@ -240,8 +249,10 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
     files = [resumable_parts.part(folder, k) for k in _chunks(sweep)]
     try:
         with resumable_parts.locked(folder / "lock_join"):
-            if out.exists() or not all(f.exists() for f in files):
-                return Done(out if out.exists() else None, {}, computed)
+            if out.exists():
+                return _already(sweep, out, True)._replace(computed=computed)
+            if not all(f.exists() for f in files):
+                return Done(None, {}, computed)
             codes = _join(sweep, out, files)
     except (InputError, FileNotFoundError):  # another process joins them at this moment
         return Done(None, {}, computed)
@@ -273,7 +284,9 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
         joined["parameters"].attrs["names"] = list(sweep.names)
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
-        joined["reference"] = np.asarray(sweep.scene.mesh.points)
+        if "reference" not in joined:  # of a loaded mesh every row has its own
+            joined["reference"] = np.asarray(sweep.scene.mesh.points)
+        joined["reference"].attrs["unit"] = "m"
         joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]
         joined.attrs["sweep"] = json.dumps(sweep.identity)
         codes = joined["status"][:]

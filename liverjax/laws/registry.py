@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core import bounds
-from liverjax.core.did_you_mean import hint
+from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, Numbers, replace
 from liverjax.laws.base import Law
@@ -49,7 +49,7 @@ LAWS: dict[str, type[Law]] = {
 
 def find(name: str) -> type[Law]:
     """The class of a law's name; `InputError` offering the nearest known name."""
-    if name not in LAWS:
+    if as_word(name, "law name") not in LAWS:
         raise InputError(f"law {name!r} is not known: {hint(name, LAWS)}")
     return LAWS[name]
 

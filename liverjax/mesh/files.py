@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from liverjax.core.did_you_mean import as_word
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
@@ -39,7 +40,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     Raises:
         InputError: unreadable file, no or other cells, unit unknown, unusable mesh.
     """
-    if unit not in UNITS:
+    if as_word(unit, "mesh unit") not in UNITS:
         raise InputError(f"mesh unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
     path = Path(path)
     if not path.is_file():
@@ -66,7 +67,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
         raise InputError(
             f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
         )
-    sets = _node_sets(data), _element_sets(data, cell)
+    sets = _node_sets(data, tets, f"mesh file {path}"), _element_sets(data, cell)
     if order == 1:
         mesh = tet_mesh(points, tets, *sets)
         check_mesh(mesh, f"mesh file {path}")
@@ -145,12 +146,23 @@ _FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
 _LARGE = 10.0
 
 
-def _node_sets(data: Any) -> dict[str, np.ndarray]:
-    """meshio's point sets, and integer point data named ``set:NAME`` (how `write_mesh` keeps them in VTU)."""
+def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    """meshio's point sets, integer point data ``set:NAME`` (how `write_mesh` keeps them in VTU), groups of triangles.
+
+    Raises:
+        InputError: a name that stands for two sets.
+    """
     sets = {name: np.asarray(nodes, dtype=np.int32) for name, nodes in (data.point_sets or {}).items()}
-    for name, values in data.point_data.items():
-        if name.startswith("set:"):
-            sets[name.removeprefix("set:")] = np.flatnonzero(values).astype(np.int32)
+    for key, values in data.point_data.items():
+        if key.startswith("set:"):
+            sets[key.removeprefix("set:")] = np.flatnonzero(values).astype(np.int32)
+    for key, nodes in _surface_sets(data, tets).items():
+        if key in sets and set(sets[key].tolist()) != set(nodes.tolist()):
+            raise InputError(
+                f"{name}: {key!r} is a set of {len(sets[key])} nodes and a group of triangles with {len(nodes)} nodes: "
+                "rename one of them"
+            )
+        sets[key] = nodes
     return sets
 
 
@@ -163,20 +175,57 @@ def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
 
     A group is named by the file (Gmsh's physical names), or by array and number, as in ``medit:ref=2``.
     """
+    return _cell_groups(data, (cell,), 3)
+
+
+#: Cells of surfaces whose named groups become node sets, and the edges of the first.
+_TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
+
+
+def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
+    """Nodes of the triangles that the file groups under a name; of 3 nodes beside quadratic elements with middles."""
+    blocks = [block for block in data.cells if block.type in _TRIANGLES]
+    first, sets = np.cumsum([0, *(len(block.data) for block in blocks)]), {}
+    for name, numbers in (_cell_groups(data, _TRIANGLES, 2) if blocks else {}).items():
+        nodes = []
+        for block, low, high in zip(blocks, first[:-1], first[1:], strict=True):
+            triangles = block.data[numbers[(numbers >= low) & (numbers < high)] - low]
+            nodes.append(triangles.ravel())
+            if block.type == "triangle" and tets.shape[1] == 10:
+                nodes.append(_middles(tets, triangles))
+        sets[name] = np.unique(np.concatenate(nodes)).astype(np.int32)
+    return sets
+
+
+def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Middles of the edges of triangles (m, 3) in quadratic elements (E, 10) in the order of VTK."""
+
+    def code(pairs: np.ndarray) -> np.ndarray:
+        low, high = np.moveaxis(np.sort(pairs.astype(np.int64), axis=-1), -1, 0)
+        return low * (int(tets.max()) + 1) + high
+
+    return tets[:, 4:][np.isin(code(tets[:, _VTK]), code(triangles[:, _EDGES]))]
+
+
+def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
+    """Numbers of the cells of some types, counted through their blocks, by the name of their group.
+
+    Groups that have a number alone are named by it if they are volumes, and left out if they are surfaces.
+    """
     kinds = [block.type for block in data.cells]
-    first = np.cumsum([0, *(len(block.data) if block.type == cell else 0 for block in data.cells)])
+    first = np.cumsum([0, *(len(block.data) if block.type in cells else 0 for block in data.cells)])
     sets = {}
     for name, parts in (data.cell_sets or {}).items():
         picks = [
             first[k] + np.asarray(part, int)
             for k, part in enumerate(parts)
-            if part is not None and kinds[k] == cell and not name.startswith("gmsh:bounding")
+            if part is not None and kinds[k] in cells and not name.startswith("gmsh:bounding")
         ]
         if picks and sum(map(len, picks)):
             sets[name] = np.concatenate(picks)
-    names = {(int(tag[0]), "gmsh:physical"): name for name, tag in data.field_data.items() if tag[-1] == 3}
+    names = {(int(tag[0]), "gmsh:physical"): name for name, tag in data.field_data.items() if tag[-1] == dimension}
     for name, parts in data.cell_data.items():
-        values = np.concatenate([np.asarray(p) for p, kind in zip(parts, kinds, strict=True) if kind == cell])
+        values = np.concatenate([np.asarray(p) for p, kind in zip(parts, kinds, strict=True) if kind in cells])
         if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
             continue
         if name.startswith("set:"):
@@ -184,7 +233,8 @@ def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
             continue
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
-            sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
+            if dimension == 3 or (int(group), name) in names:
+                sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
     return sets
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from liverjax.core.did_you_mean import hint
+from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices
 from liverjax.mesh.tetrahedra import TetMesh
@@ -29,7 +29,7 @@ def select(
     if (where is None) == (set is None):
         raise InputError(f'{name}: give either where = {{z_max = 0.0}} or set = "name"')
     if set is not None:
-        if set not in mesh.node_sets:
+        if as_word(set, f"{name}: set") not in mesh.node_sets:
             there = ", ".join(mesh.node_sets) or "none"
             raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
         return np.asarray(mesh.node_sets[set])

@@ -48,6 +48,8 @@ class ElasticSupport(Physics):
                 f"{name} needs either normal and tangential in Pa/m, for springs on the surface, or stiffness in N/m, "
                 "for springs on nodes: give one of them"
             )
+        for key, value in given.items():
+            bounds.check_one(f"{name}.{key}", value)
         if "history" in table:
             given["times"], given["history"] = history.read_history(table["history"], name)
         if "stiffness" in given:

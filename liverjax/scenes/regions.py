@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from liverjax.core import names
+from liverjax.core.did_you_mean import as_word
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Numbers, param, struct
 from liverjax.laws import Law
@@ -38,7 +39,7 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
         InputError: both or neither given, a set that the mesh has not, no element found.
     """
     if set is not None and where is None:
-        if set not in mesh.element_sets:
+        if as_word(set, f"{name}: set") not in mesh.element_sets:
             known = ", ".join(mesh.element_sets) or "none"
             raise InputError(f"{name}: the mesh has no element set {set!r} (it has: {known}); use one of them or where")
         return np.asarray(mesh.element_sets[set])

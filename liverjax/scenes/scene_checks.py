@@ -1,13 +1,14 @@
 """Checks of a scene before anything is compiled; each refusal is one sentence."""
 
 import warnings
+from collections.abc import Container
 
 import numpy as np
 
 from liverjax import laws
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
-from liverjax.mesh.selection import check_nodes, check_triangles
+from liverjax.mesh.selection import AXES, check_nodes, check_triangles
 from liverjax.mesh.tetrahedra import check_mesh
 from liverjax.physics import porosity, viscosity
 from liverjax.physics.base import Physics
@@ -161,6 +162,23 @@ def check_numbers(scene: Scene) -> None:
         porosity.check(scene.porosity)
 
 
+def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
+    """Refuse further physics whose numbers, nodes or places no run can begin with; host side.
+
+    Args:
+        scene: `Scene`.
+        only: names of those to look at, like ``obstacle.0``; None: all.
+
+    Raises:
+        InputError: one sentence that begins with the name of the physics.
+    """
+    for name, physics in _named_physics(scene):
+        if only is None or name in only:
+            physics.check(scene.mesh, name)
+            if scene.points_are != "loaded":
+                physics.check_place(scene.mesh, name)
+
+
 def check_scene(scene: Scene) -> None:
     """Refuse a scene that cannot be simulated; host side, before any compile.
 
@@ -172,10 +190,7 @@ def check_scene(scene: Scene) -> None:
     check_mesh(scene.mesh)
     check_region_elements(scene)
     _places(scene)
-    for name, physics in _named_physics(scene):
-        physics.check(scene.mesh, name)
-        if scene.points_are != "loaded":
-            physics.check_place(scene.mesh, name)
+    check_physics(scene)
     _no_two_normals(scene)
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
@@ -193,6 +208,7 @@ def check_scene(scene: Scene) -> None:
     if solve.kind == "dynamic" and scene.body is None:
         raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
     _no_contradiction(scene)
+    _no_motion_off_planes(scene)
     if not free_places(scene.mesh, scene.fixed, ()).any():
         warnings.warn(
             "fixed holds every node along every axis, so nothing can move: a place like where = {z_min = 0} takes all "
@@ -232,6 +248,9 @@ def _no_two_normals(scene: Scene) -> None:
     """Refuse a node in two oblique planes, or held along some but not all axes of its plane's normal."""
     taken: dict[int, str] = {}
     mask = free_places(scene.mesh, scene.fixed, scene.displaced)
+    for physics in scene.physics:
+        if isinstance(physics, SlidingSupport) and physics.axis:
+            mask[np.asarray(physics.nodes), AXES.index(physics.axis)] = False
     for name, physics in _named_physics(scene):
         if not isinstance(physics, SlidingSupport) or physics.axis:
             continue
@@ -254,6 +273,25 @@ def _no_contradiction(scene: Scene) -> None:
                         raise InputError(
                             f"{other} and {kind}.{k} both prescribe node {node} along {axis}: make their places differ"
                         )
+
+
+def _no_motion_off_planes(scene: Scene) -> None:
+    """Refuse a prescribed motion that leads nodes off the plane in which they slide."""
+    for name, physics in _named_physics(scene):
+        if not isinstance(physics, SlidingSupport):
+            continue
+        nodes, normals = physics.holds(scene.mesh)
+        for k, motion in enumerate(scene.displaced):
+            both = np.isin(np.asarray(motion.nodes), nodes)
+            vectors = np.array(motion.history if motion.by is None else motion.by, float)
+            vectors[..., [a for a in range(3) if AXES[a] not in motion.axes]] = 0.0
+            own = vectors[both] if motion.by is not None and vectors.ndim == 2 else vectors
+            if both.any() and np.any(np.abs(own @ normals[0]) > 1e-9 * np.abs(vectors).max()):
+                node = np.asarray(motion.nodes)[both][0]
+                raise InputError(
+                    f"displaced.{k} moves node {node} off the plane of {name}: make their places differ, or leave that "
+                    "direction out of axes"
+                )
 
 
 def _held(scene: Scene) -> None:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax import laws
-from liverjax.core import history
-from liverjax.core.did_you_mean import hint
+from liverjax.core import bounds, history
+from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices
 from liverjax.laws import Law
@@ -28,6 +28,7 @@ from liverjax.physics.porosity import Inlet, Porosity
 from liverjax.physics.registry import NAMED
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes import regions
+from liverjax.scenes.idle_settings import refuse_idle
 from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.scene_checks import CHOICES, check_scene
@@ -112,6 +113,7 @@ def scene_from(content: Content, folder: Path = Path()) -> Scene:
         solve=_read_solve(_table("solve", content.get("solve", {}))),
         points_are=content["mesh"].get("is", "reference"),
     )
+    refuse_idle(content)
     check_scene(scene)
     return scene
 
@@ -128,7 +130,7 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
         raise InputError(f'[output] fields = {names!r} must be a list of names: write fields = ["cauchy_stress"]')
     if not isinstance(reactions, bool):
         raise InputError(f"[output] reactions = {reactions!r} must be true or false: give one of them")
-    return names, reactions
+    return list(dict.fromkeys(names)), reactions
 
 
 def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
@@ -190,9 +192,8 @@ def _section(content: dict, name: str, make: Any) -> Any:
 
 
 def _number(name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{name} = {value!r} is not a number: give one")
-    return float(value)
+    bounds.check_one(name, value)
+    return float(value)  # type: ignore[arg-type]
 
 
 def _numbers(name: str, value: object, length: int | None = None) -> np.ndarray:
@@ -212,12 +213,12 @@ def _mesh(table: dict, folder: Path) -> TetMesh:
 
 def _linear_mesh(table: dict, folder: Path) -> TetMesh:
     unit = table.get("unit", "m")
-    if unit not in UNITS:
+    if as_word(unit, "[mesh] unit") not in UNITS:
         raise InputError(f"[mesh] unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
     if ("file" in table) == ("shape" in table):
         raise InputError('[mesh] needs either file = "liver.vtu" or shape = "box" (or "cylinder"): give one of them')
     if "file" in table:
-        return read_mesh(folder / str(table["file"]), unit)
+        return read_mesh(folder / as_word(table["file"], "[mesh] file"), unit)
     scale = UNITS[unit]
     if table["shape"] == "box":
         for key in ("size", "cells"):
@@ -369,7 +370,10 @@ def _read_body(table: dict) -> Body:
         raise InputError("[body] needs density in kg/m^3: give e.g. density = 1060.0")
     gravity = _numbers("[body] gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3)
     density = _number("[body] density", table["density"])
-    return Body(density=density, gravity=jnp.asarray(gravity), **_history("[body]", table))
+    given = _history("[body]", table)
+    if "gravity" in table and given and given["history"].ndim == 2:
+        raise InputError("[body] has gravity and a history of gravity itself: leave one of them out")
+    return Body(density=density, gravity=jnp.asarray(gravity), **given)
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:

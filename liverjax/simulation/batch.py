@@ -14,7 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.scenes.scene import Scene, with_parameters
-from liverjax.simulation.run import Result, simulate
+from liverjax.simulation.run import Result, simulate, unloaded
 
 STRATEGIES = ("map", "vmap")
 
@@ -24,6 +24,9 @@ class Batch:
     """Results of N lanes; `result.status` is (N, T). A lane that failed does not change the others."""
 
     result: Result = param("1", "every field with a leading axis of N lanes")
+    reference: jax.Array | None = param(
+        "m", 'reference shapes (N, V, 3) of a scene whose mesh is "loaded": each lane has its own', default=None
+    )
     strategy: str = static(
         default="map", about="map: one lane after another per device; vmap: all lanes of a device at once"
     )
@@ -58,7 +61,11 @@ def simulate_batch(
 
     def part(scene, values):
         def run(values):
-            return simulate(with_parameters(scene, values))
+            own = with_parameters(scene, values)
+            if own.points_are != "loaded":
+                return simulate(own), None
+            own = unloaded(own).scene
+            return simulate(own), own.mesh.points
 
         return jax.lax.map(run, values) if strategy == "map" else jax.vmap(run)(values)
 
@@ -71,9 +78,9 @@ def simulate_batch(
         mesh = Mesh(np.array(devices[:number]), ("lane",))
         specs = (PartitionSpec(), spread)
         part = jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
-    result = part(scene, parameters)
-    result = jax.tree.map(lambda a: a[:lanes], result) if number > 1 else result
-    return Batch(result=result, strategy=strategy, devices=number)
+    found = part(scene, parameters)
+    result, reference = jax.tree.map(lambda a: a[:lanes], found) if number > 1 else found
+    return Batch(result=result, reference=reference, strategy=strategy, devices=number)
 
 
 def _lanes(parameters: dict[str, jax.Array]) -> int:

@@ -42,6 +42,8 @@ class Ligament(Physics):
         if "stiffness" not in table:
             raise InputError(f"{name} needs stiffness in N/m: give a number")
         given = {key: table[key] for key in ("stiffness", "pre_tension", "rest_length") if key in table}
+        for key, value in given.items():
+            bounds.check_one(f"{name}.{key}", value)
         if "to" in table:
             to = jnp.asarray(_vector(table["to"], f"{name} to"))
             nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
@@ -63,10 +65,11 @@ class Ligament(Physics):
         bounds.check_shape(f"{name}.to", self.to, (3,))
         if (self.pre_tension is None) == (self.rest_length is None):
             raise InputError(f"{name} needs either pre_tension in N or rest_length in m: give one of them")
-        if np.any(np.asarray(self._lengths(mesh)) <= 0):
+        lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
+        if np.any(lengths <= 0):
             raise InputError(f"{name} has a fibre without length: move its end")
-        if self.pre_tension is not None and np.any(np.asarray(self._rest(mesh)) <= 0):
-            most = float(self.stiffness * jnp.min(self._lengths(mesh)) * numbers.shape[1])
+        if self.pre_tension is not None and np.any(rest <= 0):
+            most = float(np.asarray(self.stiffness) * lengths.min())
             raise InputError(f"{name}.pre_tension = {self.pre_tension} N is more than it could have, {most:.3g} N")
 
     def _vectors(self, mesh: TetMesh) -> jax.Array:
@@ -94,6 +97,12 @@ class Ligament(Physics):
             return np.zeros(0, int), np.zeros((0, 3))
         f = np.asarray(self._vectors(mesh))
         return np.asarray(self.nodes)[0], f / np.linalg.norm(f, axis=1, keepdims=True)
+
+
+@jax.jit  # checks of a sweep ask for them row by row
+def _lengths_and_rest(ligament: Ligament, mesh: TetMesh) -> tuple[jax.Array, jax.Array]:
+    """Lengths (m,) of the fibres in the reference shape, and at rest [m]."""
+    return ligament._lengths(mesh), ligament._rest(mesh)
 
 
 def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: Any) -> Ligament:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core import bounds
+from liverjax.core.did_you_mean import as_word
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Number, param, struct
 from liverjax.laws import layers
@@ -99,7 +100,7 @@ class Vessel(Physics):
 
 def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
     """Centre lines of the tubes of a file; a given radius replaces the measured one."""
-    unit, radius = table.get("unit", "m"), table.get("radius")
+    unit, radius = as_word(table.get("unit", "m"), f"{name} unit"), table.get("radius")
     if unit not in UNITS:
         raise InputError(f"{name} unit = {unit!r} is not known: use one of {', '.join(UNITS)}")
     if not isinstance(table["surface"], str):

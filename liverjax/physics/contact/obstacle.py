@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from liverjax.core import bounds, history
-from liverjax.core.did_you_mean import hint
+from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
@@ -71,9 +71,9 @@ class Obstacle(Physics):
         """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
         if "shape" not in table:
             raise InputError(f"{name} is without shape: give {', '.join(SHAPES)}")
-        shape = table["shape"]
+        shape = as_word(table["shape"], f"{name} shape")
         if shape not in SHAPES:
-            raise InputError(f"{name} shape = {shape!r} is not known: {hint(str(shape), SHAPES)}")
+            raise InputError(f"{name} shape = {shape!r} is not known: {hint(shape, SHAPES)}")
         for key in ("position", *SHAPES[shape]):
             if key not in table:
                 raise InputError(f"{name} is a {shape} without {key}: give it")
@@ -110,14 +110,14 @@ class Obstacle(Physics):
         if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
         history.check(self.times, self.history, name)
+        if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
+            raise InputError(f"{name} has by and a history of displacements: leave one of them out")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:
             raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
         """Refuse a body that begins inside. A loaded body may lie in the obstacle as deep as the contact leaves it."""
-        size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
-        first = self.displacement(0, 1, 0.0)
-        deepest = -float(np.min(np.asarray(_distances(self, mesh, mesh.points, first).value)))
+        size, deepest = float(np.ptp(np.asarray(mesh.points), axis=0).max()), float(_depth_at_beginning(self, mesh))
         if deepest > 1e-9 * size:
             raise InputError(
                 f"{name} position = {np.asarray(self.position).tolist()} begins {deepest:.3g} m inside the body: move "
@@ -239,6 +239,12 @@ def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Largest depth () [m] of the surface at positions x (V, 3) in the obstacle; 0 where it is outside."""
     return jnp.maximum(-jnp.min(_distances(obstacle, mesh, x, moved).value), 0.0)
+
+
+@jax.jit  # checks of a sweep ask for it row by row
+def _depth_at_beginning(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+    """How deep () [m] a run would begin inside the body; negative: the distance between them."""
+    return -jnp.min(_distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value)
 
 
 def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:

@@ -57,6 +57,9 @@ class PressedObstacle(Obstacle):
         factors."""
         super().check(mesh, name)
         history.check(self.times, self.history, name, (1,))
+        if self.history is not None and np.any(np.asarray(self.history) < 0):
+            least = float(np.min(np.asarray(self.history)))
+            raise InputError(f"{name} history has the factor {least:g}: a force presses, give factors of 0 or above")
         if self.by is not None:
             raise InputError(f"{name} has a force and a motion by: leave one of them out")
         force = np.asarray(self.force, float)
@@ -73,10 +76,10 @@ class PressedObstacle(Obstacle):
     def _meets(self, mesh: TetMesh) -> bool:
         """Whether the obstacle comes to the surface on its way."""
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
-        at, direction, travel = contact_points(self, mesh, mesh.points), self.direction(), 0.0
-        far = size + max(float(jnp.min(distances(self, at, jnp.zeros(3)).value)), 0.0)
+        travel = 0.0
+        far = size + max(float(_gap_after(self, mesh, travel)), 0.0)
         for _ in range(_MOST_STEPS):
-            gap = float(jnp.min(distances(self, at, travel * direction).value))
+            gap = float(_gap_after(self, mesh, travel))
             if gap <= 1e-3 * size:
                 return True
             travel += gap
@@ -129,6 +132,13 @@ class PressedObstacle(Obstacle):
     def advance(self, memory: jax.Array, acting: "Pressing", end: End) -> jax.Array:
         """The travel () [m] at the end of the step."""
         return acting.travel(acting.points(end.x), 1.0)
+
+
+@jax.jit
+def _gap_after(obstacle: PressedObstacle, mesh: TetMesh, travel: Number) -> jax.Array:
+    """Least distance () [m] from the body at rest, after a travel [m] along the force."""
+    at = contact_points(obstacle, mesh, mesh.points)
+    return jnp.min(distances(obstacle, at, jnp.asarray(travel * obstacle.direction())).value)
 
 
 @struct

@@ -1,0 +1,37 @@
+"""Settings of a scene file that would change nothing, each refused in one sentence: what is asked for is done."""
+
+from typing import Any
+
+from liverjax.core.errors import InputError
+
+#: Keys of [mesh] that each kind of mesh reads, beside those that all read.
+_EVERY_MESH = ("unit", "order", "is")
+_MESHES = {
+    "file": ("file",),
+    "box": ("shape", "size", "cells"),
+    "cylinder": ("shape", "radius", "height", "cell_size", "rim_cell", "rings", "match_area"),
+}
+
+
+def refuse_idle(content: dict[str, Any]) -> None:
+    """Refuse settings without effect in the content of a scene file whose values have been read.
+
+    Raises:
+        InputError: a key that this mesh, this kind of motion or this run does not look at.
+    """
+    mesh, solve, output = (content.get(name, {}) for name in ("mesh", "solve", "output"))
+    kind = "file" if "file" in mesh else mesh["shape"]
+    for key in mesh:
+        if key not in (*_EVERY_MESH, *_MESHES[kind]):
+            what = "a mesh from a file" if kind == "file" else f"shape = {kind!r}"
+            raise InputError(f"[mesh] {key} does nothing for {what}: leave it out")
+    motion = solve.get("kind", "static")
+    if motion != "dynamic" and solve.get("integrator") == "newmark":
+        raise InputError(
+            f"[solve] integrator = 'newmark' is for kind = 'dynamic', here it is {motion!r}: leave the integrator out"
+        )
+    if "reduced_tolerance" in solve and not solve.get("reduced"):
+        raise InputError('[solve] reduced_tolerance needs a reduced model: add reduced = "model.h5", or leave it out')
+    for key in ("fields", "reactions"):
+        if motion == "harmonic" and output.get(key):
+            raise InputError(f"[output] {key} is for runs in time, [solve] kind is 'harmonic': leave it out")
