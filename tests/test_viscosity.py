@@ -136,3 +136,23 @@ def test_bad_viscosity_is_refused(changes, sentence, table_2):
     prony = replace(table_2, **changes)
     with pytest.raises(lj.InputError, match=sentence):
         viscosity.check(prony, lj.laws.typical("saint_venant_kirchhoff"))
+
+
+def test_a_series_that_cannot_be_is_refused_in_python_before_anything_is_compiled():
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    still = lj.Fixed(nodes=mesh.node_sets["z_min"])
+
+    def run(ratios: object, times: object) -> lj.Scene:
+        prony = lj.Prony(ratios=ratios, relaxation_times=times)
+        law = lj.laws.NeoHookean(mu=770.0, bulk=2200.0)
+        return lj.Scene(mesh=mesh, law=law, viscosity=prony, fixed=(still,), solve=lj.Solve(dt=0.1))
+
+    with pytest.raises(lj.InputError, match=r"ratios = \[0.7, 0.6\] must add up to less than 1"):
+        lj.simulate(run(jnp.array([0.7, 0.6]), jnp.array([1.0, 0.1])))
+    with pytest.raises(lj.InputError, match="has 2 ratios and 1 relaxation_times"):
+        lj.simulate(run(jnp.array([0.3, 0.3]), jnp.array([1.0])))
+    # Of traced numbers only the counts are looked at.
+    traced = jax.make_jaxpr(lambda g: viscosity.check_series(lj.Prony(ratios=(g, g), relaxation_times=(1.0, 0.1))))
+    traced(0.7)
+    with pytest.raises(lj.InputError, match="has 2 ratios and 1 relaxation_times"):
+        jax.make_jaxpr(lambda g: viscosity.check_series(lj.Prony(ratios=(g, g), relaxation_times=(1.0,))))(0.7)

@@ -98,7 +98,7 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Refuse ratios and times that are no Prony series; host side.
+    """Refuse ratios and times that are no Prony series; host side. Of traced numbers only the counts are looked at.
 
     Raises:
         InputError: lengths that differ, values out of bounds, ratios adding up to 1 or more.
@@ -106,7 +106,14 @@ def check_series(prony: Prony) -> None:
     import numpy as np
 
     bounds.check(prony, "viscosity")
-    g, tau = np.atleast_1d(np.asarray(prony.ratios, float)), np.atleast_1d(np.asarray(prony.relaxation_times, float))
+    both = (prony.ratios, prony.relaxation_times)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(both)):
+        # Of a tuple of traced numbers NumPy knows no shape.
+        ratios, times = (len(v) if isinstance(v, (tuple, list)) else (*np.shape(v), 1)[0] for v in both)
+        if ratios != times:
+            raise InputError(f"viscosity has {ratios} ratios and {times} relaxation_times: give one of each a mode")
+        return
+    g, tau = (np.atleast_1d(np.asarray(v, float)) for v in both)
     if g.shape != tau.shape:
         raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one of each a mode")
     if not np.all(g.sum(axis=0) < 1):

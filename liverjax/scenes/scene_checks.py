@@ -142,6 +142,8 @@ def check_bounds(scene: Scene) -> None:
     bounds.check(scene, leave=("mesh", "physics"))
     for name, physics in _named_physics(scene):
         bounds.check(physics, name)
+    if scene.viscosity is not None:
+        viscosity.check_series(scene.viscosity)
     check_region_numbers(scene)
 
 
