@@ -183,6 +183,10 @@ def test_the_total_error_has_every_share(tmp_path):
     told = json.loads((tmp_path / "fit.json").read_text())
     assert told["error_shares"]["geometry"]["shear_modulus"] == pytest.approx(0.01 * G0)  # the gap is in the noise
     assert told["standard_errors"]["shear_modulus"] > 0.1 * G0
+    # The last half decade moves G0 by less than this error: no star in the table, and no word in the warnings.
+    assert abs(change) < told["standard_errors"]["shear_modulus"]
+    ends = [w for w in told["warnings"] if "half decade moves" in w]
+    assert len(ends) == 1 and "relaxation_times" in ends[0] and "modulus" not in ends[0]
 
 
 def test_whole_intervals_hold_the_moduli_where_the_gap_is_not_told():

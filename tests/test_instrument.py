@@ -7,8 +7,8 @@ import pytest
 import scipy.optimize
 
 from fitting.__main__ import main
-from fitting.fits import instrument, viscoelastic
-from fitting.methods import generalised_maxwell
+from fitting.fits import instrument, simulated_rheometer, viscoelastic
+from fitting.methods import generalised_maxwell, uncertainty
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
 
@@ -139,6 +139,54 @@ def test_the_error_of_the_gap_is_that_of_the_moduli_alone():
     assert new[0] == pytest.approx(np.hypot(old[0], 0.05 * fit.uncertainty.values[0]))
     assert np.allclose(new[1:], old[1:])
     assert np.allclose(np.diag(wide.uncertainty.correlation), 1)
+
+
+def test_the_simulation_has_the_errors_of_gap_and_instrument_too():
+    """Its mesh and its steps move nothing by a tenth of an error, so its errors are those of the closed form."""
+    s = sweep(5e-4, 3, noise=0.03)._replace(friction=FRICTION, friction_error=2e-7)
+    fit, better = corrected(s)
+    alone = uncertainty.estimate(fit.solution, False).standard_errors
+    closed = instrument.with_gap_error(fit, 0.03)
+    simulation = simulated_rheometer.Simulation(cell_size=0.004, steps=100)
+    found = simulated_rheometer.through_torsion(better, closed, simulation)
+    assert closed.uncertainty.standard_errors[-1] > 1.4 * alone[-1]  # by the instrument: the gap moves no time
+    assert found.uncertainty.standard_errors == pytest.approx(closed.uncertainty.standard_errors, rel=0.02)
+    assert found.details["gap_error"] == 0.03
+
+
+def end_of_profile(fit: viscoelastic.Fit, better: Sweep, gap: float, side: int) -> float:
+    """An end of the 95 % interval of G0: SciPy refits all other numbers, the gap and the inertia with their priors."""
+    noise, names = fit.uncertainty.noise, ("inertia_off_by", "prior_standard_deviation")
+    told = fit.details.get("instrument")
+    before = 0.0 if told is None else told[names[0]] / told[names[1]]
+    moved = np.zeros(len(OMEGA)) if told is None else told[names[1]] * better.inertia
+
+    def rows(v, G0):
+        *others, inertia, off = v
+        u = np.array([np.log(G0 / (1 + gap * off)), *others])
+        storage, loss = generalised_maxwell.moduli(generalised_maxwell.natural(u), OMEGA)
+        apart = (storage - better.storage - inertia * moved) / better.storage, (loss - better.loss) / better.loss
+        return np.concatenate([*apart, noise * np.array([inertia + before, off])]) / noise
+
+    def cost(G0):
+        start = np.append(np.asarray(fit.solution.u)[1:], [0.0, 0.0])
+        return 2 * scipy.optimize.least_squares(rows, start, args=(G0,), x_scale="jac", xtol=1e-12, ftol=1e-12).cost
+
+    G0, error = fit.uncertainty.values[0], fit.uncertainty.standard_errors[0]
+    best, q = cost(G0), fit.uncertainty.quantile
+    return scipy.optimize.brentq(lambda x: cost(x) - best - q**2, G0, G0 + 2 * side * q * error, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("gap", "share"), [(0.05, 1e-9), (1e-12, 0.3), (0.003, 0.3)])
+def test_a_profile_has_the_error_of_the_gap_and_of_the_inertia(gap, share):
+    s = sweep(0.0, 3)._replace(inertia=share * SHARE)
+    fit, better = corrected(s)
+    fit = instrument.with_gap_error(fit, gap)
+    low, high = uncertainty.profile_intervals(fit.solution, better, fit.uncertainty)["shear_modulus"]
+    for side, end in ((-1, low), (1, high)):
+        exact = end_of_profile(fit, better, gap, side) - fit.uncertainty.values[0]
+        # The grid's chords leave 0.5 % of the half width, the second order of the errors (of 1 %) the rest.
+        assert end - fit.uncertainty.values[0] == pytest.approx(exact, rel=0.02), (end, exact)
 
 
 def test_the_command_widens_the_errors_by_the_gap(tmp_path, capsys):

@@ -381,6 +381,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     closed, corrected = instrument.without_error_of_inertia(closed, sweep)
     for note in corrected.notes[len(sweep.notes) :]:
         print(f"note: {note}", file=sys.stderr)
+    if options.gap_error:  # before the sentences that compare with the errors
+        closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
     fits = [edges.honest(closed, corrected, dense)]
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation))
@@ -388,8 +390,6 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         fit.details["precompression"] = instrument.compression_numbers(fit, simulation)
     for fit in fits:
         fit.details["geometry_error"] = total_error.of_geometry(simulation, options.gap_error)
-    if options.gap_error:
-        fits = [instrument.with_gap_error(fit, options.gap_error / simulation.height) for fit in fits]
     return fits, corrected
 
 

@@ -15,7 +15,7 @@ from fitting.fits import simulated_rheometer, viscoelastic
 from fitting.fits.honesty.edges import HALF_DECADE
 from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods import as_prony_modes, host, uncertainty
-from fitting.methods.estimate import Estimate, errors_and_correlation, estimated
+from fitting.methods.estimate import Estimate, estimated, wider
 from fitting.methods.generalised_maxwell import Maxwell, weighed
 from fitting.readers import raw_torque
 from fitting.readers.frequency_sweep import Sweep, some
@@ -177,7 +177,7 @@ def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: 
     moved = slope @ np.linalg.lstsq(J, _directions(sweep, known), rcond=1e-12)[0]
     estimate = fit.uncertainty
     for direction in (moved @ np.linalg.cholesky(covariance)).T:
-        estimate = _wider(estimate, direction)
+        estimate = wider(estimate, direction)
     return estimate
 
 
@@ -188,9 +188,9 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
     own = fit.parameters
     if own is not None:
         moduli = np.array([unit.startswith("Pa") for unit in fit.kind.units])
-        own = _wider(own, np.where(moduli, relative * own.values, 0.0))
+        own = wider(own, np.where(moduli, relative * own.values, 0.0))
     details = fit.details | {"gap_error": relative}
-    return fit._replace(uncertainty=_wider(fit.uncertainty, relative * first), parameters=own, details=details)
+    return fit._replace(uncertainty=wider(fit.uncertainty, relative * first), parameters=own, details=details)
 
 
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
@@ -269,11 +269,3 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
         "axial_force_mesh_bias_N": None if unknown else fit.details.get("force_of_law_mesh_bias_N", 0.0) * rest / G,
         "axial_force_at_once_N": force * G0 / G,
     }
-
-
-def _wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
-    """The estimate with one more source of error (P,), independent of the others."""
-    root = np.column_stack([estimate.root, direction])
-    errors, correlation = errors_and_correlation(root)
-    lost = ~np.isfinite(estimate.standard_errors)
-    return estimate._replace(root=root, standard_errors=np.where(lost, np.inf, errors), correlation=correlation)

@@ -11,7 +11,7 @@ import numpy as np
 
 from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, BestPoint, Fit, Kind, by_importance, fit_at, timed
 from fitting.methods import uncertainty
-from fitting.methods.estimate import Estimate, mesh_bias
+from fitting.methods.estimate import Estimate, mesh_bias, with_shared_errors
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, bfgs, levenberg_marquardt_host
 from fitting.readers.rheometer import Sweep
@@ -151,7 +151,7 @@ OF_THE_DATA = (
 )
 
 
-KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency", "instrument")
+KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency", "instrument", "gap_error")
 
 
 def through_torsion(
@@ -165,7 +165,7 @@ def through_torsion(
 
     Args:
         sweep: data.
-        start: fit in closed form with the number of modes wanted.
+        start: fit in closed form with the number of modes wanted, and with the errors of gap and instrument.
         simulation: geometry, law and resolution.
         optimizer: one of `OPTIMIZERS`.
         progress: told of every evaluation.
@@ -211,9 +211,16 @@ def through_torsion(
         fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
-    fit = fit._replace(details=fit.details | of_the_model)
+    fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
     own = tuple(w for w in fit.warnings if not (w.startswith(MISSES) and any(m.startswith(MISSES) for m in more)))
     return fit._replace(warnings=by_importance((*own, *more, *_bias(start, fit))))
+
+
+def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
+    own = fit.parameters
+    if own is not None and start.parameters is not None:
+        own = with_shared_errors(own, start.parameters)
+    return fit._replace(uncertainty=with_shared_errors(fit.uncertainty, start.uncertainty), parameters=own)
 
 
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:

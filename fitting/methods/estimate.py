@@ -31,6 +31,7 @@ class Estimate(NamedTuple):
     seconds: float = 0.0
     mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
     time_step_bias: np.ndarray | None = None  # (P,) the same of its time steps
+    shared: np.ndarray | None = None  # (P, s) the columns of `root` by errors that all points share: gap, instrument
 
     @property
     def covariance(self) -> np.ndarray:
@@ -126,6 +127,28 @@ def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         covariance = root @ root.T
         errors = np.sqrt(np.diag(covariance))
         return errors, covariance / np.maximum(np.outer(errors, errors), 1e-300)
+
+
+def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
+    """The estimate with one more error (P,) that all points share, independent of the others."""
+    root = np.column_stack([estimate.root, direction])
+    errors, correlation = errors_and_correlation(root)
+    lost = ~np.isfinite(estimate.standard_errors)
+    shared = np.column_stack([*([] if estimate.shared is None else [estimate.shared]), direction])
+    return estimate._replace(
+        root=root, standard_errors=np.where(lost, np.inf, errors), correlation=correlation, shared=shared
+    )
+
+
+def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
+    """The estimate with the shared errors of `other`, relative to the values of the same numbers there."""
+    if other.shared is None:
+        return estimate
+    known = other.values != 0
+    part = np.divide(estimate.values, other.values, out=np.ones_like(other.values), where=known)
+    for direction in other.shared.T:
+        estimate = wider(estimate, part * direction)
+    return estimate
 
 
 #: Part of the numbers by which what the mesh leaves out may move them, all directions together, to first order.

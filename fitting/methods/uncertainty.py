@@ -63,11 +63,15 @@ def equilibrium_error(u: Estimate) -> float:
 def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:
     """95 % intervals by profile likelihood, closed form: all other parameters refitted along each one.
 
+    The likelihood is that of the noise. Where `uncertainty` has errors of the gap or the instrument too, each end is
+    moved out by them: the root of the sum of the squares, which is right to the first order of these errors.
+
     Returns:
         name -> [low, high]; `None` for an end that four standard errors do not reach.
     """
     data = (jnp.asarray(sweep.angular_frequency), sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = 2 * float(found.cost)
+    by_noise = estimate(found, sweep.noise_given).standard_errors
 
     def held(u, j, value, weight, *data):
         penalty = weight * (parameter_vector(u)[j] - value)
@@ -83,7 +87,7 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
 
     intervals: dict[str, list] = {}
     for j, name in enumerate(uncertainty.names):
-        center, error = uncertainty.values[j], uncertainty.standard_errors[j]
+        center, error = uncertainty.values[j], by_noise[j]
         if not np.isfinite(error) or error == 0:
             intervals[name] = [None, None]
             continue
@@ -93,12 +97,17 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
         rise = (chi2 - best) / uncertainty.noise**2 - uncertainty.quantile**2
-        middle = points // 2
-        intervals[name] = [
-            _crossing(reached[middle::-1], rise[middle::-1]),
-            _crossing(reached[middle:], rise[middle:]),
-        ]
+        middle, shared = points // 2, max(0.0, uncertainty.standard_errors[j] ** 2 - error**2)
+        ends = _crossing(reached[middle::-1], rise[middle::-1]), _crossing(reached[middle:], rise[middle:])
+        intervals[name] = [_farther(end, center, uncertainty.quantile * np.sqrt(shared)) for end in ends]
     return intervals
+
+
+def _farther(end: float | None, center: float, half: float) -> float | None:
+    """The end of an interval with a further error of half width `half`, independent of the others."""
+    if end is None or half == 0:
+        return end
+    return float(center + np.copysign(np.hypot(end - center, half), end - center))
 
 
 def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
