@@ -11,7 +11,8 @@ import scipy.stats
 from conftest import ROOT
 
 from fitting.__main__ import main
-from fitting.fits import posterior, simulated_rheometer, viscoelastic
+from fitting.fits import instrument, posterior, simulated_rheometer, viscoelastic
+from fitting.fits.families import models
 from fitting.methods import generalised_maxwell, springpots, uncertainty
 from fitting.methods.least_squares import levenberg_marquardt
 from fitting.methods.sampling import tempering
@@ -99,6 +100,59 @@ def test_the_draws_of_one_mode_have_the_moments_of_quadrature():
     assert found.r_hat.max() < 1.01
 
 
+def test_the_error_of_the_inertia_is_drawn_with_its_prior():
+    """Moments of five numbers against quadrature of the density, which is written out here for the measured moduli."""
+    s = one_mode(0.1, 1)
+    share, off = 40 * OMEGA, 0.6  # of a deviation of the prior, by which 120 Pa are wrong at the end
+    s = s._replace(storage=s.storage - off * 0.03 * share, inertia=share)
+    fit, better = instrument.without_error_of_inertia(viscoelastic.closed_form(s, 1), s)
+    found = posterior.of_sweep(fit, better, 1000)
+    assert better is not s and found.names[-1] == "inertia_off_by" and "deviation of 3 %" in found.prior
+
+    axes = [c + np.linspace(-w, w, 31) for c, w in zip(fit.solution.u, (0.15, 0.35, 0.3), strict=True)]
+    errors = np.linspace(-4, 4, 33)
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    model = generalised_maxwell.moduli(generalised_maxwell.natural(grid), OMEGA)
+    square = np.stack(
+        [
+            np.sum(((model[0] - s.storage - e * 0.03 * share) / better.storage) ** 2, axis=1)
+            + np.sum(((model[1] - s.loss) / better.loss) ** 2, axis=1)
+            for e in errors
+        ],
+        axis=1,
+    )
+    rest = 1 / (1 + np.exp(grid[:, 1]))  # uniform ratio: the slope of the logit
+    weight = square**-11 * np.exp(-0.5 * errors**2) * (rest * (1 - rest))[:, None]
+    weight /= weight.sum()
+    numbers = posterior._sweep_target(fit.kind, s, None).prior.numbers(grid)
+    of_modes, of_error = weight.sum(axis=1), weight.sum(axis=0)
+    mean = np.append(of_modes @ numbers, 0.03 * of_error @ errors)
+    second = np.append(of_modes @ numbers**2, 0.03**2 * of_error @ errors**2)
+    sd = np.sqrt(second - mean**2)
+    flat = found.draws.reshape(-1, 5)
+    assert np.all(np.abs(flat.mean(axis=0) - mean) < 0.08 * sd)  # as without the inertia
+    assert np.allclose(flat.std(axis=0), sd, rtol=0.1)
+    assert found.r_hat.max() < 1.01
+
+
+@pytest.mark.parametrize("springpot", [False, True])
+def test_the_error_of_the_gap_is_a_factor_of_all_moduli(springpot):
+    s = one_mode(0.02, 1)
+    fit = viscoelastic.closed_form(s, 1)
+    if springpot:
+        (fit,) = (f for f in models.fractional(s) if f.kind.name == "fractional_zener")
+    alone = posterior.of_sweep(fit, s, 500)
+    wide = posterior.of_sweep(instrument.with_gap_error(fit, 0.05), s, 500)
+    factor = wide.draws / alone.draws
+    gap = factor[..., :1]
+    moduli = ["modulus" in name or name.startswith("springpot") for name in alone.names]
+    assert any(moduli) and not all(moduli)
+    assert np.allclose(factor, np.where(moduli, gap, 1.0), rtol=1e-12)
+    # Of 2000 draws: 2.2 % of a deviation and 1.6 %, four times.
+    assert abs(gap.mean() - 1) < 0.09 * 0.05 and gap.std() == pytest.approx(0.05, rel=0.07)
+    assert "5 %" in wide.prior and wide.r_hat.max() < 1.02
+
+
 def test_data_without_noise_have_a_narrow_posterior_and_no_warning():
     sweep = one_mode(0.0, 1)
     found = posterior.of_sweep(viscoelastic.closed_form(sweep, 1), sweep, 200)
@@ -176,7 +230,7 @@ def test_a_springpot_has_the_errors_of_its_curvature():
 
     found = levenberg_marquardt(residuals, start)
     p = uncertainty.estimated(model.names, values, found, 22, False)
-    fit = types.SimpleNamespace(kind=viscoelastic.Kind(model.name, values=values), solution=found)
+    fit = types.SimpleNamespace(kind=viscoelastic.Kind(model.name, values=values), solution=found, details={})
     draws = posterior.of_sweep(fit, sweep, 500)
     flat = draws.draws.reshape(-1, 2)
     assert draws.names == p.names and "exponents uniform" in draws.prior

@@ -34,6 +34,11 @@ class Nuisance(NamedTuple):
     unit: float  # the standard deviation, as it is reported
     words: str  # what is off, for a sentence; {} is the number
 
+    @property
+    def reported(self) -> str:
+        """Its name in fit.json."""
+        return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
+
     def told(self, deviations: float) -> str:
         """The number for a sentence."""
         value = self.unit * deviations
@@ -99,6 +104,15 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     return refitted._replace(details=refitted.details | details, uncertainty=spread), corrected
 
 
+def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
+    """The errors that stand beside the modes of a fit, and what its sweep is corrected by, in deviations (k,)."""
+    told = fit.details.get("instrument")
+    if told is None or told["moves_with_the_band"]:
+        return [], np.zeros(0)
+    known = nuisances_of(sweep)
+    return known, np.array([told[n.reported] / n.unit for n in known])
+
+
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
     """A sentence on each error that moves with the band."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
@@ -124,9 +138,9 @@ def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[s
     out: dict[str, object] = {}
     errors = np.sqrt(np.diag(found.covariance))
     for k, n in enumerate(known):
-        off, sd = ("friction_off_by_N_m_s", "friction_") if n.name == "friction" else ("inertia_off_by", "")
+        sd = "friction_" if n.name == "friction" else ""
         out |= {
-            off: n.unit * float(found.values[k]),
+            n.reported: n.unit * float(found.values[k]),
             f"{sd}standard_error": n.unit * float(errors[k]),
             f"{sd}prior_standard_deviation": n.unit,
             f"{sd}without_last_half_decade": None if found.part is None else n.unit * float(found.part[k]),
@@ -134,7 +148,7 @@ def instrument_numbers(found: InstrumentErrors, known: list[Nuisance]) -> dict[s
     return out | {"moves_with_the_band": not bool(found.steady.all())}
 
 
-def _directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:
+def directions(sweep: Sweep, known: list[Nuisance]) -> np.ndarray:
     """Change of the residuals (2n, k) by one standard deviation of each error."""
     scales = np.concatenate(sweep.deviations)
     return np.stack([np.concatenate([n.moved.real, n.moved.imag]) / scales for n in known], axis=1)
@@ -153,7 +167,7 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         here = _shifted(sweep, known, values)
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
         noise = max(fit.uncertainty.noise, 1e-12)
-        d = _directions(here, known)
+        d = directions(here, known)
         own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # what the modes cannot follow
         precision = own.T @ own / noise**2 + np.eye(len(known))
         # The prior is of the whole error, the residuals are of what is left of it.
@@ -174,7 +188,7 @@ def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: 
     _, slope = host.with_jacobian(
         lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell), np.asarray(fit.solution.u)
     )
-    moved = slope @ np.linalg.lstsq(J, _directions(sweep, known), rcond=1e-12)[0]
+    moved = slope @ np.linalg.lstsq(J, directions(sweep, known), rcond=1e-12)[0]
     estimate = fit.uncertainty
     for direction in (moved @ np.linalg.cholesky(covariance)).T:
         estimate = wider(estimate, direction)

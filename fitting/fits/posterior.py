@@ -2,6 +2,9 @@
 
 The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. Without
 deviations its prior is 1 / s. With deviations it is 1 / s above 1: the deviations may be enlarged, never reduced.
+
+Errors of the instrument that a fit of a sweep has beside its modes are numbers of the posterior too, with their priors.
+The gap, of which a sweep says nothing, is drawn beside it: its factor is that of all moduli of a draw.
 """
 
 import time
@@ -13,8 +16,9 @@ import jax
 import numpy as np
 import scipy.special
 
-from fitting.fits import simulated_rheometer, time_tests, viscoelastic
+from fitting.fits import instrument, simulated_rheometer, time_tests, viscoelastic
 from fitting.fits.families import springpots_in_time
+from fitting.fits.instrument import Nuisance
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit, Kind
@@ -80,7 +84,7 @@ class Target(NamedTuple):
     """A posterior density of u, and the numbers to report."""
 
     residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors over their scales
-    prior: "Modes | Springpots"
+    prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
@@ -203,6 +207,42 @@ class Springpots(NamedTuple):
         return np.asarray(jax.jit(jax.vmap(self.values))(u))
 
 
+class WithInstrument(NamedTuple):
+    """Prior and numbers of Prony modes and of errors of the instrument: the last places of u, in their deviations."""
+
+    modes: Modes
+    errors: list[Nuisance]
+
+    @property
+    def words(self) -> str:
+        """The prior in words."""
+        each = [f"error of the {n.name} normal around 0 with a deviation of {n.told(1.0)}" for n in self.errors]
+        return "; ".join([self.modes.words, *each])
+
+    def apart(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the modes, and errors of the instrument, of u (..., P)."""
+        return u[..., : -len(self.errors)], u[..., -len(self.errors) :]
+
+    def log_prior(self, u: np.ndarray) -> np.ndarray:
+        """Log prior of u (W, P), up to a constant."""
+        modes, errors = self.apart(u)
+        return self.modes.log_prior(modes) - 0.5 * np.sum(errors**2, axis=-1)
+
+    def from_prior(self, rng: np.random.Generator, count: int, parameters: int) -> np.ndarray:
+        """Draw u (count, parameters) from the prior."""
+        modes = self.modes.from_prior(rng, count, parameters - len(self.errors))
+        return np.concatenate([modes, rng.standard_normal((count, len(self.errors)))], axis=1)
+
+    def names(self, parameters: int) -> tuple[str, ...]:
+        """Names of the reported numbers, for so many coordinates."""
+        return (*self.modes.names(parameters - len(self.errors)), *(n.reported for n in self.errors))
+
+    def numbers(self, u: np.ndarray) -> np.ndarray:
+        """Moduli, ratios, times and errors of the instrument (n, K) of u (n, P)."""
+        modes, errors = self.apart(u)
+        return np.concatenate([self.modes.numbers(modes), errors * [n.unit for n in self.errors]], axis=1)
+
+
 def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
     """Independent chains of `count` draws of the posterior.
 
@@ -220,12 +260,29 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
     return Posterior(prior.names(parameters), draws, known, chains, prior.words, time.perf_counter() - begin)
 
 
+def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:
+    """The draws with the error of the gap, if the fit has one: a factor of all moduli of a draw, which is log-normal so
+    that no modulus is negative."""
+    relative, kind = fit.details.get("gap_error"), fit.kind
+    if not relative:
+        return found
+    moduli = {"shear_modulus", "equilibrium_modulus"}
+    if kind.values is not None:
+        moduli = {name for name, unit in zip(kind.names, kind.units, strict=True) if unit.startswith("Pa")}
+    factor = np.exp(relative * np.random.default_rng((seed, 1)).standard_normal((*found.draws.shape[:2], 1)))
+    draws = np.where([name in moduli for name in found.names], found.draws * factor, found.draws)
+    known = np.array([r_hat(draws[..., k]) for k in range(draws.shape[-1])])
+    prior = f"{found.prior}; gap log-normal with a deviation of {100 * relative:.2g} %"
+    return found._replace(draws=draws, r_hat=known, prior=prior)
+
+
 def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit in closed form, of Prony modes or of a fractional model."""
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if fit.kind.values is None:
         function = viscoelastic.residuals_of(fit.kind)
-        return sample(_sweep_target(fit.kind, sweep, lambda u: function(u, *data)), len(fit.solution.u), count, seed)
+        own, parameters = _beside_instrument(fit, sweep, lambda u: function(u, *data))
+        return _with_gap(sample(own, parameters, count, seed), fit, seed)
     (model,) = (m for m in FRACTIONAL if m.name == fit.kind.name)
     x = data[0] / springpots.reference_frequency(sweep)
 
@@ -235,7 +292,22 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
         return springpots.springpot_residuals(springpots.full(model, u), model.switches, x, *data[1:])
 
     own = _sweep_target(fit.kind, sweep, lambda u: np.asarray(residuals(u)))
-    return sample(own, len(fit.solution.u), count, seed)
+    return _with_gap(sample(own, len(fit.solution.u), count, seed), fit, seed)
+
+
+def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> tuple[Target, int]:
+    """The posterior of Prony modes beside the errors of the instrument that the fit has, and the length of u."""
+    own, parameters = _sweep_target(fit.kind, sweep, residuals), len(fit.solution.u)
+    known, corrected_by = instrument.used_errors(fit, sweep)
+    if not known or not isinstance(own.prior, Modes):
+        return own, parameters
+    prior, moved = WithInstrument(own.prior, known), instrument.directions(sweep, known)
+
+    def beside(u: np.ndarray) -> np.ndarray:
+        modes, errors = prior.apart(u)
+        return residuals(modes) - (errors - corrected_by) @ moved.T
+
+    return own._replace(residuals=beside, prior=prior), parameters + len(known)
 
 
 def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> Target:
@@ -269,13 +341,15 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
         G = added * np.asarray(linear(u))
         return (np.concatenate([G.real, G.imag], axis=-1) - measured) / scales
 
-    own = _sweep_target(fit.kind, sweep, residuals)
-    found = sample(own, len(fit.solution.u), count, seed)
+    own, parameters = _beside_instrument(fit, sweep, residuals)
+    found = _with_gap(sample(own, parameters, count, seed), fit, seed)
     begin = time.perf_counter()
-    draws = found.chains.draws.reshape(-1, len(fit.solution.u))
+    draws = found.chains.draws.reshape(-1, parameters)
     some = draws[np.linspace(0, len(draws) - 1, SIMULATED).astype(int)]
-    program = compiled(partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), some[0], data)
-    exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in some])
+    modes = some[:, : len(fit.solution.u)]
+    program = compiled(partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data)
+    exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
+    exact += own.residuals(some) - residuals(modes)  # by errors of the instrument
     likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
     checked = {"draws": float(SIMULATED), "largest_difference": apart}
