@@ -223,6 +223,17 @@ def test_evidence_is_the_restricted_likelihood():
     assert np.allclose(np.diff(found), np.diff(exact), rtol=1e-9)
 
 
+def test_intervals_have_the_degrees_of_freedom_of_the_numbers_that_are_fitted():
+    """Not of the Prony modes that stand for them. Quantiles are those of tables of Student's t."""
+    s = fractional_sweep("springpot", 0.01, omega=OMEGA[::2])
+    (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")
+    assert len(s.storage) == 8 and fit.modes > 7  # 16 moduli less 2 numbers
+    assert fit.uncertainty.quantile == fit.parameters.quantile == pytest.approx(2.1448, abs=1e-4)
+    fluid = maxwell_fluid(0.01)
+    found = models.fluid(fluid, generalised_maxwell.spectrum(fluid))
+    assert found.modes == 2 and found.uncertainty.quantile == pytest.approx(2.0017, abs=1e-4)  # 62 less 4, not 5
+
+
 def maxwell_fluid(noise: float) -> Sweep:
     omega = np.geomspace(0.1, 40, 31)
     G = 400 * 1j * omega * 5 / (1 + 1j * omega * 5) + 600 * 1j * omega * 0.05 / (1 + 1j * omega * 0.05)

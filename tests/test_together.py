@@ -128,6 +128,7 @@ def test_points_on_a_straight_drive_are_not_needed():
     [
         (["--method", "torsion"], "leave out --method torsion"),
         (["--samples", "1000"], "leave out --samples"),
+        (["--gap-error", "5e-5", "--height", "0.004"], "leave out --gap-error"),
     ],
 )
 def test_what_a_common_fit_does_not_have_is_refused(more, words, tmp_path, capsys):

@@ -324,6 +324,8 @@ def _check_samples(options: argparse.Namespace) -> None:
         ("--samples", options.samples is not None, "leave it out, or give one file"),
         ("--report", options.report, "leave it out, or give one file"),
         ("--predict", bool(options.predict), "leave it out, or give one file"),
+        ("--gap-error", options.gap_error is not None, "leave it out, or give one file"),
+        ("--density", options.density is not None, "leave it out, or give one file"),
     ):
         if asked:
             raise InputError(f"{name} is of one sample, {len(options.sweep)} files are given: {instead}")
@@ -337,6 +339,7 @@ def _check_together(options: argparse.Namespace) -> None:
         ("--samples", options.samples is not None),
         ("--report", options.report),
         ("--predict", bool(options.predict)),
+        ("--gap-error", options.gap_error is not None),
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:

@@ -25,6 +25,7 @@ class Estimate(NamedTuple):
     chi2: float  # sum of squared residuals over the noise
     components: int  # measured numbers
     noise: float  # factor on the given scales: 1, or what the residuals ask for
+    freedom: float  # components less the numbers that the data determine, which need not be those of `names`
     iterations: int
     converged: bool
     codes: tuple[int, ...] = ()  # worst code of each simulation
@@ -41,7 +42,7 @@ class Estimate(NamedTuple):
     @property
     def quantile(self) -> float:
         """Quantile of Student's t for a 95 % interval."""
-        return float(scipy.special.stdtrit(max(1, self.components - len(self.names)), 0.975))
+        return float(scipy.special.stdtrit(max(1, self.freedom), 0.975))
 
 
 def estimated(
@@ -66,7 +67,8 @@ def estimated(
     u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
     if effective is not None:
         r = r[:components]
-    noise = noise_factor(r, components - (len(u) if effective is None else effective), deviations_given)
+    freedom = components - (len(u) if effective is None else effective)
+    noise = noise_factor(r, freedom, deviations_given)
     values, to_natural = _with_slope(natural_of, found.u)
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
@@ -81,6 +83,7 @@ def estimated(
         chi2=float(r @ r),
         components=components,
         noise=noise,
+        freedom=freedom,
         iterations=int(found.iterations),
         converged=bool(found.converged),
     )
