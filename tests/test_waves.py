@@ -442,10 +442,11 @@ def test_zeros_around_the_organ_are_not_measured(tmp_path):
     assert np.all(np.isfinite(found.displacement[:, found.mask]))
 
 
-def test_other_frequencies_than_those_of_the_file_are_refused(tmp_path):
+@pytest.mark.parametrize("asked", [[50.0, 70.0], [60.0, 80.0, 100.0], [60.0]])
+def test_other_frequencies_than_those_of_the_file_are_refused(tmp_path, asked):
     path = written(tmp_path, ".npz", plane_waves((5, 5, 5)))
     with pytest.raises(InputError, match="leave out --frequencies"):
-        wave_field.read_waves(path, [50.0, 70.0])
+        wave_field.read_waves(path, asked)
 
 
 def test_the_direct_inversion_leaves_out_what_the_edge_smooths():

@@ -160,7 +160,8 @@ def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.n
     if asked is None and held is None:
         raise InputError(f"{name}: holds no frequencies: give --frequencies with {number} in Hz, e.g. --frequencies 60")
     hertz = _plain(name, "frequencies", held if asked is None else asked)
-    if asked is not None and held is not None and not np.allclose(hertz, _plain(name, "frequencies", held)):
+    own = hertz if held is None else _plain(name, "frequencies", held)
+    if asked is not None and (len(own) != len(hertz) or not np.allclose(hertz, own)):
         raise InputError(f"{name}: holds the frequencies {np.ravel(held).tolist()} Hz: leave out --frequencies")
     if len(hertz) != number:
         raise InputError(f"{name}: {len(hertz)} frequencies for {number} fields of displacements: give {number}")
