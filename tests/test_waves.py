@@ -409,7 +409,10 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
     np.testing.assert_allclose(sweep.angular_frequency, 2 * np.pi * hertz)
     np.testing.assert_allclose(sweep.storage_sd, part["error_storage_Pa"])
     found = waves_report._springpots(files)["whole"]
-    assert found["mean_relative_error"] < 1e-3 and any(abs(v - 0.4) < 0.05 for v in found["numbers"].values()), found
+    assert found["model"] == "fractional_kelvin_voigt" and found["mean_relative_error"] < 1e-3
+    truth = {"equilibrium_modulus": 2000.0, "springpot": 1500 * 400**-0.4, "exponent": 0.4}
+    assert found["numbers"] == pytest.approx(truth, rel=1e-5)
+    assert set(found["standard_errors"]) == set(truth) and all(0 < e for e in found["standard_errors"].values())
     assert waves_report._springpots({}) is None
 
 

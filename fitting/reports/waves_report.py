@@ -96,7 +96,7 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[Content]
 
 
 def _springpots(sweeps: dict[str, Path]) -> Content | None:
-    """The springpot model of lowest criterion of each sweep, with its numbers; None where there are none."""
+    """The springpot model that `models.best_of_models` chooses of each sweep, with its numbers; None without sweeps."""
     if not sweeps:
         return None
     from fitting.fits.families import models
@@ -105,9 +105,9 @@ def _springpots(sweeps: dict[str, Path]) -> Content | None:
     found = {}
     for name, file in sweeps.items():
         sweep = rheometer.read_sweep(file)
-        tried = models.fractional(sweep)
-        fit = min([f for f in tried if models.identifiable(f, sweep)] or tried, key=models.information_criterion)
-        u = fit.uncertainty
+        fit, _ = models.best_of_models(models.fractional(sweep), sweep)
+        u = fit.parameters
+        assert u is not None
         found[name] = {
             "model": fit.kind.name,
             "numbers": {k: float(v) for k, v in zip(u.names, u.values, strict=True)},
