@@ -79,6 +79,18 @@ def test_the_inertia_of_the_instrument_is_named(sign):
         assert np.isclose(kept.angular_frequency[-1], found.onset)
 
 
+def test_the_mark_is_called_by_the_bound_that_it_breaks():
+    """A loss that jumps at the last point is a breach as well, behind that of the inertia."""
+    s = material(0, 0.001)
+    k = len(s.storage) - 3
+    storage, loss = s.storage.copy(), s.loss.copy()
+    storage[k:] *= 0.5
+    loss[-1] *= 4
+    found = of_data(s._replace(storage=storage, loss=loss))
+    told = kramers_kronig.sentences(found, s)
+    assert found.breaches[-1][2].startswith("G''") and "(G' falls): the mark of the instrument" in told[0]
+
+
 def test_a_drift_is_called_one():
     s = material(3, 0.001)
     drifting = s._replace(storage=s.storage * np.linspace(1.6, 1.0, len(s.storage)))

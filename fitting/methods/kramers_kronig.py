@@ -113,10 +113,10 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
     """Sentences on the data for the user, each with its remedy."""
     out, last = [], sweep.angular_frequency[-1] / (2 * np.pi)
     if found.onset is not None:
-        hertz = found.onset / (2 * np.pi)
+        hertz, bound = found.onset / (2 * np.pi), next(why for low, _, why in found.breaches if low == found.onset)
         out.append(
             f"above {hertz:.3g} Hz the storage modulus moves as that of no material that relaxes "
-            f"({found.breaches[-1][2]}): the mark of the instrument, whose inertia adds a term that grows as "
+            f"({bound}): the mark of the instrument, whose inertia adds a term that grows as "
             f"frequency^2; no model follows these points, leave them out with --max-frequency {_rounded_up(hertz):.4g}"
         )
     inner = [b for b in found.breaches if found.onset is None or b[0] < found.onset]
