@@ -196,6 +196,27 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
         field.estimate(problem, name="law.bulk", length=0.02, file=file, resume=True)
 
 
+def test_a_map_goes_on_from_its_own_problem_alone(problem, tmp_path):
+    def search(problem, length=0.02):
+        p = prior.prior(problem.scenes[0].mesh, length)
+        return field._Search(problem, "law.mu", field.start_of(problem, "law.mu"), p, tmp_path / "p.h5", None)
+
+    search(problem).write()
+    search(problem).read()
+    data = problem.data[0]
+    noisier = problem._replace(data=(data._replace(sd=2 * data.sd), *problem.data[1:]))
+    moved = problem._replace(data=(data._replace(measured=1.01 * data.measured), *problem.data[1:]))
+    stiffer = problem._replace(scenes=(lj.with_parameters(problem.scenes[0], {"law.mu": 900.0}), *problem.scenes[1:]))
+    for other, words in (
+        (search(problem, 0.03), "length differs"),
+        (search(noisier), "noise differs"),
+        (search(moved), "displacements differs"),
+        (search(stiffer), "scene differs"),
+    ):
+        with pytest.raises(lj.InputError, match=words):
+            other.read()
+
+
 @pytest.mark.slow
 def test_the_mesh_bias_of_a_map_corrects_it(tmp_path):
     """Data of quadratic elements on a mesh refined twice, mapped with linear ones on a mesh refined once: the map

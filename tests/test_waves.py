@@ -348,11 +348,13 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
 
 def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
     """Text, and HDF5 of another program."""
+    own = organ()
+    course = stiffness_map.course_of(own.body, own.matrices, own.waves, modulus(HERTZ), 0.01)
     for write in (lambda file: file.write_text("no progress"), lambda file: h5py.File(file, "w").close()):
         file = tmp_path / "progress.h5"
         write(file)
-        with pytest.raises(InputError, match="of another fit: leave out --resume"):
-            stiffness_map._first_or_resumed(None, file)
+        with pytest.raises(InputError, match=r"of another fit.*: leave out --resume"):
+            stiffness_map._first_or_resumed(course, file)
 
 
 def test_columns_of_the_table_stay_apart_where_nothing_fits():
@@ -365,6 +367,46 @@ def test_columns_of_the_table_stay_apart_where_nothing_fits():
         "2.7e+11",
         "none",
     ]
+
+
+def test_a_map_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
+    """Stopped in the second deviation, the first one is judged again: the same numbers as without the stop."""
+    own, file = organ(noise=5e-7), tmp_path / "progress.h5"
+    monkeypatch.setattr(stiffness_map, "DEVIATIONS", (0.2, 0.4))
+    less = own.waves._replace(sd=0.1 * own.waves.sd)  # so that no deviation explains the waves
+    course = stiffness_map.course_of(own.body, own.matrices, less, 1.3 * modulus(HERTZ), 0.01)
+    told = []
+    unbroken = stiffness_map.map_of(course, progress=lambda k, chi2: told.append(k))
+    assert told.count(1) >= 2
+
+    def stop(k, chi2):
+        stopped.append(k)
+        if stopped.count(1) == 2:
+            raise KeyboardInterrupt
+
+    stopped = []
+    with pytest.raises(KeyboardInterrupt):
+        stiffness_map.map_of(course, file, progress=stop)
+    again = stiffness_map.map_of(course, file, resume=True)
+    assert again.deviation == unbroken.deviation and len(again.history) == len(unbroken.history)
+    np.testing.assert_allclose(again.exponent, unbroken.exponent, rtol=1e-9, atol=1e-12)
+    for a, b in zip(again.history, unbroken.history, strict=True):
+        assert a["evidence"] == pytest.approx(b["evidence"], rel=1e-9)
+
+
+@pytest.mark.parametrize("other", ["length", "density", "noise", "frequencies", "displacements"])
+def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
+    own, file, length, w = organ(noise=5e-7), tmp_path / "progress.h5", 0.01, organ(noise=5e-7).waves
+    course = stiffness_map.course_of(own.body, own.matrices, w, modulus(HERTZ), length)
+    stiffness_map._write(file, course, stiffness_map._first_or_resumed(course, None))
+    assert stiffness_map._first_or_resumed(course, file).history == []
+    m = balance.matrices(own.body, 1.01 * DENSITY) if other == "density" else own.matrices
+    changed = {"noise": "sd", "frequencies": "omega", "displacements": "motion"}.get(other)
+    if changed:
+        w = w._replace(**{changed: 1.01 * getattr(w, changed)})
+    different = stiffness_map.course_of(own.body, m, w, modulus(HERTZ), 0.02 if other == "length" else length)
+    with pytest.raises(InputError, match=rf"of another fit \({other} differs?\): leave out --resume"):
+        stiffness_map._first_or_resumed(different, file)
 
 
 def test_changes_over_a_brick_are_those_of_a_linear_field():
@@ -412,7 +454,7 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
     assert found["model"] == "fractional_kelvin_voigt" and found["mean_relative_error"] < 1e-3
     truth = {"equilibrium_modulus": 2000.0, "springpot": 1500 * 400**-0.4, "exponent": 0.4}
     assert found["numbers"] == pytest.approx(truth, rel=1e-5)
-    assert set(found["standard_errors"]) == set(truth) and all(0 < e for e in found["standard_errors"].values())
+    assert set(found["standard_errors"]) == set(truth) and all(e > 0 for e in found["standard_errors"].values())
     assert waves_report._springpots({}) is None
 
 

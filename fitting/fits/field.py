@@ -26,7 +26,7 @@ from fitting.methods import prior as smooth
 from fitting.methods.estimate import LARGEST_BIAS
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.files import whole
+from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try, from a nearly uniform body to a free one.
@@ -100,6 +100,13 @@ class _Search:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
         self.history, self.k, self.z = [], 0, np.zeros(len(p.root_mass))
         self.best, self.evaluations, self.codes = np.inf, 0, ()
+        self.marks = {
+            "name": name,
+            "length": float(p.scale),  # of the prior: a power of it
+            "noise": mark_of(*(d.sd for d in problem.data)),
+            "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
+            "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
+        }
 
     def cost(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """(chi^2 + |z|^2)/2 and its gradient."""
@@ -126,8 +133,7 @@ class _Search:
         with whole(self.file) as new, h5py.File(new, "w") as f:
             f["z"], f["k"] = self.z, self.k
             f["history"] = np.array([[row[c] for c in _HISTORY] for row in self.history]).reshape(-1, len(_HISTORY))
-            f.attrs["name"], f.attrs["base"] = self.name, float(jnp.sum(self.base))
-            f.attrs["count"] = self.problem.components
+            f.attrs.update(self.marks)
 
     def read(self) -> None:
         """Go on from the file of an earlier run.
@@ -138,9 +144,7 @@ class _Search:
         if not self.file.is_file():
             return
         with h5py.File(self.file) as f:
-            same = f.attrs["name"] == self.name and f.attrs["count"] == self.problem.components
-            if not (same and len(f["z"]) == len(self.z) and np.isclose(f.attrs["base"], float(jnp.sum(self.base)))):
-                raise InputError(f"{self.file} is of another fit: leave out --resume or name another --out")
+            refuse_other(self.file, f.attrs, self.marks)
             self.z, self.k = f["z"][:], int(f["k"][()])
             self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
 

@@ -28,7 +28,7 @@ from fitting.waves.balance import Balanced, Matrices
 from fitting.waves.regions import MeasuredWaves
 from fitting.waves.voxels import VoxelBody
 from liverjax.core.errors import InputError
-from liverjax.core.files import whole
+from liverjax.core.files import mark_of, refuse_other, whole
 from liverjax.core.struct import Content
 
 #: Standard deviations of c to try, from a nearly uniform organ to a free one.
@@ -91,6 +91,18 @@ class Course(NamedTuple):
         """The transpose of `field`, (P,) or (P, k)."""
         return smooth.to_whitened(self.p, g.real) + 1j * smooth.to_whitened(self.p, g.imag)
 
+    def marks(self) -> dict[str, object]:
+        """What another problem would not have, by its name."""
+        m, w = self.m, self.waves
+        return {
+            "length": self.length,
+            "density": mark_of(m.mass[..., :1]),
+            "spacing": mark_of(m.shear[..., :1]),
+            "frequencies": mark_of(w.omega),
+            "noise": mark_of(w.sd),
+            "displacements": mark_of(w.motion, m.unknowns),
+        }
+
 
 class _Reached(NamedTuple):
     z: np.ndarray
@@ -98,6 +110,15 @@ class _Reached(NamedTuple):
     here: list[Balanced]
     chi2: float
     cost: float
+
+
+class _Begun(NamedTuple):
+    """Where a search stands."""
+
+    start: _Reached  # of the deviation at hand
+    point: _Reached  # reached from there
+    visited: list[tuple[_Reached, np.ndarray]]  # ends of the deviations before, with the information of their starts
+    history: list[Content]
 
 
 def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndarray, length: float) -> Course:
@@ -133,9 +154,9 @@ def map_of(
         InputError: `file` belongs to another fit.
     """
     begin = time.perf_counter()
-    point, history = _first_or_resumed(course, file if resume else None)
-    components = course.m.balances * len(course.waves.omega)
-    visited = _each_deviation(course, point, history, file, progress)
+    begun = _first_or_resumed(course, file if resume else None)
+    history, components = begun.history, course.m.balances * len(course.waves.omega)
+    visited = _each_deviation(course, begun, file, progress)
     excess, evidence = _evidences(visited, components)
     for row, value in zip(history[-len(visited) :], evidence, strict=True):
         row["evidence"] = value
@@ -213,19 +234,20 @@ def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
     return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
 
 
-def _each_deviation(course, point, history, file, progress) -> list[tuple[_Reached, np.ndarray]]:
+def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
     """Try one deviation after another, each from the last field, until chi^2 is that of the noise or stops falling."""
-    components, visited = course.m.balances * len(course.waves.omega), []
+    components = course.m.balances * len(course.waves.omega)
+    start, point, visited, history = begun
     while True:
         begin, steps = time.perf_counter(), 0
-        information = _information(course, point)  # the other steps make do with the first one's
+        information = _information(course, start)  # the other steps make do with the first one's
         while steps < STEPS:
             steps += 1
             new = _stepped(course, point, information)
             fell = point.cost - new.cost
             point = new
             progress(point.k, point.chi2 / components)
-            _write(file, course, point, history)
+            _write(file, course, _Begun(start, point, visited, history))
             if fell < LAST * point.cost:
                 break
         history.append(
@@ -240,7 +262,12 @@ def _each_deviation(course, point, history, file, progress) -> list[tuple[_Reach
         evidence = _evidences(visited, components)[1]
         if point.chi2 <= components or evidence[-1] < max(evidence) or point.k + 1 == len(DEVIATIONS):
             return visited
-        point = _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
+        start = point = _next_start(course, point)
+
+
+def _next_start(course: Course, point: _Reached) -> _Reached:
+    """The same field as one of the next deviation."""
+    return _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
 
 
 def _information(course: Course, point: _Reached) -> np.ndarray:
@@ -288,28 +315,31 @@ def _spread(course: Course, point: _Reached, excess: float, draws: int) -> tuple
 _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
-def _write(file: Path | None, course: Course, point: _Reached, history: list[dict[str, float]]) -> None:
+def _write(file: Path | None, course: Course, begun: _Begun) -> None:
     """Write the point reached to a file that is there whole or not at all."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:
-        f["z"], f["k"], f["whole"] = point.z, point.k, course.whole
-        f["history"] = np.array([[row[name] for name in _HISTORY] for row in history]).reshape(-1, len(_HISTORY))
-        f.attrs["balances"], f.attrs["size"] = course.m.balances, float(np.linalg.norm(course.waves.motion))
+        f["z"], f["whole"] = begun.point.z, course.whole
+        f["visited"] = np.array([p.z for p, _ in begun.visited]).reshape(-1, len(begun.point.z))
+        f["history"] = np.array([[row[name] for name in _HISTORY] for row in begun.history]).reshape(-1, len(_HISTORY))
+        f.attrs.update(course.marks())
 
 
-def _first_or_resumed(course: Course, file: Path | None) -> tuple[_Reached, list[Content]]:
-    """A uniform organ, or the point of an earlier run."""
+def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
+    """A uniform organ, or the point of an earlier run, whose deviations before it are judged again."""
+    start = _reached(course, np.zeros(len(course.p.root_mass), complex), 0)
     if file is None or not file.is_file():
-        return _reached(course, np.zeros(len(course.p.root_mass), complex), 0), []
-    other = InputError(f"{file} is of another fit: leave out --resume or name another --out")
+        return _Begun(start, start, [], [])
     try:
         with h5py.File(file) as f:
-            of_same = f.attrs["balances"] == course.m.balances and len(f["z"]) == len(course.p.root_mass)
-            if not (of_same and np.isclose(f.attrs["size"], np.linalg.norm(course.waves.motion))):
-                raise other
+            refuse_other(file, f.attrs, course.marks())
             history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
-            z, k = f["z"][:], int(f["k"][()])
+            z, ends = f["z"][:], f["visited"][:]
     except (OSError, KeyError):  # no HDF5, or of another program
-        raise other from None
-    return _reached(course, z, k), history
+        raise InputError(f"{file} is of another fit: leave out --resume or name another --out") from None
+    visited = []
+    for end in ends:
+        visited.append((_reached(course, end, start.k), _information(course, start)))
+        start = _next_start(course, visited[-1][0])
+    return _Begun(start, _reached(course, z, start.k), visited, history)

@@ -1,9 +1,15 @@
-"""Folders for results, tried before anything is computed; files that are there whole or not at all."""
+"""Folders for results, tried before anything is computed; files that are there whole or not at all.
 
+Marks of a problem in the file of its progress let a run go on from a file of its own problem alone.
+"""
+
+import hashlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 from liverjax.core.errors import InputError
 
@@ -44,3 +50,21 @@ def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
+
+
+def mark_of(*arrays: object) -> str:
+    """A text that is the same for equal arrays only (SHA-256 of kind, shape and bytes)."""
+    found = hashlib.sha256()
+    for a in map(np.asarray, arrays):
+        found.update(f"{a.dtype} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
+    return found.hexdigest()
+
+
+def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, object]) -> None:
+    """`InputError` where the marks that `file` holds are not these; it names the ones that differ."""
+    other = [name for name, own in marks.items() if held.get(name) != own]
+    if other:
+        raise InputError(
+            f"{file} is of another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): leave out --resume or "
+            "name another --out"
+        )
