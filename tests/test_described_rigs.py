@@ -111,6 +111,26 @@ def test_a_glued_sample_s_stiffness_is_that_of_another_program(tmp_path):
     np.testing.assert_allclose(test.answer[test.used] / test.driven[test.used], 800, rtol=0.005)
 
 
+@pytest.mark.parametrize("drive", ["displacement", "force"])
+def test_a_load_that_was_there_at_once(tmp_path, drive):
+    """Without a row at 0 s a held load is taken as a ramp, with a note; ramp = 0 takes it as a step."""
+    layer = thin_layer.Layer(thin_layer.Indenter(shape="sphere", thickness=8e-3, poisson=0.5, radius=2e-3))
+    time, force = np.geomspace(0.1, 60, 40), 3 * 800 * float(layer.force(np.array([5e-4]))[0])
+    held = (time, 0 * time + 5e-4, force * (0.4 + 0.6 * np.exp(-time / 2)))
+    if drive == "force":
+        depths = np.linspace(0, 1e-3, 4001)
+        deep = np.interp(1e-3 * (1 - 0.6 * np.exp(-0.2 * time)) / 320, 3 * layer.force(depths), depths)
+        held = (time, deep, 0 * time + 1e-3)
+    table = {"test": "sphere", "thickness": 8e-3, "radius": 2e-3, "drive": drive}
+    ramp = read_described(written(tmp_path, table, held))
+    step = read_described(written(tmp_path, table | {"ramp": 0}, held))
+    assert ramp.driven[0] == 0 and any("under load" in n for n in ramp.notes)
+    assert step.driven[0] > 0 and not any("under load" in n for n in step.notes)
+    found = fits.fit(step, 1).model
+    assert float(found.shear_modulus) == pytest.approx(800, rel=0.001)
+    assert abs(float(fits.fit(ramp, 1).model.shear_modulus) / 800 - 1) > 0.01
+
+
 def test_the_elastic_curve_before_contact_is_straight():
     values = curve_of(lambda d: 2 * d + d**2, np.array([-0.1, 0.0, 0.5, 1.0]))
     np.testing.assert_allclose(values, [-0.2, 0.0, 1.25, 3.0], atol=1e-3)
@@ -176,6 +196,7 @@ def test_the_commands_take_a_description(tmp_path):
         ({"drive": "torque"}, "use displacement or force"),
         ({"height": 1e-4}, "more than half of the height"),
         ({"data": 3}, "must name a file"),
+        ({"ramp": 0.5}, "ramp = 0.5 is in the rows already"),
         ({"data": "none.csv"}, "none.csv"),
         ({"data": "shear.csv"}, "needs columns of time, displacement and force"),
         ({"data": "still.csv"}, "displacement is zero throughout"),

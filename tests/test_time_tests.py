@@ -248,6 +248,41 @@ def test_relaxation_of_polystyrene_is_predicted_from_its_creep():
     assert np.median(error) < 0.1
 
 
+def test_the_step_s_own_time_is_read_where_a_global_one_stands_beside_it(tmp_path):
+    """TRIOS writes both; the step began at 300 s of the experiment."""
+    t = np.geomspace(0.1, 100, 40)
+    rows = "".join(
+        f"{300 + a:.7g}\t{a:.7g}\t1.0\t{g * 0.01:.9g}\n" for a, g in zip(t, relaxation(SOLID, t), strict=True)
+    )
+    for header in (
+        "Time\tStep time\tStrain\tStress\ns\ts\t%\tPa\n",
+        "Time (s)\tStep time (s)\tStrain (%)\tStress (Pa)\n",
+    ):
+        (tmp_path / "t.txt").write_text("[step]\nStress relaxation\n" + header + rows)
+        test = read_time_test(tmp_path / "t.txt", "relaxation", ramp=0.0)
+        np.testing.assert_allclose(test.time, np.append(0.0, t), rtol=1e-6)
+        assert [n for n in test.notes if "Step time" in n] == list(test.notes)
+    assert np.allclose(fits.fit(test, 2).uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=1e-3)
+
+
+def test_rows_that_begin_under_load_are_told_of_and_may_be_a_step(tmp_path):
+    """A step of 1 % at 0 s whose rows before 0.15 s were cut off."""
+    t = np.geomspace(0.15, 40, 60)
+    file = write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, 0 * t + 0.01, 0.01 * relaxation(SOLID, t))
+    ramp, step = read_time_test(file, "relaxation"), read_time_test(file, "relaxation", ramp=0.0)
+    assert ramp.driven[0] == 0 and "begin at 0.15 s under load: a linear ramp" in ramp.notes[0] and len(ramp.notes) == 1
+    assert np.all(step.driven == 0.01) and step.notes == ()
+    off = [abs(fits.fit(test, 2).uncertainty.values[0] / 900 - 1) for test in (ramp, step)]
+    assert off[1] < 1e-6 < 0.02 < off[0]
+    assert main(["relaxation", str(file), "--modes", "2", "--ramp", "0", "--out", str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert abs(found["shear_modulus"] / 900 - 1) < 1e-6 and found["notes"] == []
+    # A ramp that the rows show from its beginning needs no word.
+    t = np.linspace(0.1, 20, 200)
+    file = write(tmp_path / "r.csv", "time_s,strain [1],stress_Pa", t, 1e-4 * t, 1e-2 * t)
+    assert read_time_test(file, "relaxation").notes == ()
+
+
 @pytest.mark.parametrize(
     "text",
     [

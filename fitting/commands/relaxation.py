@@ -37,7 +37,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
     )
     command.add_argument(
-        "--ramp", type=float, default=0.0, metavar="S", help="seconds of the ramp, where no column has it"
+        "--ramp",
+        type=float,
+        metavar="S",
+        help="seconds of the ramp, where no column has it; 0 with two columns: a step at 0 s, before the first row",
     )
     command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the answers before it")
     command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
@@ -52,7 +55,7 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
     from fitting.rigs.described import read_described
 
     for name in ("radius", "height", "ramp", "min_time"):
-        if getattr(options, name):
+        if getattr(options, name) or (name == "ramp" and options.ramp is not None):
             option = f"--{name.replace('_', '-')}"
             raise InputError(f"{option} belongs into {options.file}, which describes the test: leave the option out")
     test = read_described(options.file)

@@ -46,6 +46,11 @@ FORMS = (
 )
 
 
+#: TRIOS writes the time since the test began, and since the experiment began: the first is the test's own.
+OWN_TIME = "step time"
+#: A load below this part of the largest one, at the first row, counts as rest: it moves no answer by more.
+AT_REST = 0.01
+
 #: Relative error at which a floor of the noise begins to count; of a test in cycles, part of the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
@@ -97,7 +102,7 @@ class Sample(NamedTuple):
 
 
 def read_time_test(
-    path: str | os.PathLike, kind: str, sample: Sample = Sample(), ramp: float = 0.0, start: float = 0.0
+    path: str | os.PathLike, kind: str, sample: Sample = Sample(), ramp: float | None = None, start: float = 0.0
 ) -> TimeTest:
     """Read a test.
 
@@ -105,7 +110,8 @@ def read_time_test(
         path: text with a header that names time and one of `FORMS`.
         kind: "relaxation" or "creep".
         sample: radius and height of a cylinder, for torque and force.
-        ramp: of a modulus or compliance: seconds in which strain or stress was raised; 0 for a step.
+        ramp: of a modulus or compliance: seconds in which strain or stress was raised; 0 (or None) for a step. Of two
+            columns: None, or 0 for a step at 0 s where the rows begin later.
         start: answers before this time [s] are not fitted.
 
     Raises:
@@ -120,14 +126,15 @@ def read_time_test(
             f"displacement and force; the file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
-        time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp)
+        time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp or 0.0)
     else:
         if ramp:
             raise InputError(f"{path}: --ramp {ramp:g} is for a file without the {form[0]}; leave it out")
         strain, stress, told = _as_shear(str(path), form, columns, sample)
         notes += told
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-        return of_columns(kind, time, driven, answer, (str(path), notes), start)
+        time, driven, answer, told = from_rest(time, driven, answer, at_once=ramp == 0)
+        return of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
 
 
@@ -154,11 +161,11 @@ def of_columns(
     source: tuple[str, list[str]],
     start: float = 0.0,
 ) -> TimeTest:
-    """A test of strain and stress that begins at rest.
+    """A test of strain and stress whose rows begin at 0 s, as those of `from_rest`.
 
     Args:
         kind: "relaxation" or "creep".
-        time: (n,) [s], rising.
+        time: (n,) [s], rising from 0.
         driven, answer: (n,) strain and stress [Pa], of creep stress and strain.
         source: name of the file, and notes.
         start: answers before this time [s] are not fitted.
@@ -166,8 +173,27 @@ def of_columns(
     Raises:
         InputError: nothing driven, few answers, signs that do not go together.
     """
-    time, driven, answer = _from_rest(time, driven, answer)
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], tuple(source[1])), start)
+
+
+def from_rest(
+    time: np.ndarray, driven: np.ndarray, answer: np.ndarray, at_once: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """The rows (n,), with one at 0 s if they begin later; then notes.
+
+    Args:
+        time, driven, answer: (n,) as of `of_columns`.
+        at_once: the first load was there from 0 s on; else it was raised from 0 until the first row.
+    """
+    if not time[0] > 0:
+        return time, driven, answer, []
+    first, notes = driven[0] if at_once else 0.0, []
+    if not at_once and abs(driven[0]) > AT_REST * np.max(np.abs(driven)):
+        notes.append(
+            f"the rows begin at {time[0]:.3g} s under load: a linear ramp from 0 s on is assumed. If it was a step at "
+            "0 s, say --ramp 0 (in a description: ramp = 0), or put a row with this load at 0 s"
+        )
+    return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
 
 
 def kind_of(path: str | os.PathLike) -> str:
@@ -193,7 +219,8 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
         found = _heading(cells)
         if "time" in found and any(set(f) <= set(found) for f in FORMS):
             rows, units = _rows_in_time(path, lines, k + 1, delimiter, found)
-            return _in_si(path, found, np.array(rows), units)
+            columns, notes = _in_si(path, found, np.array(rows), units)
+            return columns, [*_told_of_times(cells), *notes]
     first = next((line.strip() for line in lines if line.strip()), "")[:80]
     raise InputError(
         f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, strain and stress_Pa, "
@@ -202,9 +229,9 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Quantity -> place and unit of the first cell that names it."""
+    """Quantity -> place and unit of the first cell that names it; of times the test's own is the first."""
     found: dict[str, tuple[int, str | None]] = {}
-    for k, cell in enumerate(cells):
+    for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
         bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", text) if not text.lower().endswith("(t)") else None
         unit = bracket.group(1) if bracket else None
@@ -217,6 +244,17 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
                 found.setdefault(quantity, (k, unit or rest or None))
                 break
     return found
+
+
+def _is_own_time(cell: str) -> bool:
+    return cell.strip('" ').replace("_", " ").lower().startswith(OWN_TIME)
+
+
+def _told_of_times(cells: list[str]) -> list[str]:
+    """A note if the header has two times."""
+    if not any(map(_is_own_time, cells)) or not any("time" in _heading([c]) and not _is_own_time(c) for c in cells):
+        return []
+    return ["the times are those of the column Step time; the column Time counts from another beginning"]
 
 
 def _plain_heading(unit: str) -> str:
@@ -283,13 +321,6 @@ def _as_a_step(path, time, modulus, ramp):
     answer = np.full(len(times), np.nan)
     answer[np.searchsorted(times, time[kept])] = modulus[kept]
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
-
-
-def _from_rest(time, driven, answer):
-    """The test with a first point at rest, if the record begins under load."""
-    if time[0] > 0:
-        time, driven, answer = (np.concatenate([[0.0], v]) for v in (time, driven, answer))
-    return time, driven, answer
 
 
 def _as_shear(path, form, columns, sample):

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitting.readers.time_tests import TimeTest, of_columns, read_columns
+from fitting.readers.time_tests import TimeTest, from_rest, of_columns, read_columns
 from fitting.rigs import glued, thin_layer
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
@@ -33,7 +33,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "cone": ("half_angle", "thickness"),
     "punch": ("radius", "thickness"),
 }
-_OTHER = ("test", "data", "drive", "poisson", "min_time")
+_OTHER = ("test", "data", "drive", "poisson", "min_time", "ramp")
 #: What is driven -> kind of the test.
 _KINDS = {"displacement": "relaxation", "force": "creep"}
 #: Poisson's ratio without a word of it: glued samples have K/mu = 1000, layers keep their volume.
@@ -55,6 +55,7 @@ class Described(NamedTuple):
     poisson: float
     drive: str  # displacement or force
     min_time: float
+    at_once: bool  # ramp = 0: the load of the first row was there from 0 s on
 
 
 def read_described(path: str | Path) -> TimeTest:
@@ -63,7 +64,7 @@ def read_described(path: str | Path) -> TimeTest:
 
     Args:
         path: TOML with test, data (a table of time, displacement and force), the sizes that the test needs in metres,
-            and if wanted drive, poisson, min_time.
+            and if wanted drive, poisson, min_time, ramp = 0.
 
     Raises:
         InputError: one sentence naming file, key, value and remedy.
@@ -88,21 +89,21 @@ def read_described(path: str | Path) -> TimeTest:
     section = curve(largest * 1e-3) / (1e-3 * largest / size)
     if described.test in ("sphere", "cone"):
         section = curve(largest) / (largest / size)
-    time = columns["time"]
+    first, then = (d, force) if described.drive == "displacement" else (force, d)
+    time, first, then, told_of_start = from_rest(columns["time"], first, then, described.at_once)
+    d, force = (first, then) if described.drive == "displacement" else (then, first)
     if described.test in ("sphere", "cone") and described.drive == "displacement":
         time, d, force = _with_more_between(time, d, force)
     moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # nothing holds an indenter back
     strain, stress = curve_of(curve, moved) / section, sign * force / section
     kind = _KINDS[described.drive]
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
-    notes = [*notes, *told]
+    notes = [*notes, *told, *told_of_start]
     return of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
     """The rows, and more rows between them without a force: between two rows d is linear in time, f(d) is not."""
-    if time[0] > 0:
-        time, d, force = (np.append(0.0, v) for v in (time, d, force))
     parts = int(np.clip(_MOST_ROWS // len(time), 1, 8))
     place = np.arange((len(time) - 1) * parts + 1) / parts
     rows = np.arange(len(time))
@@ -150,7 +151,10 @@ def _description(path: Path) -> Described:
     if drive not in _KINDS:
         raise InputError(f"{path}: drive = {drive!r} is not known: use displacement or force")
     first = _number_of(path, "min_time", table.get("min_time", 0.0))
-    return Described(test, path.parent / table["data"], sizes, poisson, drive, first)
+    ramp = table.get("ramp")
+    if ramp is not None and _number_of(path, "ramp", ramp) != 0:
+        raise InputError(f"{path}: ramp = {ramp} is in the rows already: leave it out, or give 0 for a step at 0 s")
+    return Described(test, path.parent / table["data"], sizes, poisson, drive, first, ramp is not None)
 
 
 def _number_of(path: Path, key: str, value: Any) -> float:
