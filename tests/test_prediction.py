@@ -46,6 +46,16 @@ def test_errors_of_the_prediction_cover_the_truth():
     assert found.relative_errors[found.inside].mean() < 0.02
 
 
+def test_errors_of_a_sweep_with_deviations_are_relative_to_its_moduli():
+    """Beside 2 % of deviations an error of 10 % is 10 %, not 5."""
+    G = np.concatenate(generalised_maxwell.moduli(TRUTH, OMEGA))
+    storage, loss = np.split(1.1 * G, 2)
+    stiffer = Sweep(OMEGA, storage, loss, 0.02 * storage, 0.02 * loss)
+    found = prediction.predict(viscoelastic.closed_form(sweep(0.0, 0), 2), stiffer.resolved, stiffer)
+    assert np.allclose(found.relative_errors, 0.1 / 1.1, rtol=1e-5) and np.isclose(found.factor, 1.1)
+    assert "within 9.1 % on average" in prediction.sentence(found)
+
+
 def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
     s = sweep(0.0, 0)
     fit = viscoelastic.closed_form(s, 2)

@@ -1,17 +1,21 @@
 """Several tests of one material in one fit: what they say together, and what each of them adds."""
 
+import argparse
 import json
 
 import numpy as np
 import pytest
 from conftest import SHARED
 
+import liverjax as lj
 from fitting.__main__ import main
-from fitting.fits import together
+from fitting.commands import together as command
+from fitting.fits import joint, together, viscoelastic
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest, kind_of
+from fitting.reports import together_report
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -103,6 +107,20 @@ def test_the_command_reads_any_test(tmp_path, capsys):
     assert "without 1" in capsys.readouterr().out
 
 
+def test_further_sweeps_lose_the_points_of_the_instrument_too(tmp_path):
+    """An inertia of half of G' at the end, which grows as the square of the frequency."""
+    G = generalised_maxwell.moduli(TRUTH, WIDE)
+    spoiled = G[0] - 0.5 * G[0][-1] * (WIDE / WIDE[-1]) ** 2
+    columns = np.column_stack([WIDE, spoiled, G[1]])
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", columns, delimiter=",", header=head, comments="")
+    options = argparse.Namespace(radius=None, height=None, max_frequency=None, density=None)
+    found = command.read_any(options, tmp_path / "s.csv")
+    assert len(found.storage) < len(WIDE) and any("mark of the instrument" in n for n in found.notes)
+    options.max_frequency = 1e3  # a band that the user names is kept
+    assert len(command.read_any(options, tmp_path / "s.csv").storage) == len(WIDE)
+
+
 def test_the_driven_column_is_the_one_that_is_held(tmp_path):
     time = np.linspace(0, 10, 20)
     for kind, strain, stress in (
@@ -121,6 +139,61 @@ def test_points_on_a_straight_drive_are_not_needed():
     time = np.sort(np.concatenate([np.linspace(0, 10, 101), [3.33]]))
     driven = np.interp(time, [0, 2, 6, 10], [0, 1, 1, 0.5])
     assert np.allclose(time[_corners_in_time(time, driven)], [0, 2, 6, 10])
+
+
+#: A band that shows both modes.
+WIDE = np.geomspace(0.01, 100, 25)
+
+
+def with_deviations(stated: float, noise: float, springpot: bool = False) -> Sweep:
+    """A sweep whose stated deviations, parts of the moduli, are not its noise."""
+    G = np.array(generalised_maxwell.moduli(TRUTH, WIDE))
+    if springpot:
+        G = 400 + 300 * (1j * WIDE) ** 0.3
+        G = np.array([G.real, G.imag])
+    noisy = G * (1 + noise * np.random.default_rng(1).standard_normal(G.shape))
+    return Sweep(WIDE, *noisy, *(stated * noisy), source="stated.csv")
+
+
+@pytest.mark.parametrize("model", ["prony", "fractional", "spectrum"])
+def test_given_deviations_are_believed_beside_another_test(model):
+    """5 % stated and 1 % of scatter: twice the file has errors smaller by sqrt(2), and agrees with itself."""
+    from fitting.fits.families.springpots_in_time import choose_together
+
+    data = with_deviations(0.05, 0.01, springpot=model == "fractional")
+    two = choose_together([data, data], model, 2 if model == "prony" else "auto")
+    assert not any("do not agree" in w for w in two.warnings)
+    for share in two.shares:
+        assert share.noise == 1 and share.alone == 1
+        # What is reported is relative to the moduli: the scatter, not the deviations.
+        assert 0.005 < share.misfit < 0.015 and 0.005 < share.misfit_alone < 0.015
+        assert share.mean_relative_error < share.misfit < 2 * share.mean_relative_error
+    if model == "prony":
+        errors = viscoelastic.closed_form(data, 2).uncertainty.standard_errors
+        assert np.allclose(two.uncertainty.standard_errors, errors / np.sqrt(2), rtol=0.02)
+    # The residuals are over 5 %, not over the scatter: no factor makes the errors smaller.
+    assert two.uncertainty.noise == pytest.approx(1, abs=1e-9)
+
+
+def test_the_mean_error_is_not_above_the_largest_one(tmp_path):
+    found = together.fit([with_deviations(0.02, 0.02), relaxation(0.005)], 2)
+    content = together_report.write(tmp_path, found)
+    assert (
+        0.005 < content["mean_relative_error"] < 0.03 and content["mean_relative_error"] < content["max_relative_error"]
+    )
+    assert content["tests"][0]["misfit"] == pytest.approx(0.02, rel=0.4)
+    assert content["tests"][0]["misfit_by_itself"] == pytest.approx(0.02, rel=0.4)
+
+
+def test_a_joint_fit_of_one_sweep_has_the_errors_of_its_closed_form():
+    """Without deviations the noise is what the closed form leaves, not all of the moduli."""
+    data = with_deviations(0.05, 0.02)._replace(storage_sd=None, loss_sd=None)
+    closed = viscoelastic.closed_form(data, 2)
+    found = joint.fit([joint.sweep(data)], closed.model, lj.laws.create("neo_hookean", mu=770.0, bulk=7700.0))
+    assert found.converged and np.allclose(found.values, closed.uncertainty.values, rtol=1e-4)
+    assert np.allclose(found.standard_errors, closed.uncertainty.standard_errors, rtol=0.01)
+    given = with_deviations(0.05, 0.01)
+    assert np.array_equal(joint.sweep(given).sd, np.concatenate([given.storage_sd, given.loss_sd]))
 
 
 @pytest.mark.parametrize(

@@ -220,6 +220,9 @@ def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> lis
     from fitting.reports import prediction
 
     tests = [read_any(options, path) for path in options.predict]
+    for test in tests:
+        for note in test.notes:
+            print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
     return [prediction.sentence(prediction.predict(fit, sweep.resolved, test)) for test in tests]
 
 

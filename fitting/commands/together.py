@@ -44,7 +44,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def read_any(options: argparse.Namespace, path: Path) -> "Measured":
-    """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep."""
+    """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep.
+
+    Points of a sweep that the instrument spoils are left out, as of the first sweep.
+    """
+    from fitting.methods import kramers_kronig
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion
 
@@ -61,5 +65,6 @@ def read_any(options: argparse.Namespace, path: Path) -> "Measured":
         if "no header names" not in str(no_sweep) and "no column for" not in str(no_sweep):
             raise
     else:
-        return sweep
+        sweep = rheometer.without_inertia(sweep, options.radius, options.height)
+        return sweep if options.max_frequency else kramers_kronig.without_instrument(sweep)
     return time_tests.read_time_test(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.fits import viscoelastic
+from fitting.fits.together import QUIETEST
 from fitting.methods import generalised_maxwell
 from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
 from fitting.methods.least_squares import levenberg_marquardt_host
@@ -39,13 +41,13 @@ class Test(NamedTuple):
 
 
 def sweep(data: Sweep) -> Test:
-    """A frequency sweep in closed form; without deviations in the file its noise is taken as that of `data`."""
+    """A frequency sweep in closed form; its noise is that of the file, or what the best Prony modes leave of it."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
         return jnp.concatenate(generalised_maxwell.moduli(model, omega)), jnp.zeros((), jnp.int32)
 
-    return Test("sweep", predict, np.concatenate([data.storage, data.loss]), np.concatenate(data.deviations))
+    return Test("sweep", predict, np.concatenate([data.storage, data.loss]), _noise_of(data))
 
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
@@ -56,7 +58,17 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
         found = torsion.moduli(rig, law, viscosity, omega, torque, drive)
         return jnp.concatenate([found.storage, found.loss]), jnp.max(found.statistics.status)
 
-    return Test("torsion", predict, np.concatenate([data.storage, data.loss]), np.concatenate(data.deviations))
+    return Test("torsion", predict, np.concatenate([data.storage, data.loss]), _noise_of(data))
+
+
+def _noise_of(data: Sweep) -> np.ndarray:
+    """Standard deviations (2n,) [Pa] of the moduli. Scales that are no noise of the points are weights only."""
+    scales = np.concatenate(data.deviations)
+    if data.noise_given:
+        return scales
+    _, tried = viscoelastic.choose_modes(data, generalised_maxwell.refuse_impossible(data))
+    # Modes that this sweep leaves free count too: the other tests may determine them.
+    return scales * max(QUIETEST, min(fit.uncertainty.noise for fit in tried))
 
 
 def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:

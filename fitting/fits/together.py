@@ -47,8 +47,10 @@ class Share(NamedTuple):
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # measured numbers
-    noise: float  # relative size of what the common fit leaves
+    noise: float  # of the numbers, over their scales: what the common fit leaves, given deviations never made smaller
     alone: float  # the same of a fit of as many modes to this test by itself
+    misfit: float  # relative size of what the common fit leaves
+    misfit_alone: float  # and of what the fit to this test by itself leaves
     mean_relative_error: float
     errors_without: np.ndarray  # (P,) standard errors of the others alone, at the common fit
 
@@ -86,6 +88,17 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
         return (test.angular_frequency, test.density, np.arange(len(measured))), measured, measured
     _, (at, driven, rows, answer, scales) = time_tests.residuals_in_time(test, Kind())
     return (at, driven, rows), answer, scales
+
+
+def sizes_of(test: Measured) -> np.ndarray:
+    """What relative errors of the reported numbers are relative to: the numbers, of tests in time not below a floor."""
+    _, measured, scales = reported_numbers(test)
+    return scales if isinstance(test, TimeTest) else measured
+
+
+def least_noise(test: Measured) -> float:
+    """The smallest noise of a test over its scales: deviations that are given are believed."""
+    return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
 @lru_cache(maxsize=32)
@@ -180,31 +193,58 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
     starts = _starts_of_all(tests, band, modes, kind)
     noise, compiling, running = np.full(len(tests), 0.03), 0.0, 0.0
     for _ in range(ROUNDS):
+        used = noise
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
         found, compiled, ran = viscoelastic.timed(best, starts, data)
         compiling, running = compiling + compiled, running + ran
         noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
         starts = np.tile(np.asarray(found.u), (STARTS, 1))  # near already; the program is that of all starts
     modes_found = kind.maxwell(found.u)
-    spreads = uncertainty.estimate(found, False, kind.maxwell)
-    shares, fitted = misfits(tests, parts, data, np.asarray(found.residuals), noise)
+    shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
+    found = over_own_noise(found, shares, used / noise)
+    spreads = uncertainty.estimate(found, True, kind.maxwell)
     model = Maxwell(*(np.asarray(v) for v in modes_found))
     converged = bool(found.converged)
     return Together(tests, kind, model, found, spreads, converged, shares, fitted, [], (), running, compiling)
 
 
 def misfits(
-    tests: list[Measured], parts: list, data: list, residuals: np.ndarray, noise: np.ndarray
+    tests: list[Measured], data: list, residuals: np.ndarray, noise: np.ndarray, free: float
 ) -> tuple[list[Share], list[np.ndarray]]:
-    """Residuals of each test, and the numbers that the fit predicts for it."""
-    ends = np.cumsum([len(y) for _, y, _ in parts])
-    left = np.split(residuals[: ends[-1]], ends[:-1])
-    fitted = [r * scales + y for r, (_, y, scales) in zip(left, data, strict=True)]
-    shares = [
-        Share(name_of(t), t.source, len(y), float(s), np.nan, float(np.mean(np.abs(f - y) / scales)), np.array([]))
-        for t, (_, y, scales), s, f in zip(tests, parts, noise, fitted, strict=True)
-    ]
+    """What the fit leaves of each test, and the numbers that it predicts for it.
+
+    Args:
+        tests: K.
+        data: of each test what predicts it, its numbers, and what the residuals are divided by.
+        residuals: of all tests; rows of a prior may stand below.
+        noise: (K,) of the tests over their scales.
+        free: number of parameters that the data determine.
+    """
+    counts = [len(y) for _, y, _ in data]
+    left = np.split(residuals[: sum(counts)], np.cumsum(counts)[:-1])
+    shares, fitted = [], []
+    for test, (_, y, scales), r, s in zip(tests, data, left, noise, strict=True):
+        errors = np.abs(r * scales) / sizes_of(test)
+        misfit = _size_of_noise(errors, len(y) * (1 - free / sum(counts)))
+        own = (name_of(test), test.source, len(y), float(s), np.nan, misfit, np.nan, float(errors.mean()))
+        shares.append(Share(*own, errors_without=np.array([])))
+        fitted.append(r * scales + y)
     return shares, fitted
+
+
+def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> Solution:
+    """The minimum with the residuals of each test over its noise: times `ratio` (K,), the noise that was used over it.
+
+    Rows of a prior below take the mean ratio, as the weight of a prior is stated in the mean noise.
+    """
+    factor = np.repeat(ratio, [s.points for s in shares])
+    prior = np.full(len(found.residuals) - len(factor), np.exp(np.mean(np.log(ratio))))
+    rows = jnp.asarray(np.concatenate([factor, prior]))
+    return found._replace(residuals=rows * found.residuals, jacobian=rows[:, None] * found.jacobian)
+
+
+def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
+    return float(np.sqrt(np.sum(residuals**2) / max(1.0, freedom)))
 
 
 def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
@@ -213,9 +253,7 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
     left = np.split(residuals, np.cumsum(counts)[:-1])
     out = []
     for test, r, s, count in zip(tests, left, used, counts, strict=True):
-        found = s * float(np.sqrt(np.sum(r**2) / max(1.0, count * (1 - free / counts.sum()))))
-        given = isinstance(test, Sweep) and test.noise_given
-        out.append(max(1.0 if given else QUIETEST, found))
+        out.append(max(least_noise(test), s * _size_of_noise(r, count * (1 - free / counts.sum()))))
     return np.array(out)
 
 
@@ -281,10 +319,10 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
 def disagreements(shares: list[Share]) -> list[str]:
     """A sentence on each test that the common fit misses by more than a fit of its own."""
     return [
-        f"the tests do not agree: {s.source or s.name} is missed by {100 * s.noise:.2g} % in the common fit and by "
-        f"{100 * s.alone:.2g} % by itself; look for another temperature, strain or sample"
+        f"the tests do not agree: {s.source or s.name} is missed by {100 * s.misfit:.2g} % in the common fit and by "
+        f"{100 * s.misfit_alone:.2g} % by itself; look for another temperature, strain or sample"
         for s in shares
-        if s.noise > APART * s.alone and s.noise > 0.01
+        if s.noise > APART * s.alone and s.misfit > 0.01
     ]
 
 
@@ -301,15 +339,15 @@ def _shares(fit: Together) -> list[Share]:
     starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])
     vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
 
-    def alone(k: int) -> float:
+    def alone(k: int) -> np.ndarray:
         data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
-        return float(viscoelastic.timed(best, starts, data)[0].cost)
+        return np.asarray(viscoelastic.timed(best, starts, data)[0].residuals)
 
     return shares_by_rows(fit, np.asarray(fit.solution.jacobian), vector, fit.uncertainty.values, alone)
 
 
 def shares_by_rows(
-    fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], float]
+    fit: Together, jacobian: np.ndarray, slope: np.ndarray, values: np.ndarray, alone: Callable[[int], np.ndarray]
 ) -> list[Share]:
     """The shares of the tests: the errors with the rows of the other tests only, and the misfit of a fit to each test
     alone.
@@ -319,7 +357,7 @@ def shares_by_rows(
         jacobian: of the residuals of all tests by u; rows of a prior may stand below.
         slope: derivative of the reported numbers by u.
         values: of the reported numbers.
-        alone: place of a test -> cost of a fit to it alone.
+        alone: place of a test -> residuals over its scales of a fit to it alone, at the rows that the test has in all.
     """
     counts = [s.points for s in fit.shares]
     free = jacobian.shape[1] if fit.kind.effective is None else fit.kind.effective
@@ -329,7 +367,14 @@ def shares_by_rows(
     for k, share in enumerate(fit.shares):
         root, _ = spread(jacobian[place != k], 1.0, slope)
         without = errors_and_correlation(root)[0]
-        square = 2 * alone(k) / max(1.0, counts[k] - min(free, counts[k] / 2))
+        r, (_, _, scales) = alone(k)[: sum(counts)][place[: sum(counts)] == k], reported_numbers(fit.tests[k])
+        freedom = counts[k] - min(free, counts[k] / 2)
         unknown = ~(without < 1e3 * np.abs(values))
-        out.append(share._replace(alone=float(np.sqrt(square)), errors_without=np.where(unknown, np.inf, without)))
+        out.append(
+            share._replace(
+                alone=max(least_noise(fit.tests[k]), _size_of_noise(r, freedom)),
+                misfit_alone=_size_of_noise(r * scales / sizes_of(fit.tests[k]), freedom),
+                errors_without=np.where(unknown, np.inf, without),
+            )
+        )
     return out

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.stats
 
 from fitting.fits import time_tests
-from fitting.fits.together import Measured, name_of, reported_numbers
+from fitting.fits.together import Measured, name_of, reported_numbers, sizes_of
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.time_tests import TimeTest
@@ -22,13 +22,14 @@ class Prediction(NamedTuple):
     predicted: np.ndarray  # (m,)
     measured: np.ndarray  # (m,)
     standard_errors: np.ndarray  # (m,) of the prediction, infinite where the fit leaves it free
-    scales: np.ndarray  # (m,) what errors are relative to
+    scales: np.ndarray  # (m,) weights: deviations where the test has them
+    sizes: np.ndarray  # (m,) what errors are relative to
     inside: np.ndarray  # (m,) whether the test is there in the band that the fit has seen
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """|predicted - measured| over the scales (m,)."""
-        return np.abs(self.predicted - self.measured) / self.scales
+        """|predicted - measured| over the sizes (m,)."""
+        return np.abs(self.predicted - self.measured) / self.sizes
 
     @property
     def factor(self) -> float:
@@ -74,9 +75,8 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
         place = np.tile(1 / omega, len(measured) // len(omega))
     inside = (place >= low * (1 - 1e-9)) & (place <= high * (1 + 1e-9))
     errors = np.where(errors < 1e30, errors, np.inf)
-    return Prediction(
-        name_of(test), test.source, np.asarray(answers(jnp.asarray(vector))), measured, errors, scales, inside
-    )
+    predicted = np.asarray(answers(jnp.asarray(vector)))
+    return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes_of(test), inside)
 
 
 def _scatter(residuals: np.ndarray) -> float:

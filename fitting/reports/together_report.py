@@ -97,8 +97,8 @@ def _share_of_test(share: Share, found: Together) -> Content:
         "data": share.source,
         "measured_numbers": share.points,
         "mean_relative_error": share.mean_relative_error,
-        "misfit": share.noise,
-        "misfit_by_itself": share.alone,
+        "misfit": share.misfit,
+        "misfit_by_itself": share.misfit_alone,
         "standard_errors_without_it": named,
     }
 
@@ -142,7 +142,7 @@ def table(found: Together) -> str:
         rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that stand for it")
     rows += spectrum_rows(found.details or {})
     for k, s in enumerate(found.shares, 1):
-        rows.append(f"{k}: misfit {100 * s.noise:.2g} %, by itself {100 * s.alone:.2g} %")
+        rows.append(f"{k}: misfit {100 * s.misfit:.2g} %, by itself {100 * s.misfit_alone:.2g} %")
     for row in found.tried if len(found.tried) > 1 else []:
         free = "" if row["identifiable"] else "   numbers left free"
         modes = f"{row['modes']:2d} modes, " if row["model"].startswith("prony") else 10 * " "
@@ -171,7 +171,7 @@ def figure(found: Together) -> "Figure":
         panel.set(xscale="log", yscale="log", xlabel="frequency [Hz]" if spectral else "time [s]")
         panel.set_ylabel(QUANTITIES[share.name])
         panel.set_title(
-            f"{share.name}: misfit {100 * share.noise:.2g} %\nby itself {100 * share.alone:.2g} %", fontsize=9
+            f"{share.name}: misfit {100 * share.misfit:.2g} %\nby itself {100 * share.misfit_alone:.2g} %", fontsize=9
         )
         panel.legend(fontsize=8, frameon=False)
         panel.grid(color=GREY, alpha=0.2)

@@ -131,7 +131,10 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
     return [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
 
 
-def _as_a_fit(tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum) -> SpectrumFit:
+def _as_a_fit(
+    tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
+) -> SpectrumFit:
+    """The spectrum as a fit; `over` makes of its minimum one of residuals over their noise (None: noise is found)."""
     low, high = together.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
@@ -160,8 +163,9 @@ def _as_a_fit(tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, tol
     r = np.concatenate([found.r, prior @ np.ones(len(strengths))])
     J = np.concatenate([slopes, prior])
     solution = Solution(u, r, J, 0.5 * found.r @ found.r, jnp.array(1), jnp.array(0.0), jnp.array(found.converged))
-    spread = uncertainty.estimate(solution, False, kind.maxwell, (len(found.r), told.effective))
-    own = estimated(names, jnp.exp, solution, len(found.r), False, told.effective)
+    solution = over(solution) if over else solution
+    spread = uncertainty.estimate(solution, over is not None, kind.maxwell, (len(found.r), told.effective))
+    own = estimated(names, jnp.exp, solution, len(found.r), over is not None, told.effective)
     sentences = []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(f"{len(made.times)} Prony modes follow the spectrum to {100 * made.error:.2g} % only")
@@ -195,17 +199,17 @@ def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)
         used, noise = noise, together.noises(tests, parts, found.r, noise, told.effective)
-    fit = _as_a_fit(tests, grid, found, told)
     data = _weighed_parts(tests, used)
-    shares, fitted = together.misfits(tests, parts, data, found.r, noise)
+    shares, fitted = together.misfits(tests, data, found.r, noise, told.effective)
+    fit = _as_a_fit(tests, grid, found, told, lambda whole: together.over_own_noise(whole, shares, used / noise))
     own = (tests, fit.kind, fit.model, fit.solution, fit.spread, found.converged)
     first = Together(*own, shares, fitted, [], fit.sentences, 0.0, 0.0, fit.own, fit.details)
     function = _rows_and_slopes(tuple(map(together.name_of, tests)))
 
-    def alone(k: int) -> float:
+    def alone(k: int) -> np.ndarray:
         without = [(at, y, s if j == k else np.full(len(y), np.inf)) for j, (at, y, s) in enumerate(parts)]
         quiet = [(at, y, s * noise[k]) for at, y, s in without]
-        return float(0.5 * noise[k] ** 2 * np.sum(_minimum(function, quiet, grid, found.x).r ** 2))
+        return noise[k] * _minimum(function, quiet, grid, found.x).r
 
     slope = np.diag(fit.own.values)
     return first._replace(

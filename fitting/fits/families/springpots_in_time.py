@@ -124,7 +124,8 @@ class _Springpot(NamedTuple):
     error: float  # of the few modes over the band
 
 
-def _springpot_at(case: Fractional, whole: Solution, spans: Spans) -> _Springpot:
+def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: bool) -> _Springpot:
+    """A model at its minimum; `over_noise`: the residuals are over their noise, which is not to be found."""
     free = jnp.array(case.free)
     solution = whole._replace(u=whole.u[free], jacobian=whole.jacobian[:, free])
 
@@ -148,8 +149,8 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans) -> _Springpot
     for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes that computed it")):
         if error > as_prony_modes.ALLOWED:
             sentences.append(f"{what} follow the model {case.name} to {100 * error:.2g} % only: take another --model")
-    own = estimated(case.names, values, solution, len(solution.residuals), False)
-    spread = uncertainty.estimate(solution, False, kind.maxwell)
+    own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
+    spread = uncertainty.estimate(solution, over_noise, kind.maxwell)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(solution.u)))
     return _Springpot(case, kind, model, solution, spread, own, tuple(sentences), made.error)
 
@@ -171,7 +172,7 @@ def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
     whole, compiling, running = viscoelastic.timed(_each_model((test.kind,)), *given)
     out = []
     for k, case in enumerate(FRACTIONAL):
-        found = _springpot_at(case, jax.tree.map(lambda leaf, k=k: leaf[k], whole), spans)
+        found = _springpot_at(case, jax.tree.map(lambda leaf, k=k: leaf[k], whole), spans, over_noise=False)
         fitted = np.asarray(found.solution.residuals) * scales + answer
         where = (test.time[time_tests.thinned(test)], answer, fitted, scales)
         seconds = (running * (k == 0), compiling * (k == 0))
@@ -259,14 +260,14 @@ def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
     for k, case in enumerate(FRACTIONAL):
         first, noise, seconds = starts[k : k + 1], np.full(len(tests), 0.03), np.zeros(2)
         for _ in range(together.ROUNDS):
-            data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
+            used, data = noise, [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
             given = (first, case.switches[None], spans.times, spans.reference, data)
             whole, *took = viscoelastic.timed(minima, *given)
             whole, seconds = jax.tree.map(lambda leaf: leaf[0], whole), seconds + took
             noise = together.noises(tests, parts, np.asarray(whole.residuals), noise, len(case.free))
             first = np.tile(np.asarray(whole.u), (1, STARTS, 1))
-        found = _springpot_at(case, whole, spans)
-        shares, fitted = together.misfits(tests, parts, data, np.asarray(whole.residuals), noise)
+        shares, fitted = together.misfits(tests, data, np.asarray(whole.residuals), noise, len(case.free))
+        found = _springpot_at(case, together.over_own_noise(whole, shares, used / noise), spans, over_noise=True)
         own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
         out.append(Together(*own, shares, fitted, [], found.sentences, seconds[1], seconds[0], found.own))
     return out
@@ -317,9 +318,9 @@ def _shares_of_springpots(fit: Together) -> list[Share]:
     starts = np.vstack([whole, _around(whole, case, np.random.default_rng(1))])[None]
     minima = _each_model(tuple(map(together.name_of, fit.tests)))
 
-    def alone(k: int) -> float:
+    def alone(k: int) -> np.ndarray:
         data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
         given = (starts, case.switches[None], spans.times, spans.reference, data)
-        return float(viscoelastic.timed(minima, *given)[0].cost[0])
+        return np.asarray(viscoelastic.timed(minima, *given)[0].residuals[0])
 
     return together.shares_by_rows(fit, jacobian, slope, fit.parameters.values, alone)
