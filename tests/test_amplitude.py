@@ -167,6 +167,22 @@ def test_files_that_are_no_strain_sweep_get_a_sentence(tmp_path, tanned, change,
     assert "\n" not in str(told.value)
 
 
+def test_tension_and_a_frequency_that_is_missing(tmp_path, tanned):
+    """E' and E'' are three times the moduli of shear; a point without its frequency is left out."""
+    law, memories, shares = tanned
+    path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
+    shear, text = strain_sweep.read_strain_sweep(path), path.read_text()
+    path.write_text(text.replace("storage_modulus_Pa,loss_modulus_Pa", "E'_Pa,E''_Pa"))
+    tension = strain_sweep.read_strain_sweep(path)
+    np.testing.assert_allclose(tension.storage, shear.storage / 3, rtol=1e-12)
+    np.testing.assert_allclose(tension.loss, shear.loss / 3, rtol=1e-12)
+    assert any("G = E / 3" in n for n in tension.notes)
+    path.write_text(text.replace("\n1.0,", "\n,", 1))
+    hole = strain_sweep.read_strain_sweep(path)
+    assert hole.angular_frequency == pytest.approx(2 * np.pi) and len(hole.strain) == len(shear.strain) - 1
+    assert any("1 points without" in n for n in hole.notes)
+
+
 def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
     law, memories, shares = tanned
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)

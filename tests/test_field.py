@@ -95,6 +95,8 @@ _BAD = {
     "node,ux,uy,uz,sd\n1,0,0,0,0": "sd must be positive",
     "node,ux,uy,uz,time\n1,0,0,0,1": "has no dt",
     "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
+    "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is no number: mend it, or leave it empty",
+    "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is no number",
     "": "cannot be read",
 }
 

@@ -8,6 +8,7 @@ import pytest
 from test_rheometer import _workbook
 
 from fitting.readers.rheometer import read_sweep
+from fitting.readers.tables.sweep_tables import tables_of
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -144,6 +145,16 @@ def test_it_is_read_as_it_is(name, tmp_path):
     # Numbers were written with seven digits behind the point: the smallest, 0.016 Hz, to 3e-6.
     assert np.allclose(found.angular_frequency, OMEGA, rtol=1e-5)
     assert np.allclose(found.storage, G.real, rtol=1e-5) and np.allclose(found.loss, G.imag, rtol=1e-5)
+
+
+def test_all_columns_have_the_table_s_decimal_sign():
+    """A strain of 1,100 % beside moduli of 1,234.5 is 11; beside 1.234,5 it is 0.011."""
+    head = "strain_%,frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C"
+    for modulus, strain in (("1,234.5", 11.0), ("1.234,5", 0.011)):
+        lines = [f'"1,100","{k}","{modulus}","{modulus}","25"' for k in range(1, 5)]
+        (table,) = tables_of("x", [head, *lines])
+        assert np.allclose(table.raw["strain"], strain) and np.allclose(table.rows[0][1:], 1234.5)
+        assert np.allclose(table.raw["temperature"], 298.15)
 
 
 def test_a_workbook_with_texts_for_numbers(tmp_path):

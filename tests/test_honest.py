@@ -2,9 +2,13 @@
 
 import itertools
 import json
+import math
+import time
+from fractions import Fraction
 
 import numpy as np
 import pytest
+import scipy.stats
 from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
@@ -45,6 +49,26 @@ def test_chances_of_runs_are_those_of_counting_every_order(ups):
         found, chance = runs_probability(np.where(row, 1, -1))
         assert found == own and chance == pytest.approx(np.mean(runs <= own), rel=1e-12)
     assert runs_probability(np.ones(5)) == (1, 2.0**-4)
+
+
+def test_the_runs_of_long_records_are_counted_at_once():
+    """Against whole numbers; 100,000 points took minutes, and by Wald and Wolfowitz's normal limit half are below."""
+    signs = np.sign(np.random.default_rng(3).standard_normal(600))
+    runs, chance = runs_probability(signs)
+    a, b = int((signs > 0).sum()), int((signs < 0).sum())
+
+    def ways(r: int) -> int:
+        k, more = r // 2, r // 2 + r % 2
+        return math.comb(a - 1, k - 1) * math.comb(b - 1, more - 1) + math.comb(a - 1, more - 1) * math.comb(
+            b - 1, k - 1
+        )
+
+    assert chance == pytest.approx(float(Fraction(sum(map(ways, range(2, runs + 1))), math.comb(a + b, a))), rel=1e-9)
+    begin = time.process_time()
+    n = 100_000
+    runs, chance = runs_probability(np.where(np.random.default_rng(1).permutation(n) % 2, 1, -1))
+    score = (runs + 0.5 - (n / 2 + 1)) / np.sqrt(n * (n - 2) / (4 * (n - 1)))
+    assert chance == pytest.approx(scipy.stats.norm.cdf(score), abs=0.002) and time.process_time() - begin < 5
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])

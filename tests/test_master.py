@@ -103,6 +103,31 @@ def test_given_factors_are_taken_as_they_are(tmp_path):
     assert np.allclose(found.sweep.storage, moduli_of_polymer(found.sweep.angular_frequency).real, rtol=1e-9)
 
 
+def test_given_factors_and_vertical_ones_do_not_go_together(tmp_path):
+    write_rows(tmp_path / "a.csv", factors=True)
+    data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
+    (note,) = (n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes if "--vertical" in n)
+    assert "its column shift_factor" in note
+    assert not any("--vertical finds" in n for n in master_curve.master_curve(data, None).sweep.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "celsius"),
+    [("Sweep-25C", 25), ("Sweep -25C", -25), ("-25 °C", -25), ("run_-25.5 C", -25.5), ("3-25C", 25)],
+)
+def test_a_hyphen_between_words_is_no_sign(tmp_path, name, celsius):
+    tables = [(name, 1.0), ("other 40 C", 2.0)]
+    text = "".join(
+        f"[step]\n{title}\nFrequency\tStorage modulus\tLoss modulus\nHz\tPa\tPa\n"
+        + "".join(f"{f}\t{m * (1 + f)}\t{m * f}\n" for f in (1, 2, 3))
+        + "\n"
+        for title, m in tables
+    )
+    (tmp_path / "t.txt").write_text(text)
+    data = temperature_sweeps.read_temperatures([tmp_path / "t.txt"])
+    assert np.allclose(data.temperatures - 273.15, [celsius, 40])
+
+
 def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
     paths = []
     for k, s in enumerate(sweeps(0.0)[2:7]):

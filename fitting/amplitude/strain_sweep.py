@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.tables.complex_moduli import column_in_si, storage_and_loss
+from fitting.readers.tables.complex_moduli import column_in_si, storage_and_loss, to_shear
 from fitting.readers.tables.sweep_tables import tables_of
 from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
@@ -44,13 +44,19 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     notes: list[str] = []
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
     rows = np.asarray(chosen.rows)
-    values = {q: column_in_si(str(path), c, rows[:, j], notes) for q, (c, j) in columns.items()}
+    in_si = {q: (c, column_in_si(str(path), c, rows[:, j], notes)) for q, (c, j) in columns.items()}
+    notes += to_shear(in_si)
+    values = {q: v for q, (_, v) in in_si.items()}
     omega, both = values["frequency"], storage_and_loss(values, notes)
     G = both["storage"], both["loss"]
     strain = chosen.raw["strain"]
-    good = np.isfinite(strain) & (strain > 0) & np.isfinite(G[0]) & np.isfinite(G[1]) & (G[0] > 0) & (G[1] > 0)
+    good = np.all([np.isfinite(column) & (column > 0) for column in (strain, omega, *G)], axis=0)
     kept = good & (strain <= (np.inf if max_strain is None else max_strain))
-    notes += [f"{(~good).sum()} points without a positive strain or modulus are left out"] if not good.all() else []
+    notes += (
+        [f"{(~good).sum()} points without a positive strain, frequency or modulus are left out"]
+        if not good.all()
+        else []
+    )
     if good.sum() > kept.sum():
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as asked for")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:

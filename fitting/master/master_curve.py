@@ -53,7 +53,13 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     parts = [_shifted_sweep(s, a, b) for s, a, b in zip(data.sweeps, found.log_a, found.log_b, strict=True)]
     laws = temperature_laws.temperature_laws_of(found)
     whole = joined(parts)
-    return MasterCurve(whole._replace(notes=(*whole.notes, *_sentences(found))), parts, found, laws)
+    notes = [*whole.notes, *_sentences(found)]
+    if vertical and found.given:
+        notes.append(
+            "--vertical finds no factors of the moduli here, since the file has those of the frequencies: leave out "
+            "its column shift_factor to find both"
+        )
+    return MasterCurve(whole._replace(notes=tuple(notes)), parts, found, laws)
 
 
 def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:

@@ -74,7 +74,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     if "temperature" in raw:
         T = raw["temperature"]
     else:
-        stated = re.search(r"(-?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
+        # A hyphen behind a letter or a digit parts words ("Sweep-25C"), it is no sign.
+        stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
         if stated is None:
             raise InputError(
                 f"{path}: the table {name or 'of the file'!r} states no temperature: add a column temperature_C"

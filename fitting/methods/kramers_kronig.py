@@ -14,6 +14,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
@@ -152,14 +153,18 @@ def runs_probability(signs: np.ndarray) -> tuple[int, float]:
     runs = int(1 + np.sum(up[1:] != up[:-1])) if n else 0
     if min(a, b) == 0:  # one sign only: as likely as 2^(1 - n)
         return runs, 2.0 ** (1 - n) if n else 1.0
-    total = 0
-    for r in range(2, runs + 1):
-        k = r // 2
-        if r % 2 == 0:
-            total += 2 * math.comb(a - 1, k - 1) * math.comb(b - 1, k - 1)
-        else:
-            total += math.comb(a - 1, k) * math.comb(b - 1, k - 1) + math.comb(a - 1, k - 1) * math.comb(b - 1, k)
-    return runs, total / math.comb(n, a)
+    # Of r runs one sign has r // 2 and the other as many, or one more.
+    r = np.arange(2, runs + 1)
+    k, more = r // 2, r // 2 + r % 2
+    ways = np.logaddexp(_log_splits(a, k) + _log_splits(b, more), _log_splits(a, more) + _log_splits(b, k))
+    return runs, min(1.0, float(np.exp(scipy.special.logsumexp(ways) - _log_splits(n + 1, a + 1))))
+
+
+def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
+    """Logarithm of the number of ways to part n points in order into runs, C(n - 1, parts - 1); -inf for none."""
+    top, low = n - 1, np.asarray(parts) - 1
+    log = scipy.special.gammaln
+    return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
 
 
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:

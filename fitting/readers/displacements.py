@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
+from fitting.readers.tables.text_tables import EMPTY
 from liverjax.core.errors import InputError
 from liverjax.mesh.basis import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
@@ -101,7 +102,20 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
             raise InputError(f"{path} has no column {needed}: give x,y,z (or node) and ux,uy,uz")
     if ("node" in names) == all(c in names for c in "xyz"):
         raise InputError(f"{path} needs either a column node or columns x,y,z: give one of them")
-    return {name: np.asarray(data[name], float) for name in names}
+    table = {name: np.asarray(data[name], float) for name in names}
+    if any(np.isnan(column).any() for column in table.values()):
+        _refuse_words(path, table)
+    return table
+
+
+def _refuse_words(path: Path, table: dict[str, np.ndarray]) -> None:
+    """`InputError` where a cell that is not empty is no number: it would pass for one that was not measured."""
+    cells = np.atleast_2d(np.genfromtxt(path, delimiter=",", comments="#", dtype=str, encoding="utf-8"))
+    for j, (name, column) in enumerate(table.items()):
+        for k in np.flatnonzero(np.isnan(column)):
+            cell = cells[k - len(column), j].strip().strip('"')  # the header, if it is there, is above
+            if cell.lower() not in EMPTY:
+                raise InputError(f"{path}: row {k + 1}: {name} = {cell!r} is no number: mend it, or leave it empty")
 
 
 def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

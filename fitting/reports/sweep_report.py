@@ -56,7 +56,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "converged": fit.converged,
         "modes": n,
         "shear_modulus": float(fit.model.shear_modulus),
-        "equilibrium_modulus": float(fit.model.shear_modulus * (1 - fit.model.ratios.sum())),
+        "equilibrium_modulus": max(0.0, float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))),
         "ratios": fit.model.ratios.tolist(),
         "relaxation_times": fit.model.relaxation_times.tolist(),
         "standard_errors": {

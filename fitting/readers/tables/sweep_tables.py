@@ -112,18 +112,23 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
         rows, numbers, k = _rows_below(path, columns, lines, k, delimiter, len(cells))
         if rows:
             units = [split_cells(line, delimiter) for line in lines[headers[-1] : above]]
-            raw = _raw(cells, units, [split_cells(lines[n - 1], delimiter) for n in numbers], delimiter)
+            own = [split_cells(lines[n - 1], delimiter) for n in numbers]
+            sign = decimal_sign(row[c.place] for row in own for c in columns if c.place < len(row))
+            raw = _raw(cells, units, own, delimiter, sign)
             tables.append(Table(name, columns, rows, numbers, raw))
         free = k
     return tables, headers
 
 
-def _raw(cells, unit_rows, rows, delimiter) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase and temperature in SI of the rows of a table. A column with a gap is left out."""
+def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
+    """Raw torque, angle, phase, strain and temperature in SI of the rows of a table; a column with a gap is left out.
+
+    `sign` is the table's decimal sign.
+    """
     found, units = {}, unit_rows[-1] if unit_rows else []
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
-        values = [to_number(row[place], delimiter) if place < len(row) else None for row in rows]
+        values = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
         if all(v is not None and np.isfinite(v) for v in values):
             found[quantity] = factor * np.array(values, float) + offset
     return found
