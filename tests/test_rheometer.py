@@ -414,7 +414,7 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of the curves as CSV"):
             read_curves([path])
     monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
-    with pytest.raises(InputError, match="pip install python-calamine"):
+    with pytest.raises(InputError, match=r"pip install '\.\[excel\]'"):
         read_sweep(old)
 
 
