@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core import history
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.physics.base import Step
@@ -142,6 +143,35 @@ def test_derivative_by_an_entry_of_a_history():
 def test_bad_histories_are_refused(table, words):
     with pytest.raises(InputError, match=words):
         scene_from(content(traction=[{"where": TOP, **table}]))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty: give columns time,factor or time,x,y,z"),
+        (b"# alone\n\n", "is empty"),
+        (b"time;factor\n0,0;0,5\n1,0;1,0\n", "has rows of different lengths: .* commas between them and points"),
+        (b"time,factor\n0,0\n1\n", "has rows of different lengths"),
+        (b"\xff\xfe\x00", "is not text"),
+        (b"time,force\n0,0\n1,1\n", "has columns"),
+        (b"time,factor\n0,zero\n1,1\n", "must hold finite numbers"),
+        (None, r"cannot be read \(No such file or directory\): give columns"),
+    ],
+)
+def test_files_that_are_no_table_are_one_sentence(tmp_path, content, words):
+    file = tmp_path / "h.csv"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(InputError, match=words) as refused:
+        history.read_history(file, "traction.0")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_file_of_a_spreadsheet_is_read(tmp_path):
+    """It begins with a mark of its encoding and has empty lines."""
+    (tmp_path / "h.csv").write_bytes(b"\xef\xbb\xbftime,factor\r\n0,0\r\n\r\n1,2\r\n")
+    times, factors = history.read_history(tmp_path / "h.csv", "traction.0")
+    assert list(times) == [0, 1] and list(factors) == [0, 2]
 
 
 def test_a_history_needs_time():

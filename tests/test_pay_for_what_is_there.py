@@ -8,8 +8,10 @@ import jax
 import pytest
 
 import liverjax as lj
+from liverjax.core import history
 from liverjax.core.struct import replace
-from liverjax.physics import registry
+from liverjax.physics import darcy, inertia, loads, porosity, registry, viscosity
+from liverjax.physics.volumes import averaged, mixed
 from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
@@ -33,6 +35,23 @@ TABLES: dict[str, dict[str, Any]] = {
     "Obstacle": {"obstacle": [PLANE]},
     "RoughObstacle": {"obstacle": [PLANE | {"friction": 0.3}]},
     "PressedObstacle": {"obstacle": [{k: PLANE[k] for k in ("shape", "position", "axis")} | {"force": [0, 0, -1.0]}]},
+}
+#: The same of the physics that are in no registry: a table that has it, and the file of its equations.
+SOLVE = {"kind": "static", "dt": 0.05, "steps": 2}
+FLUID = {"bulk": 1600.0, "limit_bulk": 2200.0, "fluid_fraction": 0.5, "permeability": 2e-5}
+OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "viscosity": (viscosity, {"viscosity": {"ratios": [0.3], "relaxation_times": [0.2]}, "solve": SOLVE}),
+    "sponge": (porosity, {"porosity": FLUID, "solve": SOLVE}),
+    "flow": (darcy, {"porosity": FLUID, "solve": SOLVE}),
+    "averaged volumes": (averaged, {"solve": {"volumetric": "nodal"}}),
+    "mixed volumes": (mixed, {"solve": {"volumetric": "mixed"}}),
+    "inertia": (inertia, {"body": {"density": 1000.0}, "solve": SOLVE | {"kind": "dynamic"}}),
+    "weight": (loads, {"body": {"density": 1000.0, "gravity": [0, 0, -1.0]}}),
+    "traction": (loads, {"traction": [TOP | {"value": [0, 0, 1.0]}]}),
+    "history": (
+        history,
+        {"traction": [TOP | {"value": [0, 0, 1.0], "history": [[0.0, 0.0], [1.0, 1.0]]}], "solve": SOLVE},
+    ),
 }
 
 
@@ -68,6 +87,15 @@ def test_only_scenes_that_have_it_hold_its_equations(order):
     own = {inspect.getfile(kind) for kind in registry.NAMED}
     assert not own & without
     assert own <= with_all
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_what_has_no_registry_is_in_no_other_program(order):
+    own = {name: module.__file__ for name, (module, _) in OTHERS.items()}
+    plain = scene_of(order, {})
+    assert not set(own.values()) & set(files(traced(plain).jaxpr))
+    for name, (_, table) in OTHERS.items():
+        assert own[name] in set(files(traced(scene_of(order, table)).jaxpr)), name
 
 
 @pytest.mark.parametrize("kind", registry.NAMED, ids=lambda kind: kind.__name__)

@@ -1,5 +1,8 @@
 """The shape before the load: there and back, and against a column under its own weight."""
 
+import json
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +104,28 @@ def test_a_column_under_its_own_weight(verified):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_a_block_is_as_another_program_finds_it_in_the_given_shape(verified):
+    """Mazier's block of 2 m by Govindjee and Mihalic's method (`experiments.sources.unloaded_block`): equilibrium in
+    the given shape and in the reference shape are the same equations of linear elements."""
+    file = Path(__file__).parents[1] / "experiments" / "results" / "unloaded_block.json"
+    points, tets, theirs = (np.array(json.loads(file.read_text())[key]) for key in ("points", "tetrahedra", "unloaded"))
+    inside_out = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) < 0
+    tets[inside_out] = tets[inside_out][:, [0, 2, 1, 3]]
+    scene = lj.Scene(
+        mesh=lj.tet_mesh(points, tets),
+        law=lj.laws.create("neo_hookean_compressible", mu=25e3, lame_lambda=8e5),
+        body=lj.Body(density=1000.0, gravity=(0.0, 0.0, -9.81)),
+        fixed=(lj.Fixed(nodes=jnp.asarray(np.flatnonzero(points[:, 2] < 1e-9))),),
+        solve=lj.Solve(tolerance=TOLERANCE),
+    )
+    ours = lj.unloaded(scene).scene.mesh.points
+    off = float(np.abs(ours - theirs).max() / np.abs(theirs - points).max())
+    # A residual of 1e-12 of the forces, and theirs, Newton's last change of 1e-13 of the side.
+    assert off < 1e-10
+    verified("shape of a block before its weight", "scikit-fem", off, 1e-10)
+
+
 def test_derivatives_go_through_the_reference_shape():
     """Reference length by mu, and a run from it: its end does not depend on mu at all."""
     scene = scene_from(content())

@@ -74,8 +74,21 @@ def _liver() -> list[str]:
         peak = f"{_mm(r['peak_m'])} | {_tip(r)}" if r["converged"] else "a step failed | | "
         pressure = f"{r['least_Pa']:.0f} to {r['greatest_Pa']:.0f} Pa" if "least_Pa" in r else "none"
         form = "quadratic" if r.get("order") == 2 else "linear"
-        rows.append(f"| {r['name']} | {form} | {peak} | {pressure} | {r['run_s']:.2g} s | {_seconds(r)} |")
-    return [*rows, "", *_claim(data["motion"])]
+        run = f"{r['run_s']:.0f}" if r["run_s"] > 10 else f"{r['run_s']:.2g}"
+        rows.append(f"| {r['name']} | {form} | {peak} | {pressure} | {run} s | {_seconds(r)} |")
+    return [*rows, "", *_finer(data), *_claim(data["motion"])]
+
+
+def _finer(data: dict) -> list[str]:
+    """What quadratic elements change in motion."""
+    linear, found = {r["name"]: r for r in data["motion"]}, []
+    for r in data.get("finer", []):
+        if r["converged"]:
+            more = r["peak_m"] / linear[r["name"]]["peak_m"] - 1
+            found.append(f"{r['name']}: the peak is {percent(more)} higher, the step was cut {r['cuts']} times")
+        else:
+            found.append(f"{r['name']}: a step failed")
+    return [f"Quadratic elements on the same mesh, in motion: {'; '.join(found)}.", ""] if found else []
 
 
 def _mm(length: float) -> str:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import bodies, elements, identification, reduced, rigs, stability
+from experiments.pages import bodies, elements, identification, moving, reduced, rigs, stability
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
 
@@ -442,6 +442,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         "has linear tetrahedra alone, and no error of the mesh",
     ),
     "liver_mesh": ("how far is the phantom's answer known: two meshes, two orders?", elements.phantom, ""),
+    "moving_mesh": ("how near is the estimate of the mesh's error while a body moves?", moving.came_out, ""),
     "liver_in_place": (
         "the phantom with capsule, ligaments, vessels, on a plane, and its unloaded shape: what does each change?",
         bodies.in_place,

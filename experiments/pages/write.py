@@ -9,6 +9,7 @@ from experiments.pages import (
     elements,
     front,
     identification,
+    moving,
     overview,
     porosity,
     reduced,
@@ -27,6 +28,7 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     HERE / "README.md": overview.PARTS,
     HERE / "TABLES.md": tables.PARTS
     | elements.PARTS
+    | moving.PARTS
     | porosity.PARTS
     | identification.PARTS
     | stability.PARTS

@@ -49,11 +49,21 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     kinds = [_FACTOR if n == 1 else _VECTOR for n in forms]
     wanted = " or ".join(",".join(kind) for kind in kinds)
     try:
-        # NumPy takes a comment on the first line for the names.
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.lstrip().startswith("#")]
-        data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
-    except (OSError, ValueError, IndexError, StopIteration) as error:
-        raise InputError(f"{name} history {path} cannot be read ({error}): give columns {wanted}") from None
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a mark before the first name
+    except OSError as error:
+        raise InputError(f"{name} history {path} cannot be read ({error.strerror}): give columns {wanted}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{name} history {path} is not text: give columns {wanted}") from None
+    # NumPy takes a comment on the first line for the names.
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        raise InputError(f"{name} history {path} is empty: give columns {wanted}")
+    if len({line.count(",") for line in lines}) > 1:
+        raise InputError(
+            f"{name} history {path} has rows of different lengths: give columns {wanted}, with commas between them and "
+            "points in numbers"
+        )
+    data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
     found = next((kind for kind in kinds if set(kind) <= set(data.dtype.names or ())), None)
     if found is None:
         raise InputError(f"{name} history {path} has columns {data.dtype.names}: give {wanted}")

@@ -1,9 +1,15 @@
 """Integrals of fields over nodes, and values of nodal fields at the points of elements."""
 
+from functools import cache
+from itertools import product
+from math import factorial
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from liverjax.mesh.basis import basis
+from liverjax.mesh.adjacency import PAIRS
+from liverjax.mesh.basis import FACES, basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.places import given, taken
 
@@ -73,3 +79,43 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
     nodes = jnp.stack(mesh.element_nodes[: 4 if mesh.order == 1 else 10])
     own = jnp.array([parts[a >= 4] for a in range(len(nodes))], mesh.volumes.dtype)
     return given(jnp.zeros(mesh.number_of_nodes, mesh.volumes.dtype), nodes, own[:, None] * mesh.volumes[None])
+
+
+@cache
+def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Consistent mass of an element over its mass in two parts: a diagonal (n,), and what is left (n, n).
+
+    The diagonal is the lumped mass. Functions of order 3 have none: theirs are the integrals of their squares.
+    """
+    whole = products(order)
+    parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]
+    parts[:4], parts[4:10] = lumped[0], lumped[-1]
+    return parts, whole - np.diag(parts)
+
+
+@cache
+def products(order: int) -> np.ndarray:
+    """Integrals (n, n) of the products of two functions over an element, over its volume; exact."""
+    vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
+    if order == 1:
+        functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]
+    else:
+        functions = [{tuple(2 * n for n in v): 2.0, v: -1.0} for v in vertex]
+        functions += [{_exponents(vertex, i, j): 4.0} for i, j in PAIRS]
+    if order == 3:
+        functions += [{_exponents(vertex, i, i, j): 1.0, _exponents(vertex, i, j, j): -1.0} for i, j in PAIRS]
+        functions += [{_exponents(vertex, i, j, k): 27.0} for i, j, k in FACES]
+
+    def integral(f: dict[tuple, float], g: dict[tuple, float]) -> float:
+        total = 0.0
+        for (p, a), (q, b) in product(f.items(), g.items()):
+            powers = np.add(p, q)
+            total += a * b * 6 * np.prod([factorial(n) for n in powers]) / factorial(int(powers.sum()) + 3)
+        return total
+
+    return np.array([[integral(f, g) for g in functions] for f in functions])
+
+
+def _exponents(vertex: list[tuple], *which: int) -> tuple:
+    """Exponents of a product of linear functions."""
+    return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))

@@ -27,7 +27,7 @@ from liverjax.core.struct import Content, Indices, Number
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.darcy import Guess
-from liverjax.solvers.attached import Attached, GivesWay
+from liverjax.solvers.attached import Attached, Between, GivesWay
 from liverjax.solvers.attached import definite as without_negative
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector
@@ -188,14 +188,14 @@ class NodalForce:
         """Diagonal blocks 3 x 3 of (V,) [N/m], an entry None where it is 0; None: the force is constant."""
         return None
 
-    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached | None:
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
         """Stiffness at x of further elements between nodes, added to `stiffness`; None: there are none."""
         return None
 
-    def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached | None:
+    def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
         """The same without negative eigenvalues."""
         own = self.attached(mesh, x, s)
-        return None if own is None else without_negative(own)
+        return without_negative(own) if isinstance(own, Attached) else own
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
         """The loss of stiffness by a number that adapts to motion (`definite`: that of the definite form); None:

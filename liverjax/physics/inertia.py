@@ -1,4 +1,4 @@
-"""Inertia of lumped masses, by implicit Euler or by Newmark's average acceleration."""
+"""Inertia of lumped or consistent masses, by implicit Euler or by Newmark's average acceleration."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -6,13 +6,18 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import Number, param, static, struct
-from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh.nodal import mass_parts, nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.physics.base import End, NodalForce, Physics, Start, Step, diagonal
+from liverjax.physics.base import End, Free, NodalForce, Physics, Start, Step, diagonal
+from liverjax.solvers import attached
+from liverjax.solvers.attached import Masses, masses
 from liverjax.solvers.block_matrix import Block
+from liverjax.tensors.places import given
 
 #: k of the acceleration k (x - ...)/dt^2 at the end of a step.
 FACTOR = {"euler": 1.0, "newmark": 4.0}
+#: Tolerance of the accelerations at the beginning of a run.
+_EXACT = 1e-12
 
 
 class Motion(NamedTuple):
@@ -24,31 +29,56 @@ class Motion(NamedTuple):
 
 @struct
 class Inertia(Physics):
-    """Mass of the body, a quarter of every element at each of its nodes."""
+    """Mass of the body, at its nodes or as the integrals of the products of its functions."""
 
     density: Any = param("kg/m^3", "per reference volume, one number or one a node (V,)", above=0.0)
     integrator: str = static(default="euler", about="euler (first order) or newmark (second order)")
+    mass: str = static(default="lumped", about="lumped: at the nodes; or consistent")
 
     def begin(self, start: Start) -> Motion:
         """Begin at rest, with the acceleration m a = f: Newmark's method keeps its order from the first step."""
         acceleration = None
         if self.integrator == "newmark":
-            mass = self.density * nodal_volumes(start.mesh)
-            # Functions of order 3, of the mesh's estimate, have no mass: they follow the others at once.
-            has_mass = (mass > 0)[:, None]
-            forces = start.free.vectors(-start.force())
-            acceleration = jnp.where(has_mass, forces / jnp.where(has_mass, mass[:, None], 1.0), 0.0)
+            acceleration = _accelerations(*self._masses(start.mesh), start.free, start.free.vectors(-start.force()))
         return Motion(jnp.zeros_like(start.x), acceleration)
 
     def freeze(self, memory: Motion, step: Step) -> "Moving":
         """Masses, and the motion at the beginning of the step."""
-        mass = self.density * nodal_volumes(step.mesh)
-        return Moving(mass=mass, x=step.x, motion=memory, dt=step.dt, mask=step.free.mask, integrator=self.integrator)
+        mass, shared = self._masses(step.mesh)
+        own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": step.free.mask, "integrator": self.integrator}
+        return Moving(mass=mass, shared=shared, **own)
+
+    def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
+        """Masses (V,) [kg] of the nodes, and what elements have beside them."""
+        if self.mass == "lumped":
+            return self.density * nodal_volumes(mesh), None
+        density, (parts, matrix) = jnp.asarray(self.density), mass_parts(mesh.order)
+        size = mesh.volumes * (density if density.ndim == 0 else jnp.mean(density[mesh.tetrahedra], axis=1))
+        shares = jnp.asarray(parts, size.dtype)[:, None] * size[None]
+        mass = given(jnp.zeros(mesh.number_of_nodes, size.dtype), jnp.stack(mesh.element_nodes), shares)
+        return mass, masses(mesh, matrix, size)
 
     def advance(self, memory: Motion, acting: "Moving", end: End) -> Motion:
         """Velocity and acceleration at the end of the step."""
         velocity, acceleration = acting.kinematics(end.x)
         return Motion(velocity, None if memory.acceleration is None else acceleration)
+
+
+def _accelerations(mass: jax.Array, shared: Masses | None, free: Free, force: jax.Array) -> jax.Array:
+    """a (V, 3) [m/s^2] of m a = f."""
+    if shared is None:
+        return force / mass[:, None]
+
+    def product(a: jax.Array) -> jax.Array:
+        return free.vectors(_inertia(mass, shared, a))
+
+    return jax.scipy.sparse.linalg.cg(product, force, tol=_EXACT, M=lambda r: r / mass[:, None])[0]
+
+
+def _inertia(mass: jax.Array, shared: Masses | None, a: jax.Array) -> jax.Array:
+    """Mass times accelerations (V, 3): forces (V, 3) [N]."""
+    force = mass[:, None] * a
+    return force if shared is None else force + jnp.stack(attached.product(shared, tuple(a.T)), axis=1)
 
 
 @struct
@@ -61,6 +91,7 @@ class Moving(NodalForce):
     dt: jax.Array = param("s", "time step")
     mask: jax.Array = param("1", "(V, 3) 1 where free")
     integrator: str = static(default="euler")
+    shared: Masses | None = param("kg", "what elements have beside the masses of their nodes", default=None)
 
     everywhere: ClassVar[bool] = True
 
@@ -83,13 +114,19 @@ class Moving(NodalForce):
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
         """Mass times acceleration."""
-        return self.mass[:, None] * self.kinematics(x)[1]
+        return _inertia(self.mass, self.shared, self.kinematics(x)[1])
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
         """m a . a dt^2/(2k); the force is its gradient."""
         a = self.kinematics(x)[1]
-        return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(self.mass[:, None] * a * a)
+        return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(_inertia(self.mass, self.shared, a) * a)
 
     def stiffness(self) -> Block:
         """k m/dt^2 along every axis."""
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
+
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
+        """The same of what elements have beside."""
+        if self.shared is None:
+            return None
+        return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

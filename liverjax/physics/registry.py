@@ -55,7 +55,7 @@ def physics_of(scene: Any) -> tuple[Physics, ...]:
         found.append(MixedVolume(law=scene.law))
     body = scene.body
     if body is not None and scene.solve.kind == "dynamic":
-        found.append(Inertia(density=body.density, integrator=scene.solve.integrator))
+        found.append(Inertia(density=body.density, integrator=scene.solve.integrator, mass=body.mass))
     if body is not None or scene.traction:
         keys = ("density", "gravity", "times", "history")
         weight = {} if body is None else {key: getattr(body, key) for key in keys}

@@ -23,12 +23,13 @@ from liverjax.scenes.springpots import SpringpotSeries
 
 @struct
 class Body:
-    """Mass and weight: a node has its density times a quarter of every element around it."""
+    """Mass and weight. Lumped, a node has its density times a quarter of every linear element around it."""
 
     density: Number = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0, typical=1060.0)
     gravity: Numbers = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
+    mass: str = static(default="lumped", about="in motion lumped: at the nodes; or consistent: as the weight is")
 
 
 @struct

@@ -31,6 +31,8 @@ CHOICES = {
     "volumetric": ("element", "nodal", "mixed", "auto"),
     "robust": ("off", "projected", "regularised"),
 }
+#: What [body] mass may be.
+MASSES = ("lumped", "consistent")
 
 
 def check_before_run(scene: Scene) -> None:
@@ -105,6 +107,8 @@ def _check_motion(motion: Displaced, name: str) -> None:
 
 
 def _body(body: Body, nodes: int) -> None:
+    if body.mass not in MASSES:
+        raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
     # Of a tuple of traced numbers NumPy knows no shape.
     gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
     density = np.shape(body.density)

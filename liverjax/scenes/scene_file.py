@@ -52,7 +52,7 @@ _KEYS = {
         "inlet",
         "initial_pressure",
     ),
-    "body": ("density", "gravity", "history"),
+    "body": ("density", "gravity", "history", "mass"),
     "fixed": ("where", "set", "axes"),
     "displaced": ("where", "set", "axes", "by", "history"),
     "traction": ("where", "set", "value", "pressure", "history"),
@@ -373,7 +373,8 @@ def _read_body(table: dict) -> Body:
     given = _history("[body]", table)
     if "gravity" in table and given and given["history"].ndim == 2:
         raise InputError("[body] has gravity and a history of gravity itself: leave one of them out")
-    return Body(density=density, gravity=jnp.asarray(gravity), **given)
+    mass = table.get("mass", Body.mass)
+    return Body(density=density, gravity=jnp.asarray(gravity), mass=mass, **given)
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:

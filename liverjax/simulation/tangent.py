@@ -21,7 +21,7 @@ from liverjax.physics.base import Free, VolumeStress
 from liverjax.simulation import mixed_system
 from liverjax.simulation.equations import Equations
 from liverjax.solvers import attached, block_matrix, clusters, direct, point_matrix
-from liverjax.solvers.attached import Attached, GivesWay
+from liverjax.solvers.attached import Attached, Between
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.clusters import Inverses
 from liverjax.solvers.krylov import (
@@ -107,11 +107,11 @@ def node_blocks(e: Equations) -> Block | None:
     return total
 
 
-def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Attached | GivesWay, ...]:
+def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
     """Stiffness of the physics' elements between nodes, and its losses by numbers that adapt."""
 
-    def of(kind: str) -> tuple[Attached | GivesWay, ...]:
-        found: list[Attached | GivesWay | None] = []
+    def of(kind: str) -> tuple[Between, ...]:
+        found: list[Between | None] = []
         for a in e.nodal:
             found.append(a.attached(e.mesh, x, s) if kind == "true" else a.definite(e.mesh, x, s))
             found.append(a.gives_way(e.mesh, x, s, kind != "true"))
@@ -120,7 +120,7 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Attach
     return _of_kind(kind, of)
 
 
-def _symmetric(e: Equations, more: tuple[Attached | GivesWay, ...]) -> tuple[Attached, ...]:
+def _symmetric(e: Equations, more: tuple[Between, ...]) -> tuple[Attached, ...]:
     """The part of elements between nodes that a preconditioner uses: the symmetric one, since friction has a stiffness
     without symmetry."""
     elements = tuple(own for own in more if isinstance(own, Attached))
@@ -154,7 +154,7 @@ class Tangent(NamedTuple):
     x: jax.Array | None  # (V, 3) where it was made, for loads that follow
     s: Any  # part of the step there
     follows: jax.Array | None  # 1 where these loads count, 0 in a tangent without negative eigenvalues
-    attached: tuple[Attached | GivesWay, ...] = ()  # elements between nodes, not in the matrix
+    attached: tuple[Between, ...] = ()  # elements between nodes, not in the matrix
     pressures: Coarse | None = None  # of unknown pressures in thin cells
     #: Whether `solve` eliminates unknown pressures first; None: it never does.
     eliminates: jax.Array | None = None
@@ -235,7 +235,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
 
 
 #: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
-_Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Attached | GivesWay, ...]]
+_Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
 # A program has the two functions below several times: within jit they are traced once.
 

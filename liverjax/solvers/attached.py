@@ -1,13 +1,15 @@
-"""Dense blocks of small elements that are attached to nodes of the body: membranes, springs between points, vessels."""
+"""Small elements that are attached to nodes of the body, and masses that nodes of an element share."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.block_matrix import Block, BlockMatrix, added
+from liverjax.tensors.places import given, taken
 
 
 class Attached(NamedTuple):
@@ -24,8 +26,36 @@ class GivesWay(NamedTuple):
     size: jax.Array  # () [N/m] stiffness of the number by itself
 
 
-def product(A: Attached | GivesWay, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+class Masses(NamedTuple):
+    """Mass of all elements beside a diagonal one, or its stiffness over a time step: the same along every axis."""
+
+    nodes: jax.Array  # (n, E)
+    signs: jax.Array  # (n, E) of functions that have a direction
+    matrix: jax.Array  # (n, n) symmetric
+    size: jax.Array  # (E,) [kg] or [N/m]
+
+
+#: What acts between nodes beside a matrix.
+Between = Attached | GivesWay | Masses
+
+
+def masses(mesh: TetMesh, matrix: np.ndarray, size: jax.Array) -> Masses:
+    """`Masses` of a matrix (n, n) times a number for each element (E,)."""
+    nodes = jnp.stack(mesh.element_nodes)
+    signs = mesh.oriented(jnp.ones((len(nodes), 1, nodes.shape[1]), size.dtype))[:, 0]
+    return Masses(nodes, signs, jnp.asarray(matrix, size.dtype), size)
+
+
+def _shared(A: Masses, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
+    moved = A.signs[:, None] * jnp.stack([taken(c, A.nodes) for c in columns], axis=1)
+    force = (A.size[None] * A.signs)[:, None] * jnp.tensordot(A.matrix, moved, axes=(1, 0))
+    return tuple(given(jnp.zeros_like(c), A.nodes, force[:, k]) for k, c in enumerate(columns))
+
+
+def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
     """Forces, columns (V,), of a motion given by its columns (V,)."""
+    if isinstance(A, Masses):
+        return _shared(A, columns)
     if isinstance(A, GivesWay):
         share = -sum(jnp.vdot(h, c) for h, c in zip(A.h.T, columns, strict=True)) / A.size
         return tuple(share * A.h.T)

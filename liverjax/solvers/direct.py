@@ -13,7 +13,7 @@ import numpy as np
 from liverjax.core.struct import Number
 from liverjax.mesh.basis import basis
 from liverjax.mesh.tetrahedra import TetMesh
-from liverjax.solvers.attached import Attached, GivesWay
+from liverjax.solvers.attached import Attached, Between, GivesWay, Masses
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
 
@@ -26,7 +26,7 @@ def solve(
     free: jax.Array,
     b: jax.Array,
     normals: jax.Array | None = None,
-    attached: tuple[Attached | GivesWay, ...] = (),
+    attached: tuple[Between, ...] = (),
 ) -> jax.Array:
     """Solution (m, V) of A x = b (m, V) for m x m blocks, 0 where `free` (m, V) is 0; NaN where A is singular.
 
@@ -44,7 +44,7 @@ def solve_points(
     free: tuple[jax.Array, jax.Array],
     b: tuple[jax.Array, jax.Array],
     normals: Number | None = None,
-    attached: tuple[Attached | GivesWay, ...] = (),
+    attached: tuple[Between, ...] = (),
 ) -> jax.Array:
     """The same of quadratic elements, flat: positions (3 V,), and pressures of the vertices where A has them.
 
@@ -82,13 +82,18 @@ def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
     return scipy.sparse.coo_array((values, (lines, columns)), shape=(size, size)).tocsr()
 
 
-def _entries(attached: tuple[Attached | GivesWay, ...], n: int) -> list[tuple]:
+def _entries(attached: tuple[Between, ...], n: int) -> list[tuple]:
     """Values, lines and columns of the matrices of elements between nodes. In the order of the unknowns all x of the n
     nodes come first."""
     found = []
     for nodes, blocks in (own for own in attached if isinstance(own, Attached)):
         at = (nodes[:, None] + n * np.arange(3)[None, :, None]).reshape(-1, nodes.shape[1])
         found.append((blocks.reshape(len(at), len(at), -1), at[:, None], at[None]))
+    for own in (own for own in attached if isinstance(own, Masses)):
+        values = own.matrix[:, :, None] * own.signs[:, None] * own.signs[None] * own.size
+        for axis in range(3):
+            at = own.nodes + axis * n
+            found.append((values, at[:, None], at[None]))
     return found
 
 
@@ -112,7 +117,7 @@ def _solve(*given: object) -> np.ndarray:
     return _one_solution(A.tocsr(), free.ravel(), b.ravel(), (normals, abs(diagonal[0, 0]).mean()), ways).reshape(m, n)
 
 
-def _given_ways(attached: tuple[Attached | GivesWay, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
+def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
     """h (size, n) of all numbers that adapt, in the order of the unknowns, and the stiffness (n,) of each."""
     found = [own for own in attached if isinstance(own, GivesWay)]
     H = np.zeros((size, len(found)))

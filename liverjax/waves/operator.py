@@ -10,22 +10,17 @@ where K_rest is of what does not relax: the volumetric part of the law where onl
 supports, membranes and springs. Pressures that are unknowns beside the motion: `liverjax.waves.pressures`.
 """
 
-from functools import cache
-from itertools import product
-from math import factorial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.laws.base import Law, volumetric_part
 from liverjax.laws.terms import invariant_terms
-from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.basis import FACES, basis
-from liverjax.mesh.nodal import nodal_volumes
+from liverjax.mesh.basis import basis
+from liverjax.mesh.nodal import nodal_volumes, products
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import viscosity
 from liverjax.physics.base import Free
@@ -71,7 +66,7 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
         own = invariant_terms.blocks(invariant_terms.state_of(volume, F), _shape_vectors(mesh), _OWN)
         rest = own if rest is None else [add_matrices(a, b) for a, b in zip(rest, own, strict=True)]
     springs = node_blocks(e)
-    more = tuple(own for own in (a.attached(mesh, x, 1.0) for a in e.nodal) if own is not None)
+    more = tuple(own for own in (a.attached(mesh, x, 1.0) for a in e.nodal) if isinstance(own, Attached))
     nodes = jnp.stack(mesh.element_nodes)
     heavy = None if scene.body is None else _mass(mesh, jnp.asarray(scene.body.density), nodes, mass)
     whole = None if rest is None else _element_matrices(mesh, rest)
@@ -138,36 +133,8 @@ def _mass(mesh: TetMesh, density: jax.Array, nodes: jax.Array, kind: str) -> jax
     if kind == "lumped":
         return density * nodal_volumes(mesh)
     own = density if density.ndim == 0 else jnp.mean(density[nodes], axis=0)
-    M = jnp.asarray(_products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
+    M = jnp.asarray(products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
     return _both_ways(mesh, M)
-
-
-@cache
-def _products(order: int) -> np.ndarray:
-    """Integrals (n, n) of the products of two functions over an element, over its volume; exact."""
-    vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
-    if order == 1:
-        functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]
-    else:
-        functions = [{tuple(2 * n for n in v): 2.0, v: -1.0} for v in vertex]
-        functions += [{_exponents(vertex, i, j): 4.0} for i, j in PAIRS]
-    if order == 3:
-        functions += [{_exponents(vertex, i, i, j): 1.0, _exponents(vertex, i, j, j): -1.0} for i, j in PAIRS]
-        functions += [{_exponents(vertex, i, j, k): 27.0} for i, j, k in FACES]
-
-    def integral(f: dict[tuple, float], g: dict[tuple, float]) -> float:
-        total = 0.0
-        for (p, a), (q, b) in product(f.items(), g.items()):
-            powers = np.add(p, q)
-            total += a * b * 6 * np.prod([factorial(n) for n in powers]) / factorial(int(powers.sum()) + 3)
-        return total
-
-    return np.array([[integral(f, g) for g in functions] for f in functions])
-
-
-def _exponents(vertex: list[tuple], *which: int) -> tuple:
-    """Exponents of a product of linear functions."""
-    return tuple(sum(v) for v in zip(*(vertex[k] for k in which), strict=True))
 
 
 #: Displacements (V, 3) [m], and pressures (P,) [Pa] or None.

@@ -1,0 +1,154 @@
+"""Consistent masses: their sums, free fall, the factorisation, derivatives; and the mesh's estimate in motion."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_quadratic import crooked
+
+import liverjax as lj
+from liverjax.core.struct import replace
+from liverjax.mesh.nodal import load_volumes
+from liverjax.mesh.promotion import cubic
+from liverjax.physics.base import Free, Start
+from liverjax.physics.inertia import Inertia
+from liverjax.solvers import attached
+
+pytestmark = pytest.mark.quick_to_compile
+
+LINEAR = crooked((2, 1, 1), (0.02, 0.01, 0.01))
+MESHES = {1: LINEAR, 2: lj.quadratic(LINEAR), 3: cubic(lj.quadratic(LINEAR))}
+GRAVITY = np.array([0.3, 0.0, -9.81])
+
+
+def falling(order: int, mass: str, integrator: str = "newmark", **solve) -> lj.Scene:
+    return lj.Scene(
+        mesh=MESHES[order],
+        law=lj.laws.NeoHookean(mu=800.0, bulk=1600.0),
+        body=lj.Body(density=1000.0, gravity=jnp.asarray(GRAVITY), mass=mass),
+        solve=lj.Solve(kind="dynamic", integrator=integrator, dt=0.002, steps=4, **solve),
+    )
+
+
+def fallen(scene: lj.Scene) -> np.ndarray:
+    """Where all points of a free body are, by the recursion of the integrator (T, 1, 3)."""
+    n, dt = np.arange(1, scene.solve.steps + 1), scene.solve.dt
+    way = dt**2 * (n**2 if scene.solve.integrator == "newmark" else n * (n + 1)) / 2
+    return way[:, None, None] * GRAVITY
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_masses_integrate_products_of_functions(order):
+    """Times a constant field they give the weight; times a linear one, with itself, its second moments."""
+    mesh = MESHES[order]
+    mass, shared = Inertia(density=1000.0, mass="consistent")._masses(mesh)
+
+    def product(v: jax.Array) -> jax.Array:
+        return mass[:, None] * v + jnp.stack(attached.product(shared, tuple(v.T)), axis=1)
+
+    assert mass.min() > 0
+    whole = mesh.number_of_vertices + (order > 1) * mesh.pattern.edges.shape[1]
+    one = jnp.zeros_like(mesh.points).at[:whole].set(1.0)
+    assert np.allclose(product(one)[:, 0], 1000.0 * load_volumes(mesh), rtol=1e-13, atol=1e-13 * mass.max())
+    moment = jnp.vdot(mesh.points[:, 0], product(mesh.points)[:, 0])
+    # By the corners X_a of tetrahedra: V/20 (sum_a X_a^2 + (sum_a X_a)^2).
+    X = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra), 0]
+    exact = 1000.0 * np.sum(np.asarray(mesh.volumes) / 20 * ((X**2).sum(axis=1) + X.sum(axis=1) ** 2))
+    assert np.isclose(moment, exact, rtol=1e-13)
+
+
+def test_numbers_by_node_are_means_by_element():
+    mesh = MESHES[2]
+    density = jnp.linspace(900.0, 1100.0, mesh.number_of_nodes)
+    mass, shared = Inertia(density=density, mass="consistent")._masses(mesh)
+    total = jnp.sum(mass) + jnp.sum(jnp.stack(attached.product(shared, (jnp.ones_like(mass),))))
+    assert np.isclose(total, jnp.sum(mesh.volumes * density[mesh.tetrahedra].mean(axis=1)), rtol=1e-13)
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "euler"])
+def test_a_free_quadratic_body_falls_as_one(integrator):
+    """Lumped masses of quadratic elements are not as their weight: the body bends itself."""
+    found = []
+    for mass in ("consistent", "lumped"):
+        scene = falling(2, mass, integrator, tolerance=1e-10)
+        off = lj.simulate(scene).check().positions - scene.mesh.points[None] - fallen(scene)
+        found.append(np.abs(off).max() / np.abs(fallen(scene)).max())
+    assert found[0] < 1e-9 and found[1] > 0.05
+
+
+def test_accelerations_at_the_beginning_are_those_of_the_weight():
+    """With a side held: m a = f where the body is free, 0 where it is held."""
+    mesh = MESHES[2]
+    own = Inertia(density=1000.0, integrator="newmark", mass="consistent")
+    mask = jnp.ones_like(mesh.points).at[mesh.node_sets["x_min"]].set(0.0)
+    weight = 1000.0 * load_volumes(mesh)[:, None] * jnp.asarray(GRAVITY)[None]
+    a = own.begin(Start(mesh, mesh.points, Free(mask), lambda: -weight)).acceleration
+    mass, shared = own._masses(mesh)
+    force = mass[:, None] * a + jnp.stack(attached.product(shared, tuple(a.T)), axis=1)
+    assert np.all(a[mesh.node_sets["x_min"]] == 0)
+    assert np.abs(mask * (force - weight)).max() < 1e-10 * np.abs(weight).max()
+
+
+def held(order: int, **solve) -> lj.Scene:
+    scene = falling(order, "consistent", **solve)
+    return replace(scene, fixed=(lj.Fixed(nodes=scene.mesh.node_sets["x_min"]),))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_factorisation_and_a_robust_step_find_the_same(order):
+    rest = lj.simulate(held(order, tolerance=1e-11)).check().positions
+    for solve in ({"linear_solver": "direct"}, {"robust": "projected"}):
+        other = lj.simulate(held(order, tolerance=1e-11, **solve)).check().positions
+        assert np.abs(other - rest).max() < 1e-9 * np.abs(rest - MESHES[order].points[None]).max()
+
+
+@pytest.mark.slow
+def test_derivatives_go_through_the_first_acceleration():
+    scene = held(2, tolerance=1e-11)
+
+    def tip(density: float) -> jax.Array:
+        return 1e3 * jnp.sum(lj.simulate(lj.with_parameters(scene, {"body.density": density})).positions[-1, :, 2])
+
+    slope, h = jax.grad(tip)(1000.0), 1e-1
+    assert np.isclose((tip(1000.0 + h) - tip(1000.0 - h)) / (2 * h), slope, rtol=1e-5)
+
+
+def test_the_estimate_in_free_fall_is_nothing():
+    """The richer functions have weight and as much mass: a body of linear elements falls as one in both spaces."""
+    scene = falling(1, "lumped", tolerance=1e-10)
+    result = lj.simulate(scene, mesh_error=True).check()
+    assert bool(result.mesh_error.found.all())
+    assert np.abs(result.mesh_error.positions).max() < 1e-8 * np.abs(fallen(scene)).max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_estimate_in_motion_is_the_way_to_the_richer_run(order):
+    """A beam that swings through a period, little: of linear elements the estimate leads to quadratic ones on the same
+    mesh; of quadratic ones, two thirds of it to a finer mesh (`moving_mesh` has more)."""
+    mesh = lj.shapes.box((0.1, 0.02, 0.02), (5, 1, 1) if order == 1 else (2, 1, 1))
+    scene = lj.Scene(
+        mesh=mesh if order == 1 else lj.quadratic(mesh),
+        law=lj.laws.NeoHookean(mu=4000.0, bulk=8000.0),
+        body=lj.Body(density=1000.0, gravity=jnp.array([0.0, 0.0, -0.05])),
+        fixed=(lj.Fixed(nodes=mesh.node_sets["x_min"]),),
+        solve=lj.Solve(kind="dynamic", integrator="newmark", dt=0.02, steps=30),
+    )
+    scene = scene if order == 1 else replace(scene, fixed=(lj.Fixed(nodes=scene.mesh.node_sets["x_min"]),))
+    result = lj.simulate(scene, mesh_error=True).check()
+    assert bool(result.mesh_error.found.all())
+    fine = lj.quadratic(mesh if order == 1 else lj.refined(mesh))
+    body = replace(scene.body, mass="consistent")
+    richer = replace(scene, mesh=fine, body=body, fixed=(lj.Fixed(nodes=fine.node_sets["x_min"]),))
+    V = mesh.number_of_vertices
+    truth, found, change = (
+        np.asarray(x[:, :V, 2])
+        for x in (lj.simulate(richer).check().positions, result.positions, result.mesh_error.positions)
+    )
+    off = truth - found
+    size = np.linalg.norm(change) / np.linalg.norm(off)
+    if order == 1:
+        # Linear solves to a hundredth in each of thirty steps; the motion is linear to its size, 4 mm of 100.
+        assert np.linalg.norm(change - off) < 0.05 * np.linalg.norm(off)
+    assert 0.5 < size < 2 and np.vdot(change, off) > 0.9 * np.linalg.norm(change) * np.linalg.norm(off)
