@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.physics.base import Free, Step
+from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.enriched import enriched
+from liverjax.solvers import attached
 from liverjax.tensors.matrices import deformation_gradient, determinant
 
 pytestmark = pytest.mark.quick_to_compile
@@ -40,6 +43,32 @@ def _relative_error(scene: lj.Scene) -> float:
 def test_a_following_pressure_on_a_cube():
     """The functions of a face have 9/20 of a uniform load; without them the error was 0.56."""
     assert _relative_error(_cube(traction=(lj.Traction(triangles=_face("z_max"), pressure=100.0),))) < ROUNDOFF
+
+
+@pytest.mark.parametrize("history", [None, jnp.array([0.5, 1.0]), jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])])
+def test_a_cube_between_planes_and_an_elastic_foundation(history):
+    """The foundation's traction is uniform where the body's motion is; without the functions of order 3 it was 0.07."""
+    times = None if history is None else jnp.array([0.0, 1.0])
+    springs = ElasticSupport(triangles=_face("z_max"), normal=1e4, tangential=0.0, times=times, history=history)
+    push = lj.Traction(triangles=_face("x_max"), value=jnp.array([-100.0, 0.0, 0.0]))
+    dt = None if history is None else 1.0
+    assert _relative_error(_cube(physics=(springs,), traction=(push,), solve=lj.Solve(dt=dt))) < ROUNDOFF
+
+
+def test_a_foundation_of_order_3_has_the_derivatives_of_its_energy():
+    scene = enriched(_cube(physics=(ElasticSupport(triangles=_face("z_max"), normal=3e3, tangential=5e2),)))
+    rich, rng = scene.mesh, np.random.default_rng(0)
+    step = Step(rich, rich.points, 1.0, 1, 1.0, False, 1e-8, Free(jnp.ones_like(rich.points)))
+    springs = scene.physics[-1].freeze(None, step)
+    x, v = (
+        rich.points + jnp.asarray(1e-3 * rng.standard_normal(rich.points.shape)),
+        rng.standard_normal(rich.points.shape),
+    )
+    slope = jax.grad(lambda x: springs.energy(rich, x))(x)
+    assert np.abs(springs.force(rich, x, 1.0) - slope).max() < 1e-12 * np.abs(slope).max()
+    found = jnp.stack(attached.product(springs.attached(rich, x, 1.0), tuple(jnp.asarray(v).T)), axis=1)
+    exact = jax.jvp(lambda x: springs.force(rich, x, 1.0), (x,), (jnp.asarray(v),))[1]
+    assert np.abs(found - exact).max() < 1e-12 * np.abs(exact).max()
 
 
 def test_pressure_on_a_closed_surface_of_order_3_is_the_change_of_volume():

@@ -3,9 +3,10 @@
 Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
 (a Winkler foundation). They begin without tension. A history of factors changes their stiffness in time. A history of
 displacements moves the wall, and the springs with it. Each node of a triangle has a third of it; in quadratic elements
-the middles of its edges have these thirds.
+the middles of its edges have these thirds. The functions of order 3, of the mesh's estimate, have their integrals.
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -14,11 +15,16 @@ import numpy as np
 
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content, Indices, Number, Numbers, param, struct
-from liverjax.mesh import selection, surface
+from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, struct
+from liverjax.mesh import promotion, selection, surface
+from liverjax.mesh.basis import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
+from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block
+
+#: Degree of the rule on triangles for functions of order 3.
+_DEGREE = 5
 
 
 @struct
@@ -74,15 +80,23 @@ class ElasticSupport(Physics):
         if self.history is not None and np.ndim(self.history) == 1:
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
-    def freeze(self, memory: None, step: Step) -> "Springs":
-        """One symmetric block a node."""
-        own = blocks(self, step.mesh)
+    def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
+        """One symmetric block a node, or one a point of functions of order 3."""
+        kind: Any = Foundation if self.triangles is not None and step.mesh.order == 3 else Springs
+        own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
+        given = {"triangles": self.triangles} if kind is Foundation else {}
         if self.history is None:
-            return Springs(blocks=own)
+            return kind(blocks=own, **given)
         before, after = (history.entry_at(n * step.dt, self.times, self.history) for n in (step.k - 1, step.k))
         if after.ndim:
-            return Springs(blocks=own, wall=jnp.stack([before, after]))
-        return Springs(blocks=tuple(tuple(after * entry for entry in row) for row in own))
+            return kind(blocks=own, wall=jnp.stack([before, after]), **given)
+        return kind(blocks=tuple(tuple(after * entry for entry in row) for row in own), **given)
+
+    def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "ElasticSupport":
+        """On the same triangles or nodes."""
+        if self.triangles is None:
+            return self
+        return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
         """Nodes are held along the axes in which their block has a stiffness."""
@@ -98,17 +112,31 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
     if support.triangles is None:
         own = zero.at[support.nodes].add(support.stiffness)
         return tuple(tuple(own if r == c else zero for c in range(3)) for r in range(3))
+
+    def shared(whole: jax.Array) -> jax.Array:
+        total = zero
+        for nodes, part in surface.nodal_shares(mesh, support.triangles):
+            total = total.at[nodes].add(part * whole)
+        return total
+
+    return _each(support, mesh, shared)
+
+
+def point_blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
+    """3 x 3 blocks of (Q, m) [N/m]: of the points of triangles."""
+    weights = triangle_rule(_DEGREE)[0]
+    return _each(support, mesh, lambda whole: jnp.asarray(weights, whole.dtype)[:, None] * whole[None])
+
+
+def _each(support: ElasticSupport, mesh: TetMesh, shared: Callable[[jax.Array], jax.Array]) -> Block:
+    """3 x 3 blocks of what `shared` makes of the stiffness (m,) [N/m] of triangles."""
     normal = surface.areas(mesh.points, support.triangles)
     area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
     n = normal / area[:, None]
 
     def entry(r: int, c: int) -> jax.Array:
         along = support.tangential if r == c else 0.0
-        whole = area * ((support.normal - support.tangential) * n[:, r] * n[:, c] + along)
-        total = zero
-        for nodes, part in surface.nodal_shares(mesh, support.triangles):
-            total = total.at[nodes].add(part * whole)
-        return total
+        return shared(area * ((support.normal - support.tangential) * n[:, r] * n[:, c] + along))
 
     upper = {(r, c): entry(r, c) for r in range(3) for c in range(r, 3)}
     return tuple(tuple(upper[min(r, c), max(r, c)] for c in range(3)) for r in range(3))
@@ -141,3 +169,40 @@ class Springs(NodalForce):
     def stiffness(self) -> Block:
         """The blocks."""
         return self.blocks
+
+
+@struct
+class Foundation(NodalForce):
+    """Springs during a step at the points of triangles, for functions of order 3: each function has its integral."""
+
+    triangles: Indices = param("1", "(m, 4), as of `liverjax.mesh.promotion.with_faces`")
+    blocks: Block = param("N/m", "3 x 3 of (Q, m)")
+    wall: jax.Array | None = param(
+        "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None
+    )
+
+    def _at_points(self, mesh: TetMesh, x: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Nodes (10, m), their functions (10, Q), and stretch of the springs (3, Q, m) [m]."""
+        nodes = jnp.stack(surface.triangle_nodes(mesh, self.triangles))
+        N = jnp.asarray(surface.triangle_functions(mesh, triangle_rule(_DEGREE)[1]), x.dtype)
+        u = jnp.einsum("aq,ami->iqm", N, (x - mesh.points)[nodes])
+        if self.wall is not None:
+            u = u - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[:, None, None]
+        return nodes, N, u
+
+    def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
+        """Forces of the points, shared out by the functions."""
+        nodes, N, u = self._at_points(mesh, x, s)
+        own = jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks])
+        return jnp.zeros_like(x).at[nodes].add(jnp.einsum("aq,iqm->ami", N, own))
+
+    def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
+        """Half of stretch times force."""
+        u = self._at_points(mesh, x, 1.0)[2]
+        return 0.5 * jnp.einsum("iqm,ijqm,jqm->", u, jnp.stack([jnp.stack(row) for row in self.blocks]), u)
+
+    def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
+        """Second derivative of the energy."""
+        nodes, N, _ = self._at_points(mesh, x, s)
+        H = jnp.stack([jnp.stack(row) for row in self.blocks])
+        return Attached(nodes, jnp.einsum("aq,bq,ijqm->aibjm", N, N, H))
