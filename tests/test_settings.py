@@ -71,6 +71,7 @@ flux = 1e-6
 [body]
 density = 1060.0
 gravity = [0.0, 0.0, -1.0]
+mass = "lumped"
 history = [[0.0, 0.0], [1.0, 1.0]]
 [[fixed]]
 set = "z_min"
@@ -310,6 +311,20 @@ def test_settings_that_would_change_nothing_are_refused(case, tmp_path):
     with pytest.raises(lj.InputError, match=words) as told:
         scene_from(CUBE | change, tmp_path)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        {"shape": "cylinder", "radius": 10.0, "height": 10.0, "cell_size": 0.002},
+        {"shape": "cylinder", "radius": 10.0, "height": 10.0, "cell_size": 0.002, "match_area": True},
+        {"shape": "cylinder", "radius": 0.01, "height": 0.01, "cell_size": 0.002, "rim_cell": 1e-9},
+        {"shape": "box", "size": [0.1, 0.1, 0.1], "cells": [1000, 1000, 1000]},
+    ],
+)
+def test_meshes_that_no_memory_holds_are_refused(mesh):
+    with pytest.raises(lj.InputError, match="ask for about .* tetrahedra"):
+        scene_from(CUBE | {"mesh": mesh})
 
 
 def test_settings_that_do_something_are_taken():

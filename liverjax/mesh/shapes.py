@@ -11,6 +11,9 @@ from liverjax.mesh.cylinders import graded, graded_cylinder
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
+#: The most tetrahedra of a shape; linear ones of so many take about 20 GB, with a run.
+MOST_TETRAHEDRA = 20_000_000
+
 
 def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
     """A box with one corner at the origin, each brick cut into six tetrahedra along one diagonal (Kuhn).
@@ -22,6 +25,7 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
     _positive("size", size)
     if len(cells) != 3 or any(int(n) != n or n < 1 for n in cells):
         raise InputError(f"box cells = {list(cells)} must be three positive whole numbers: give e.g. [8, 8, 8]")
+    _not_too_many(6 * math.prod(int(n) for n in cells), "cells")
     shape = tuple(int(n) + 1 for n in cells)
     grid = np.indices(shape).reshape(3, -1).T
     corner = np.indices(tuple(int(n) for n in cells)).reshape(3, -1).T
@@ -70,6 +74,7 @@ def cylinder(
         return _graded(radius, height, (cell_size, cell_size if rim_cell is None else rim_cell), rings, match_area)
     count = max(2, math.ceil(radius / cell_size - 1e-9))
     layers = max(1, math.ceil(height / cell_size - 1e-9))
+    _not_too_many(18 * count**2 * layers, "radius, height and cell_size")
     disc, triangles = _disc(count)
     points, tets = stacked(disc * radius, triangles, np.linspace(0.0, height, layers + 1))
     n, per_layer = np.arange(len(points)), len(disc)
@@ -91,6 +96,9 @@ def _graded(
         if not (np.isfinite(ring) and 0 < ring < radius):
             raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: mend them")
     largest = min(cell_size, radius / 2)
+    # A ring of radius r has at least 2 pi r / largest cells: as many prisms as cells of this length, at least.
+    _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
+    _not_too_many(18 * math.ceil(min(radius, height) / rim_cell) ** 2 // 100, "rim_cell")
     radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)
     heights = graded(height, {0.0: rim_cell, float(height): rim_cell}, cell_size)
     return graded_cylinder(radii, heights, match_area)
@@ -114,6 +122,15 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
                 if m < k - 1:
                     triangles.append([inner[0], outer[1], inner[1]])
     return np.vstack(points), np.asarray(triangles)
+
+
+def _not_too_many(tetrahedra: int, names: str) -> None:
+    """Refuse a mesh that no memory holds, before it is made."""
+    if tetrahedra > MOST_TETRAHEDRA:
+        raise InputError(
+            f"shape {names} ask for about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: are the "
+            "lengths in metres, or is the unit missing?"
+        )
 
 
 def _positive(name: str, values: Sequence[float]) -> None:
