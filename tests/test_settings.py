@@ -323,7 +323,7 @@ def test_settings_that_would_change_nothing_are_refused(case, tmp_path):
     ],
 )
 def test_meshes_that_no_memory_holds_are_refused(mesh):
-    with pytest.raises(lj.InputError, match="ask for about .* tetrahedra"):
+    with pytest.raises(lj.InputError, match=r"ask for about .* tetrahedra"):
         scene_from(CUBE | {"mesh": mesh})
 
 
