@@ -399,7 +399,7 @@ def test_runs_in_parts_batches_and_inverted_starts():
     second, _ = simulate_part(scene, state, 3.0, 2)
     parts = np.concatenate([first.positions, second.positions])
     # Each part begins with a tangent of its own: the same to the tolerance of a step, 1e-8 of the forces.
-    assert np.abs(parts - whole.positions).max() < 1e-6 * np.abs(whole.positions - mesh.points).max()
+    assert np.abs(parts - whole.positions).max() < 1e-6 * np.abs(whole.positions - mesh.points[None]).max()
     batch = lj.simulate_batch(scene, {"law.mu": jnp.array([800.0, 900.0])})
     assert np.abs(batch.result.positions[0] - whole.positions).max() < 1e-6 * 0.01
     static = replace(scene_of(mesh, "projected"), solve=lj.Solve(robust="projected"))

@@ -182,8 +182,9 @@ def adjoint(
     return x, b, residual
 
 
-#: Of `_with_flow`: tolerance of its solves for motions and for pressures, and how often at most.
-_INNER, _INNER_PRESSURE, _REFINEMENTS = 5e-2, 1e-2, 60
+#: Of `_with_flow`: tolerance of its solves for motions and for pressures, how often at most, and how often in a row
+#: without a gain: a loose solve for pressures far off may leave more forces out of balance than there were.
+_INNER, _INNER_PRESSURE, _REFINEMENTS, _VAIN = 5e-2, 1e-2, 60, 3
 
 
 def _with_flow(
@@ -209,17 +210,18 @@ def _with_flow(
         return b[:n] - tangent.flat_free(e, tangent.with_nodal_products(e, K, motion, force)), dP
 
     def go_on(c):
-        _, _, r, _, last, k = c
-        size = jnp.linalg.norm(r)
-        return (size > tolerance * scale) & (size < last) & (k < _REFINEMENTS)
+        _, _, r, _, _, vain, k = c
+        return (jnp.linalg.norm(r) > tolerance * scale) & (vain < _VAIN) & (k < _REFINEMENTS)
 
     def step(c):
-        x, P, r, dP, _, k = c
+        x, P, r, dP, least, vain, k = c
         size = jnp.linalg.norm(r)
         # The last refinement does no more than is asked for.
         inner = jnp.clip(0.3 * tolerance * scale / size, _INNER, 0.5)
         x, P = x + tangent.solve(e, K, r, inner, max_iterations)[0], P + dP
-        return x, P, *left(x, P), size, k + 1
+        r, dP = left(x, P)
+        least = jnp.minimum(least, size)
+        return x, P, r, dP, least, jnp.where(jnp.linalg.norm(r) < least, 0, vain + 1), k + 1
 
     load, begin = left(jnp.zeros_like(b[:n]), jnp.zeros_like(b[n:]))
     size = jnp.linalg.norm(load)
@@ -235,6 +237,6 @@ def _with_flow(
     r, dP = left(x, P)
     helps = jnp.linalg.norm(r) < size
     x, P, r, dP = (jnp.where(helps, a, b) for a, b in zip((x, P, r, dP), (0 * x, 0 * P, load, begin), strict=True))
-    start = (x, P, r, dP, jnp.asarray(jnp.inf, b.dtype), done)
+    start = (x, P, r, dP, jnp.linalg.norm(r), jnp.array(0), done)
     x, P, r, dP, *_ = jax.lax.while_loop(go_on, step, start)
     return jnp.concatenate([x, P + dP + given]), load, jnp.linalg.norm(r) / scale
