@@ -217,6 +217,9 @@ def test_a_map_goes_on_from_its_own_problem_alone(problem, tmp_path):
     ):
         with pytest.raises(lj.InputError, match=words):
             other.read()
+    (tmp_path / "p.h5").write_text("no HDF5")
+    with pytest.raises(lj.InputError, match="of another fit"):
+        search(problem).read()
 
 
 @pytest.mark.slow

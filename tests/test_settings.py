@@ -197,7 +197,7 @@ frequencies = [60.0]
 #: A value of every kind of TOML.
 KINDS = (["a", "b"], [1.0, 2.0, 3.0], [], 5, -7.5, "a word", True, {"a": 1}, [{"a": 1}])
 #: What a section needs beside mesh, law, the held place and [solve].
-NEEDS = {"region": ("viscosity", "porosity"), "solve": ("body",), "springpots": ("displaced",)}
+NEEDS = {"region": ("viscosity", "porosity"), "solve": ("body",), "law": ("body",), "springpots": ("displaced",)}
 
 
 def _addresses(content, before=()):
@@ -252,8 +252,14 @@ def test_the_scenes_are_read_and_have_every_key():
 def test_a_value_of_another_kind_is_read_or_gets_one_sentence(section):
     for k, address in CASES:
         if address[0] == section:
-            for value in KINDS:
-                _told(_changed(SCENES[k], address, value))
+            told = [_told(_changed(SCENES[k], address, value)) for value in KINDS]
+            words = {str(part) for part in address if isinstance(part, str)}
+            # No key takes all kinds, and each sentence names the key or its section.
+            assert any(told), address
+            assert all(sentence is None or any(word in sentence for word in words) for sentence in told), (
+                address,
+                told,
+            )
 
 
 #: The second scene about [mesh]; a change of one of the scenes -> part of the sentence.

@@ -11,7 +11,6 @@ import liverjax as lj
 from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
-from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics import boundary
 from liverjax.physics.inertia import Motion
 from liverjax.simulation.equations import equations, initial_state
@@ -172,59 +171,6 @@ def test_order_of_the_integrators(integrator, order, verified):
     name = {"euler": "implicit Euler", "newmark": "Newmark"}[integrator]
     verified(f"{name}: order {order} of the motion", "its truncation error", abs(observed - order), 0.25, observed)
     assert abs(observed - order) < 0.25
-
-
-def _let_go(**changes) -> lj.Scene:
-    """A body of six elements, held below, by Newmark's method."""
-    mesh = box(1)
-    solve = lj.Solve(kind="dynamic", dt=0.01, integrator="newmark", tolerance=1e-10)
-    return lj.Scene(mesh=mesh, law=LAW, body=lj.Body(density=1060.0), fixed=(bottom(mesh),), solve=solve, **changes)
-
-
-def test_newmark_keeps_its_order_from_a_stretched_start():
-    """Stretched by 2 % and let go. Without the law's force in the first acceleration the differences halve: order 1."""
-    scene = _let_go()
-
-    def stretched(by: jax.Array) -> jax.Array:
-        return scene.mesh.points * (1 + by * jnp.array([[0.0, 0.0, 1.0]]))
-
-    start = stretched(jnp.asarray(0.02))
-    x = [np.asarray(state.x[-1]) for state, _ in march(scene, (10, 20, 40), 0.05, start)]
-    observed = np.log2(np.linalg.norm(x[1] - x[0]) / np.linalg.norm(x[2] - x[1]))
-    assert abs(observed - 2) < 0.25
-
-    @jax.jit
-    def end(by: jax.Array) -> jax.Array:
-        run = replace(scene, solve=replace(scene.solve, steps=3))
-        return jnp.sum(lj.simulate(run, start=stretched(by)).positions[-1, -1])
-
-    h = 1e-4
-    difference = (end(jnp.asarray(0.02 + h)) - end(jnp.asarray(0.02 - h))) / (2 * h)
-    assert np.isclose(jax.grad(end)(jnp.asarray(0.02)), difference, rtol=1e-5)
-
-
-def test_the_first_acceleration_has_all_forces_at_the_start():
-    """Mass times acceleration: minus the law's force, and the push of a sponge's pressure, P0 a third of the area."""
-
-    def push(scene: lj.Scene, start: jax.Array | None = None) -> np.ndarray:
-        state = initial_state(scene, start)
-        motion = next(m for m in state.memories if isinstance(m, Motion))
-        return np.asarray(1060.0 * nodal_volumes(scene.mesh)[:, None] * motion.acceleration)
-
-    scene = _let_go()
-    X = scene.mesh.points
-    free = np.asarray(X[:, 2:] > 0)
-    start = X * jnp.array([[1.0, 1.0, 1.02]])
-    expected = np.where(free, -np.asarray(mjed.internal_force(scene.mesh, LAW, start)), 0.0)
-    assert np.allclose(push(scene, start), expected, rtol=1e-10, atol=1e-12 * np.abs(expected).max())
-    mixed = replace(scene, solve=replace(scene.solve, volumetric="mixed"))
-    # A uniform state: the pressures that are unknown are those of the law.
-    assert np.allclose(push(mixed, start), expected, rtol=1e-8, atol=1e-10 * np.abs(expected).max())
-    wet = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-9, initial_pressure=50.0)
-    surface = (lj.Traction(triangles=jnp.asarray(boundary.boundary_triangles(scene.mesh)), pressure=-50.0),)
-    out = np.where(free, np.asarray(boundary.follower_forces(surface, X)), 0.0)
-    assert np.allclose(push(replace(scene, porosity=wet)), out, rtol=1e-8, atol=1e-10 * np.abs(out).max())
-    assert np.all(push(scene) == 0.0)
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
-"""Elastography: waves on voxels from files, the balance of forces, regions, maps and the command."""
+"""Elastography: waves on voxels, the balance of forces, regions, maps and the command."""
 
 import json
-import sys
 
 import h5py
 import numpy as np
@@ -202,126 +201,6 @@ def written(tmp_path, ending, field):
     return path
 
 
-@pytest.mark.parametrize("ending", [".npz", ".h5", ".csv", ".nii", ".nii.gz"])
-def test_a_file_of_any_format_is_read_as_it_was_written(tmp_path, ending):
-    field = plane_waves((5, 6, 7), noise=1e-7)
-    asked = list(HERTZ) if ".nii" in ending else None
-    found = wave_field.read_waves(written(tmp_path, ending, field), asked)
-    np.testing.assert_allclose(found.frequencies, HERTZ)
-    np.testing.assert_allclose(found.spacing, H, rtol=1e-6)
-    scale = np.abs(field.displacement).max()
-    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-6 * scale)
-
-
-def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
-    field = plane_waves((5, 5, 5))
-    t = np.arange(8) / 8
-    phases = np.stack([np.real(field.displacement * np.exp(2j * np.pi * one)) for one in t], axis=1)
-    np.savez(tmp_path / "phases.npz", phases=1e6 * phases, spacing=H, unit="um")
-    found = wave_field.read_waves(tmp_path / "phases.npz", list(HERTZ))
-    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
-
-
-def test_an_array_of_hdf5_may_name_its_own_unit_spacing_and_frequencies(tmp_path):
-    field = plane_waves((5, 5, 5))
-    with h5py.File(tmp_path / "own.h5", "w") as file:
-        file["displacement"] = 1e6 * field.displacement
-        file["frequencies"] = HERTZ
-        file["displacement"].attrs.update({"unit": "um", "spacing": [H] * 3})
-        file["frequencies"].attrs["unit"] = "Hz"
-    found = wave_field.read_waves(tmp_path / "own.h5")
-    np.testing.assert_allclose(found.displacement, field.displacement, atol=1e-18)
-    np.testing.assert_allclose(found.spacing, H)
-
-
-@pytest.mark.parametrize("ending", [".npy", ".npz"])
-def test_text_and_objects_in_place_of_arrays_get_a_sentence_about_numbers(tmp_path, ending):
-    path = tmp_path / f"waves{ending}"
-    path.write_text("no array")
-    with pytest.raises(InputError, match="no arrays of numbers"):
-        wave_field.read_waves(path, [60.0], spacing=[H] * 3)
-    saved = np.array([{"u": 1}], dtype=object)
-    np.save(path, saved) if ending == ".npy" else np.savez(path, displacement=saved)
-    with pytest.raises(InputError, match="no arrays of numbers"):
-        wave_field.read_waves(path, [60.0], spacing=[H] * 3)
-
-
-def wrapped_file(path, radians_per_metre=2.8e5):
-    """Phases of waves that go over 2 pi several times, as a scanner stores them: a corner is not measured."""
-    field = plane_waves((12, 12, 14))
-    t = np.arange(8) / 8
-    motion = np.stack([np.real(field.displacement * np.exp(2j * np.pi * one)) for one in t], axis=1)
-    wrapped = np.angle(np.exp(1j * radians_per_metre * motion))
-    wrapped[:, :, :2, :2, :2] = np.nan
-    np.savez(path, wrapped=wrapped, spacing=H, frequencies=HERTZ)
-    return radians_per_metre * field.displacement, np.ptp(radians_per_metre * motion)
-
-
-def test_wrapped_phases_are_unwrapped(tmp_path):
-    pytest.importorskip("skimage")
-    exact, reach = wrapped_file(tmp_path / "wrapped.npz")
-    assert reach > 2 * np.pi  # else nothing is wrapped
-    found = wave_field.read_waves(tmp_path / "wrapped.npz")
-    off = (found.displacement - exact)[:, 2:]
-    np.testing.assert_allclose(off, 0, atol=1e-12)
-    assert np.all(np.isnan(found.displacement[:, :2, :2, :2])) and found.mask.sum() == found.mask.size - 8
-    assert not found.notes
-    wrapped_file(tmp_path / "steep.npz", 6e5)  # more than pi from one voxel to the next
-    assert "mask them" in wave_field.read_waves(tmp_path / "steep.npz").notes[0]
-
-
-def test_wrapped_phases_that_are_no_radians_get_a_sentence(tmp_path, monkeypatch):
-    wrapped_file(tmp_path / "wrapped.npz")
-    held = dict(np.load(tmp_path / "wrapped.npz"))
-    np.savez(tmp_path / "grey.npz", **held | {"wrapped": 1300 * held["wrapped"]})
-    with pytest.raises(InputError, match="radians between -pi and pi"):
-        wave_field.read_waves(tmp_path / "grey.npz")
-    monkeypatch.setitem(sys.modules, "skimage.restoration", None)
-    with pytest.raises(InputError, match=r"pip install 'liverjax\[unwrap\]'"):
-        wave_field.read_waves(tmp_path / "wrapped.npz")
-
-
-@pytest.mark.parametrize(
-    "change, words",
-    [
-        ({"spacing": None}, "give --spacing"),
-        ({"spacing": [2.0, 2.0, 2.0]}, "give metres, not mm"),
-        ({"frequencies": None}, "give --frequencies with 2"),
-        ({"frequencies": [60.0]}, "1 frequencies for 2 fields"),
-        ({"frequencies": [60.0, 60.0]}, "not all different"),
-        ({"frequencies": [60.0, -1.0]}, "above 0 Hz"),
-        ({"displacement": np.ones((2, 5, 5, 5, 3))}, "no imaginary part"),
-        ({"displacement": np.ones((5, 5)) + 1j}, "frequencies first, components last"),
-        ({"displacement": np.full((2, 5, 5, 5, 3), 0j)}, "zero or not a number everywhere"),
-        ({"displacement": None}, "name the waves displacement"),
-        ({"mask": np.zeros((5, 5, 5), int)}, "no voxel of the mask"),
-        ({"mask": np.ones((4, 5, 5), int)}, "on the same voxels"),
-        ({"labels": np.full((5, 5, 5), 0.5)}, "whole numbers"),
-        ({"unit": "inch"}, "unit 'inch' is not known"),
-        ({"frequencies": ["sixty", "hundred"]}, "frequencies holds"),
-        ({"origin": [0.0, np.nan, 0.0]}, "three coordinates"),
-    ],
-)
-def test_a_file_that_cannot_be_used_gets_a_sentence(tmp_path, change, words):
-    field = plane_waves((5, 5, 5))
-    arrays = {"displacement": field.displacement, "spacing": field.spacing, "frequencies": HERTZ} | change
-    np.savez(tmp_path / "bad.npz", **{k: v for k, v in arrays.items() if v is not None})
-    with pytest.raises(InputError, match=words) as told:
-        wave_field.read_waves(tmp_path / "bad.npz")
-    assert "bad.npz" in str(told.value) and "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize("ending", [".npz", ".npy", ".h5", ".csv", ".nii.gz", ".xyz"])
-def test_a_damaged_or_unknown_file_gets_a_sentence(tmp_path, ending):
-    path = tmp_path / f"waves{ending}"
-    path.write_bytes(b"PK\x03\x04 this is no archive\n1,2,3\n")
-    with pytest.raises(InputError, match="waves") as told:
-        wave_field.read_waves(path, [60.0], spacing=[H] * 3)
-    assert "\n" not in str(told.value)
-    with pytest.raises(InputError, match="no such file"):
-        wave_field.read_waves(tmp_path / f"none{ending}")
-
-
 def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     labels = np.ones((7, 7, 9), int)
     labels[..., 5:] = 4
@@ -485,13 +364,6 @@ def test_zeros_around_the_organ_are_not_measured(tmp_path):
     found = wave_field.read_waves(tmp_path / "zeros.npz")
     assert found.mask.sum() == 5 * 6 * 7 and "do not move at all" in found.notes[0]
     assert np.all(np.isfinite(found.displacement[:, found.mask]))
-
-
-@pytest.mark.parametrize("asked", [[50.0, 70.0], [60.0, 80.0, 100.0], [60.0]])
-def test_other_frequencies_than_those_of_the_file_are_refused(tmp_path, asked):
-    path = written(tmp_path, ".npz", plane_waves((5, 5, 5)))
-    with pytest.raises(InputError, match="leave out --frequencies"):
-        wave_field.read_waves(path, asked)
 
 
 def test_the_direct_inversion_leaves_out_what_the_edge_smooths():

@@ -139,14 +139,17 @@ class _Search:
         """Go on from the file of an earlier run.
 
         Raises:
-            InputError: no such file, or of another problem.
+            InputError: a file that is damaged, or of another problem.
         """
         if not self.file.is_file():
             return
-        with h5py.File(self.file) as f:
-            refuse_other(self.file, f.attrs, self.marks)
-            self.z, self.k = f["z"][:], int(f["k"][()])
-            self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
+        try:
+            with h5py.File(self.file) as f:
+                refuse_other(self.file, f.attrs, self.marks)
+                self.z, self.k = f["z"][:], int(f["k"][()])
+                self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
+        except (OSError, KeyError):  # no HDF5, or of another program
+            raise InputError(f"{self.file} is of another fit: leave out --resume or name another --out") from None
 
 
 _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")

@@ -162,7 +162,7 @@ def _nifti(path: Path) -> Content:
     try:
         import nibabel
     except ImportError:
-        raise InputError(f"{path}: NIfTI needs nibabel: pip install 'liverjax[nifti]', or give .npz") from None
+        raise InputError(f"{path}: NIfTI needs nibabel: pip install '.[nifti]', or give .npz") from None
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
     unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm where it is not said

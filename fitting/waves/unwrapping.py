@@ -26,7 +26,7 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
         from skimage.restoration import unwrap_phase
     except ImportError:
         raise InputError(
-            f"{name}: wrapped phases need scikit-image: pip install 'liverjax[unwrap]', or unwrap them first"
+            f"{name}: wrapped phases need scikit-image: pip install '.[unwrap]', or unwrap them first"
         ) from None
     out = np.full(phases.shape, np.nan)
     for f, t, c in np.ndindex(phases.shape[0], phases.shape[1], phases.shape[-1]):

@@ -1,8 +1,7 @@
 """Settings of a scene file that would change nothing, each refused in one sentence: what is asked for is done."""
 
-from typing import Any
-
 from liverjax.core.errors import InputError
+from liverjax.core.struct import Content
 
 #: Keys of [mesh] that each kind of mesh reads, beside those that all read.
 _EVERY_MESH = ("unit", "order", "is")
@@ -13,7 +12,7 @@ _MESHES = {
 }
 
 
-def refuse_idle(content: dict[str, Any]) -> None:
+def refuse_idle(content: Content) -> None:
     """Refuse settings without effect in the content of a scene file whose values have been read.
 
     Raises:

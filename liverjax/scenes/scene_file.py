@@ -247,7 +247,7 @@ def _cylinder(table: dict, scale: float) -> TetMesh:
 
 
 def _law(value: object, where: str = "[law]") -> Law:
-    tables = value if isinstance(value, list) else [value]
+    tables = value if isinstance(value, list) and value else [value]
     made = []
     for table in tables:
         if not isinstance(table, dict) or "name" not in table:
