@@ -6,9 +6,6 @@ Importing turns on JAX's 64-bit mode unless the environment sets ``JAX_ENABLE_X6
 import os
 from types import ModuleType
 
-# Groups of a factorisation run side by side. Threads of BLAS beside them wait for each other: three times as long.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import jax
 
 if jax.__version__ in ("0.10.2", "0.11.0"):

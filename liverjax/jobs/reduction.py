@@ -19,6 +19,7 @@ from liverjax.reduced.run import ReducedResult, reduced_positions, reduced_press
 from liverjax.reduced.training import reduce_scene
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import Result
+from liverjax.solvers.blas import one_blas_thread
 from liverjax.solvers.problem import StepStatistics
 
 
@@ -65,11 +66,12 @@ def tried(scene: Scene) -> Tried:
     """
     solve = scene.solve
     model, plain = load_reduced(solve.reduced), replace(scene, solve=replace(solve, reduced=""))
-    begin = time.perf_counter()
-    first = jax.block_until_ready(simulate_reduced(model, plain))
-    again = time.perf_counter()
-    found = jax.block_until_ready(simulate_reduced(model, plain))
-    run_time = time.perf_counter() - again
+    with one_blas_thread():
+        begin = time.perf_counter()
+        first = jax.block_until_ready(simulate_reduced(model, plain))
+        again = time.perf_counter()
+        found = jax.block_until_ready(simulate_reduced(model, plain))
+        run_time = time.perf_counter() - again
     x, found = reduced_positions(model, plain, found), reduced_error(model, plain, found)
     error = np.asarray(found.error)
     moved = float(np.linalg.norm(np.asarray(x) - np.asarray(scene.mesh.points), axis=-1).max())

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.solvers import multifrontal
+from liverjax.solvers.blas import one_blas_thread
 from liverjax.solvers.direct import across
 from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_part
 
@@ -89,6 +90,11 @@ class _Order(NamedTuple):
 
 
 def _host(*given: object) -> np.ndarray:
+    with one_blas_thread():
+        return _at_the_frequencies(*given)
+
+
+def _at_the_frequencies(*given: object) -> np.ndarray:
     A, factors, omegas, b = jax.tree.map(np.asarray, given)
     V, size = len(A.points), b.shape[1]
     by_node = np.concatenate([np.arange(3 * V).reshape(3, V).T.ravel(), np.arange(3 * V, size)])
