@@ -59,6 +59,7 @@ def test_cells_of_equal_sides_have_no_clusters():
     assert len(jax.tree.leaves(plate(10.0).mesh)) > len(jax.tree.leaves(plate(1.0).mesh))
 
 
+@pytest.mark.slow
 def test_flat_cells_take_as_few_iterations_as_cubes():
     law = lj.laws.NeoHookean(mu=700.0, bulk=7e6)
     counts = []

@@ -106,6 +106,7 @@ def test_projected_stiffness_has_no_negative_eigenvalue():
     np.testing.assert_allclose(K[..., below], alone[..., below], rtol=1e-12, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_laws_in_series_carry_one_force(verified):
     """Held at the sides, each half is stretched uniformly: equal nominal stress, and stretches that add up."""
     mesh = block(1, (1, 1, 4))

@@ -45,7 +45,14 @@ def test_a_following_pressure_on_a_cube():
     assert _relative_error(_cube(traction=(lj.Traction(triangles=_face("z_max"), pressure=100.0),))) < ROUNDOFF
 
 
-@pytest.mark.parametrize("history", [None, jnp.array([0.5, 1.0]), jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])])
+@pytest.mark.parametrize(
+    "history",
+    [
+        pytest.param(None, marks=pytest.mark.slow),
+        pytest.param(jnp.array([0.5, 1.0]), marks=pytest.mark.slow),
+        jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]]),
+    ],
+)
 def test_a_cube_between_planes_and_an_elastic_foundation(history):
     """The foundation's traction is uniform where the body's motion is; without the functions of order 3 it was 0.07."""
     times = None if history is None else jnp.array([0.0, 1.0])

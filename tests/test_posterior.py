@@ -135,7 +135,7 @@ def test_the_error_of_the_inertia_is_drawn_with_its_prior():
     assert found.r_hat.max() < 1.01
 
 
-@pytest.mark.parametrize("springpot", [False, True])
+@pytest.mark.parametrize("springpot", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_error_of_the_gap_is_a_factor_of_all_moduli(springpot):
     s = one_mode(0.02, 1)
     fit = viscoelastic.closed_form(s, 1)

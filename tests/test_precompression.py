@@ -100,6 +100,7 @@ def test_glued_torque_is_that_of_a_sample_compressed_and_then_turned(law):
     assert by_hand == pytest.approx(float(stiffness), rel=1e-3)  # what is left is the twist's square and its product
 
 
+@pytest.mark.slow
 def test_simulated_moduli_are_those_of_the_linear_rig(law):
     """The run in time about the held state, where what is left is of the order of the strain."""
     rig = rig_of(Simulation(precompression=STRAIN, cell_size=0.004))

@@ -125,6 +125,7 @@ def test_a_sweep_holds_the_rows_of_single_runs(files):
         assert not (files / "rows.h5.parts").exists()
 
 
+@pytest.mark.slow
 def test_rows_of_a_loaded_mesh_are_measured_from_their_own_shapes(files):
     """Each row lies as given under its loads: so it has moved from a reference shape of its own."""
     (files / "scene.toml").write_text(SCENE.replace("[mesh]", '[mesh]\nis = "loaded"'))

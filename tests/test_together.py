@@ -155,7 +155,7 @@ def with_deviations(stated: float, noise: float, springpot: bool = False) -> Swe
     return Sweep(WIDE, *noisy, *(stated * noisy), source="stated.csv")
 
 
-@pytest.mark.parametrize("model", ["prony", "fractional", "spectrum"])
+@pytest.mark.parametrize("model", ["prony", pytest.param("fractional", marks=pytest.mark.slow), "spectrum"])
 def test_given_deviations_are_believed_beside_another_test(model):
     """5 % stated and 1 % of scatter: twice the file has errors smaller by sqrt(2), and agrees with itself."""
     from fitting.fits.families.springpots_in_time import choose_together

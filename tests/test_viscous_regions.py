@@ -36,7 +36,8 @@ def lower(mesh):
     return jnp.asarray(np.flatnonzero(centres[:, 1] < 0.005))
 
 
-@pytest.mark.parametrize("order, part", [(1, "all"), pytest.param(2, "isochoric", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order, part", [(1, "all"), (2, "isochoric")])
 def test_a_body_of_two_has_the_forces_of_both(order, part):
     """All nodes are moved, so that every element has its own stress: the force is half of each body's."""
     scene = block(order, part=part)
