@@ -157,6 +157,24 @@ def test_bad_ligaments_are_refused(table, words):
         scene_from(content(ligament=[table]))
 
 
+#: One node of the top.
+CORNER = {"x_max": 0.0, "y_max": 0.0, "z_min": SIDE}
+
+
+@pytest.mark.parametrize(("rest", "holds"), [(0.05, True), (0.1, True), (0.100001, False), (0.2, False)])
+def test_slack_fibres_hold_nothing(rest, holds):
+    """A body that slides along z hangs by fibres of 0.1 m: longer ones at rest are slack, and nothing holds it then."""
+    table = content(
+        fixed=[{"where": {"x_max": 0.0}, "axes": "xy"}],
+        ligament=[{"where": CORNER, "to": [0.0, 0.0, 0.2], "stiffness": 40.0, "rest_length": rest}],
+    )
+    if holds:
+        scene_from(table)
+    else:
+        with pytest.raises(InputError, match="nothing holds the body"):
+            scene_from(table)
+
+
 # -- vessels ---------------------------------------------------------------------------------------------------------
 
 

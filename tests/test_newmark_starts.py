@@ -1,4 +1,4 @@
-"""Newmark's method from given positions, or a given pressure of the fluid: the first acceleration has all forces."""
+"""Runs in motion from given positions: the first acceleration has all forces, and the stress there begins to relax."""
 
 import jax
 import jax.numpy as jnp
@@ -73,3 +73,29 @@ def test_the_first_acceleration_has_all_forces_at_the_start():
     out = np.where(free, np.asarray(boundary.follower_forces(surface, X)), 0.0)
     assert np.allclose(push(replace(scene, porosity=wet)), out, rtol=1e-8, atol=1e-10 * np.abs(out).max())
     assert np.all(push(scene) == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("order", "part", "tau"),
+    [(1, "isochoric", 0.1), pytest.param(2, "all", [[0.1] * 6], marks=pytest.mark.slow)],
+)
+def test_the_stress_at_the_start_relaxes_from_its_first_moment(order, part, tau):
+    """Held where it begins: the elastic force times 1 - g (1 - exp(-t/tau)), exact for a constant stress."""
+    mesh = box(1) if order == 1 else lj.quadratic(box(1))
+    by = 0.05 * mesh.points * jnp.array([[0.0, 0.0, 1.0]])
+    everywhere = jnp.arange(mesh.number_of_nodes)
+    held = lj.Displaced(nodes=everywhere, by=by, times=jnp.array([0.0, 1.0]), history=jnp.array([1.0, 1.0]))
+    law = lj.laws.StableNeoHookean(mu=800.0, lame_lambda=0.0) if part == "all" else LAW
+    viscous = lj.Prony(
+        ratios=jnp.full(np.shape(tau) or (1,), 0.4), relaxation_times=jnp.atleast_1d(jnp.array(tau)), part=part
+    )
+    solve = lj.Solve(kind="dynamic", dt=0.05, steps=4, tolerance=1e-10)
+    scene = lj.Scene(
+        mesh=mesh, law=law, viscosity=viscous, body=lj.Body(density=1060.0), displaced=(held,), solve=solve
+    )
+    found = lj.simulate(scene, start=mesh.points + by).check()
+    left = 1 - 0.4 * (1 - np.exp(-np.asarray(found.times) / 0.1))
+    whole = mjed.internal_force(mesh, law.isochoric_part() if part == "isochoric" else law, mesh.points + by)
+    rest = mjed.internal_force(mesh, law.volumetric_part(), mesh.points + by) if part == "isochoric" else 0.0
+    exact = left[:, None, None] * np.asarray(whole)[None] + np.asarray(rest)
+    assert np.allclose(found.reactions, exact, rtol=1e-9, atol=1e-12 * np.abs(exact).max())

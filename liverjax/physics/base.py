@@ -84,6 +84,7 @@ class Start(NamedTuple):
     x: jax.Array  # (V, 3) [m]
     free: Free
     force: Callable[[], jax.Array]  # (V, 3) [N] what acts on the nodes at x, without inertia
+    moved: bool = False  # whether the body was brought to x at this moment; if not, x is at rest or but a guess
 
 
 class Step(NamedTuple):

@@ -27,6 +27,8 @@ from liverjax.tensors.matrices import (
     Matrix,
     Vector,
     add_matrices,
+    deformation_gradient,
+    determinant,
     dot,
     matmul,
     matvec,
@@ -269,8 +271,15 @@ class Viscoelasticity(Physics):
     prony: Prony = param("1", "how it relaxes")
 
     def begin(self, start: Start) -> History:
-        """At rest."""
-        return initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
+        """Nothing is remembered. Where the body has just been brought to its positions, all of its stress is new."""
+        memory = initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
+        if memory.stress is None or not start.moved:
+            return memory
+        F = deformation_gradient(start.mesh, start.x)
+        # What is inside out has no stress to go on from.
+        whole = determinant(F) > 0
+        F = tuple(tuple(jnp.where(whole, F[i][j], float(i == j)) for j in range(3)) for i in range(3))
+        return memory._replace(stress=relaxing_stress(self.prony, self.law, F))
 
     def freeze(self, memory: History, step: Step) -> "Viscoelastic":
         """The law and its memory for the step."""

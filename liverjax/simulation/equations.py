@@ -114,7 +114,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
         forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce)]
         return sum(forces, jnp.zeros_like(x))
 
-    begin = Start(scene.mesh, x, free, force)
+    begin = Start(scene.mesh, x, free, force, moved=start is not None and scene.solve.kind == "dynamic")
     return State(x, tuple(p.begin(begin) for p in physics))
 
 

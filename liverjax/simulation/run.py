@@ -118,7 +118,8 @@ def simulate(
 
     Args:
         scene: `Scene`.
-        start: positions (V, 3) [m] to begin at, at rest, with the pressure and memory of the reference; None: the
+        start: positions (V, 3) [m] to begin at, at rest, as if brought there from the reference at this moment: no
+            stress has relaxed yet, and the fluid answers to the change of volume in the first step; None: the
             reference positions. Inverted elements need robust = "projected". A static scene then takes the start as
             a guess. If the guess is inverted or leads nowhere, the run begins at the reference positions.
         report: called on the host with the number of every finished step, for progress.

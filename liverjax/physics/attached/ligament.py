@@ -19,6 +19,9 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
+#: A fibre this little shorter than its rest length, relative to it, is not slack but rounded.
+_ROUNDED = 1e-9
+
 
 @struct
 class Ligament(Physics):
@@ -92,11 +95,13 @@ class Ligament(Physics):
         return Fibres(at=self.nodes, weights=self.weights, to=self.to, rest=rest, spring=self.stiffness / len(rest))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes are held along the fibres that end in a wall."""
+        """Nodes are held along the fibres that end in a wall and are not slack at the beginning."""
         if self.to is None:
             return np.zeros(0, int), np.zeros((0, 3))
-        f = np.asarray(self._vectors(mesh))
-        return np.asarray(self.nodes)[0], f / np.linalg.norm(f, axis=1, keepdims=True)
+        lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
+        taut = lengths >= (1 - _ROUNDED) * rest
+        f = np.asarray(self._vectors(mesh))[taut]
+        return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
 
 @jax.jit  # checks of a sweep ask for them row by row
