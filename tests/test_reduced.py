@@ -1,5 +1,8 @@
 """Reduced models: the full model in other coordinates, their structure, their error, and what they refuse."""
 
+import argparse
+import inspect
+
 import h5py
 import jax
 import jax.numpy as jnp
@@ -8,7 +11,9 @@ import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
+from liverjax.commands import reduce
 from liverjax.core.struct import replace
+from liverjax.reduced import training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
 from liverjax.reduced.run import _updated
@@ -75,15 +80,27 @@ def test_a_body_that_is_only_moved_converges():
     assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.003
 
 
+#: Numbers between and beyond those of the training.
+UNSEEN = {"law.mu": [850.0, 640.0], "body.gravity": [[0.5, -1.0, -4.0], [0.0, 3.0, 2.0]]}
+
+
 @pytest.fixture(scope="module")
 def trained() -> tuple:
-    """A viscous bar in motion, its reduced model of few rows, and numbers between and beyond them."""
+    """A viscous bar in motion, its reduced model of few rows, and positions of full runs with other numbers."""
     scene = _bar((4, 1, 1), viscosity=PRONY, solve=MOVING)
     rng = np.random.default_rng(1)
     down = rng.uniform(-5.0, -2.0, 8)
     gravity = np.stack([rng.uniform(-2, 2, 8), rng.uniform(-2, 2, 8), down], axis=1)
     rows = {"law.mu": rng.uniform(700.0, 1000.0, 8), "body.gravity": gravity}
-    return scene, lj.reduce_scene(scene, rows, most_modes=5, point_tolerance=1e-3)
+    # Full runs with other numbers are of the training's batch: they share its program.
+    numbers = {name: np.concatenate([value, UNSEEN[name]]) for name, value in rows.items()}
+    batch = lj.simulate_batch(scene, numbers)
+    with pytest.MonkeyPatch.context() as patch:
+        first = replace(batch, result=jax.tree.map(lambda a: a[:8], batch.result))
+        patch.setattr(training, "simulate_batch", lambda *_: first)
+        model = lj.reduce_scene(scene, rows, most_modes=5, point_tolerance=1e-3)
+    assert not np.any(batch.result.status)
+    return scene, model, batch.result.positions[8:]
 
 
 @pytest.mark.parametrize("runs", [1, 8, MOST_STATES // 2 + 1, 3 * MOST_STATES])
@@ -98,7 +115,7 @@ def test_states_of_all_times_are_sampled(runs):
 
 
 def test_the_reduced_force_is_the_gradient_of_the_reduced_energy(trained):
-    scene, model = trained
+    scene, model, *_ = trained
     assert np.all(np.asarray(model.weights) > 0) and len(model.points) < scene.mesh.weights.size
     # Volume is kept by a row of the least squares.
     assert float(model.weights.sum()) == pytest.approx(float(scene.mesh.volumes.sum()), rel=1e-6)
@@ -145,7 +162,7 @@ def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
 
 
 def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained):
-    scene, model = trained
+    scene, model, *_ = trained
     whole, mu = with_all_points(scene, model.modes), 800.0
     q = lj.simulate_reduced(model, scene).coordinates
     # Mirrored elements, of which this law has no force, and a body that has not moved.
@@ -158,11 +175,10 @@ def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained)
 
 
 def test_the_error_is_stated(trained):
-    scene, model = trained
+    scene, model, truths = trained
     bare = replace(model, correction=None)
-    for mu, gravity in ((850.0, (0.5, -1.0, -4.0)), (640.0, (0.0, 3.0, 2.0))):
-        own = lj.with_parameters(scene, {"law.mu": mu, "body.gravity": gravity})
-        full = lj.simulate(own).check().positions
+    for k, (mu, full) in enumerate(zip(UNSEEN["law.mu"], truths, strict=True)):
+        own = lj.with_parameters(scene, {name: value[k] for name, value in UNSEEN.items()})
         for m in (bare, model):
             found = lj.simulate_reduced(m, own)
             error = lj.reduced_error(m, own, found).error
@@ -215,13 +231,11 @@ def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
     exact = [np.tensordot(a[..., :1] + 0.3 * a[..., :1] ** 3, fields, axes=1) for a in (q, new)]
     moved = [np.linalg.norm(a, axis=-1).max(axis=(1, 2)) for a in exact]
     found = learnt_correction(Learnt(q, exact[0], moved[0], volumes, None))
-    corrected = np.stack([correction_at(found, jnp.asarray(own), None) for own in new])
+    corrected = jax.jit(jax.vmap(lambda own: correction_at(found, own, None)))(jnp.asarray(new))
     true = np.linalg.norm(corrected - exact[1], axis=-1).max(axis=(1, 2))
-    stated = [
-        float(stated_at(found, jnp.asarray(a), jnp.asarray(u), None)[-1]) for a, u in zip(new, exact[1], strict=True)
-    ]
+    stated = jax.jit(jax.vmap(lambda q, u: stated_at(found, q, u, None)))(jnp.asarray(new), jnp.asarray(exact[1]))
     within = lambda ratios: float(np.mean(np.abs(np.log(ratios)) < np.log(2)))  # noqa: E731
-    told, seen = within(np.asarray(found.ratios)), within(np.array(stated) / true)
+    told, seen = within(np.asarray(found.ratios)), within(np.asarray(stated)[:, -1] / true)
     assert told > 0.5
     # Binomial: of 80 runs left out and of 200 new ones, three standard deviations of both.
     spread = told * (1 - told) * (1 / 80 + 1 / 200)
@@ -229,7 +243,7 @@ def test_stated_errors_are_right_as_often_as_those_of_runs_left_out():
 
 
 def test_a_body_at_rest_converges_and_has_no_error_to_state(trained):
-    scene, model = trained
+    scene, model, *_ = trained
     still = lj.with_parameters(scene, {"body.gravity": jnp.zeros(3)})
     found = lj.simulate_reduced(model, still)
     # Without loads roundoff is all that is left of the forces.
@@ -260,7 +274,7 @@ def test_rows_of_the_largest_stated_errors_are_run():
 @pytest.mark.slow
 def test_the_bias_of_identified_numbers_is_stated(trained):
     """Data of a full run with known numbers; the reduced model fits them, and one more full run states how far off."""
-    scene, model = trained
+    scene, model, *_ = trained
     model, true = replace(model, correction=None), np.array([800.0, 0.35])
     names = ("law.mu", "viscosity.ratios.0")
 
@@ -282,7 +296,7 @@ def test_the_bias_of_identified_numbers_is_stated(trained):
 
 @pytest.mark.slow
 def test_derivatives_and_lanes(trained):
-    scene, model = trained
+    scene, model, *_ = trained
 
     def tip(mu):
         own = lj.with_parameters(scene, {"law.mu": mu, "viscosity.ratios.0": mu / 3000.0})
@@ -300,7 +314,7 @@ def test_derivatives_and_lanes(trained):
 
 
 def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
-    scene, model = trained
+    scene, model, *_ = trained
     q = np.random.default_rng(6).normal(size=(12, 6, 3))
     V = len(scene.mesh.points)
     fields = np.ones((2, V, 3)) * np.arange(2)[:, None, None]
@@ -327,7 +341,7 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
 
 
 def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
-    _, model = trained
+    _, model, _ = trained
     (tmp_path / "text.h5").write_text("no HDF5")
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["positions"] = np.zeros((2, 3))
@@ -413,6 +427,7 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     (tmp_path / "rows.csv").write_text("law.mu,body.gravity.2\n700,-1.2\n900,-0.8\n800,-0.4\n800,-1.0\n")
     model = ["--out", str(tmp_path / "model.h5")]
     assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "rows.csv"), *model, "--modes", "3"]) == 0
+    assert "3 modes" in (said := capsys.readouterr().out) and "no correction: too few rows" in said
     found = {}
     for name, lines in (("full", ""), ("used", 'reduced = "model.h5"'), ("refused", REFUSED)):
         (tmp_path / f"{name}.toml").write_text(SCENE + lines)
@@ -430,6 +445,16 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     assert np.allclose(found["full"][1], [0, 0, 3e-3], rtol=0, atol=1e-9)
 
 
+def test_the_command_has_the_defaults_of_the_function():
+    parsers = argparse.ArgumentParser().add_subparsers()
+    reduce.add(parsers)
+    found = parsers.choices["reduce"].parse_args(["scene.toml", "rows.csv"])
+    defaults = inspect.signature(lj.reduce_scene).parameters
+    for option, argument in (("tolerance", "tolerance"), ("modes", "most_modes"), ("runs", "runs")):
+        assert getattr(found, option) == defaults[argument].default
+
+
+@pytest.mark.slow
 def test_one_row_makes_a_model_without_correction(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "row.csv").write_text("law.mu\n800\n")

@@ -15,7 +15,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("rows", type=Path, metavar="ROWS.csv", help="a header of dotted names, one row a run")
     command.add_argument("--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="the model (model.h5)")
     command.add_argument(
-        "--tolerance", type=float, default=1e-3, metavar="X", help="part of the motions that may be left out (1e-3)"
+        "--tolerance", type=float, default=1e-4, metavar="X", help="part of the motions that may be left out (1e-4)"
     )
     command.add_argument("--modes", type=int, default=40, metavar="N", help="the most modes (40)")
     command.add_argument(

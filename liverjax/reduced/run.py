@@ -428,7 +428,8 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
-    return _reduced_run(model, scene)
+    # What the run does not need: models that differ in it alone share one program.
+    return _reduced_run(replace(model, correction=None, ranges={}), scene)
 
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
