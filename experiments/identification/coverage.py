@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
@@ -24,9 +23,9 @@ from experiments.common import RESULTS, either, plt, save
 from fitting.fits import viscoelastic
 from fitting.fits.families import models
 from fitting.fits.families.choice import contains, label_of
+from fitting.fits.honesty.moduli_errors import fitted_moduli
 from fitting.fits.viscoelastic import Fit, information_criterion
 from fitting.methods import generalised_maxwell, host
-from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import GAIN, State, accept, begin
 from fitting.readers.frequency_sweep import Sweep
@@ -254,26 +253,14 @@ def parameters(truth: Truth, names: list[str], fits: dict[str, Fits], order: np.
     return {key: float(value) for key, value in out.items()}
 
 
-def fitted_moduli(fit: Fit, sweep: Sweep) -> Estimate:
-    """G' then G'' at `LOOKED_AT` of a fit of the program, with errors by the delta method."""
-
-    def of(u):
-        if fit.kind.moduli is not None:
-            G = fit.kind.moduli(u, LOOKED_AT)
-            return jnp.concatenate([jnp.real(G), jnp.imag(G)])
-        halves = generalised_maxwell.moduli(fit.kind.maxwell(u), LOOKED_AT)
-        return (np if isinstance(u, np.ndarray) else jnp).concatenate(halves, axis=-1)
-
-    names = [f"{part} at {omega:.3g} rad/s" for part in ("storage", "loss") for omega in LOOKED_AT]
-    count, given = 2 * len(fit.storage), sweep.noise_given
-    return estimated(names, of, fit.solution, count, given, fit.kind.effective)
-
-
 def by_the_program(truth: Truth) -> dict:
-    """Coverage of the moduli by the program's choices on sweeps with noise alone: N modes, a spectrum, any model."""
+    """Coverage of the moduli by the program's choices on sweeps with noise alone.
+
+    N modes, a spectrum, the model chosen from all with its own errors, and with the choice among them, as reported.
+    """
     data, out = measured(np.random.default_rng(10), truth, 0), {}
     for k, kind in enumerate(TRUTHS):
-        inside: dict[str, list] = {"prony": [], "spectrum": [], "auto": []}
+        inside: dict[str, list] = {"prony": [], "spectrum": [], "auto_alone": [], "auto": []}
         chosen: dict[str, int] = {}
         for row in np.flatnonzero(truth.kind == k)[:OWN]:
             sweep = Sweep(OMEGA, *np.split(data[row], 2))
@@ -281,11 +268,12 @@ def by_the_program(truth: Truth) -> dict:
             dense = generalised_maxwell.spectrum(sweep)
             prony = viscoelastic.choose_modes(sweep, dense)[0]
             tried = models.every_model(sweep, "auto", prony, dense)
-            best = models.best_of_models(tried, sweep)[0]
+            best, able = models.best_of_models(tried, sweep)
+            several = best._replace(rivals=tuple(fit for fit in able if fit is not best))
             chosen[best.kind.name] = chosen.get(best.kind.name, 0) + 1
             wide = next(fit for fit in tried if fit.kind.name == "spectrum")
-            for name, fit in (("prony", prony), ("spectrum", wide), ("auto", best)):
-                found = fitted_moduli(fit, sweep)
+            for name, fit in (("prony", prony), ("spectrum", wide), ("auto_alone", best), ("auto", several)):
+                found = fitted_moduli(fit, LOOKED_AT, sweep.noise_given)
                 off = np.abs(found.values - np.concatenate([true.real, true.imag]))
                 inside[name].append(off <= found.quantile * found.standard_errors)
         out[kind] = {name: float(np.mean(rows)) for name, rows in inside.items()} | {"chosen": chosen}

@@ -113,7 +113,8 @@ def _by_the_program(data: dict) -> str:
         return ", ".join(f"{kind} {percent(found[model])}" for kind, found in own.items())
 
     return (
-        f"with `--model auto`, 95 % intervals of the moduli cover the true ones by truth: {by('auto')}; with N modes: "
+        f"with `--model auto`, 95 % intervals of the moduli cover the true ones by truth: {by('auto')} (without the "
+        f"choice of the model among the errors {by('auto_alone')}); with N modes: "
         f"{by('prony')}; with `--model spectrum` a wide spectrum {percent(own['spectrum']['spectrum'])} "
         f"({data['program']['sweeps']} sweeps of each truth, noise alone). "
     )

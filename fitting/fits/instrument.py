@@ -232,7 +232,16 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
         else (uncertainty.cautions(sweep, of, kind.name) for of in (fit.uncertainty, spread))
     )
     warnings = (*(w for w in fit.warnings if w not in old), *new)
-    return fit._replace(model=model, kind=kind, uncertainty=spread, parameters=own, warnings=warnings, details=details)
+    rivals = tuple(of_compressed_sample(other, sweep, factors) for other in fit.rivals)
+    return fit._replace(
+        model=model,
+        kind=kind,
+        uncertainty=spread,
+        parameters=own,
+        warnings=warnings,
+        details=details,
+        rivals=rivals,
+    )
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:

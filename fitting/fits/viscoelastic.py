@@ -50,6 +50,7 @@ class Fit(NamedTuple):
     details: Content
     kind: Kind = Kind()
     parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
+    rivals: tuple["Fit", ...] = ()  # the other models that it was chosen from
 
     @property
     def modes(self) -> int:
@@ -196,14 +197,21 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
     return bool(fit.converged and not uncertainty.superfluous(sweep, fit.uncertainty))
 
 
-def information_criterion(fit: Fit) -> float:
-    """Bayesian information criterion with the noise level estimated: m ln(RSS/m) + k ln m.
+def number_of_parameters(fit: Fit) -> float:
+    """The number of parameters, or the effective one where a prior holds them."""
+    return len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
 
-    k is the number of parameters, or the effective one where a prior holds them.
-    """
-    m, k = 2 * len(fit.storage), len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
-    mean_square = max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, 1e-300)
-    return float(m * np.log(mean_square) + k * np.log(m))
+
+def mean_square(fit: Fit) -> float:
+    """Mean square of the residuals of the data."""
+    m = 2 * len(fit.storage)
+    return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, 1e-300)
+
+
+def information_criterion(fit: Fit) -> float:
+    """Bayesian information criterion of k parameters with the noise level estimated: m ln(RSS/m) + k ln m."""
+    m = 2 * len(fit.storage)
+    return float(m * np.log(mean_square(fit)) + number_of_parameters(fit) * np.log(m))
 
 
 #: Mean relative residual at which a fit is exact to the digits of any data.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fitting.fits.families import models
-from fitting.fits.honesty import edges, total_error
+from fitting.fits.honesty import edges, moduli_errors, total_error
 from fitting.fits.posterior import Posterior
 from fitting.fits.simulated_rheometer import largest_shift
 from fitting.fits.viscoelastic import Fit, Kind
@@ -81,6 +81,21 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "run_time_s": fit.run_time,
         "compile_time_s": fit.compile_time,
         "details": fit.details,
+    }
+
+
+def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
+    """Moduli of a fit in closed form with their standard errors, the choice of the model among them."""
+    found = moduli_errors.fitted_moduli(fit, sweep.angular_frequency, sweep.noise_given)
+    storage, loss = np.split(found.values, 2)
+    errors = np.split(found.standard_errors, 2)
+    return {
+        "angular_frequency": sweep.angular_frequency.tolist(),
+        "storage": storage.tolist(),
+        "loss": loss.tolist(),
+        "standard_errors": {"storage": errors[0].tolist(), "loss": errors[1].tolist()},
+        "interval_quantile_95": found.quantile,
+        "weights_of_models": moduli_errors.model_weights(fit),
     }
 
 
@@ -161,6 +176,7 @@ def write(
     out.mkdir(parents=True, exist_ok=True)
     main = fits[-1]
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
+    content["moduli"] = moduli_rows(fits[0], sweep)
     content["band_sensitivity"] = band_sensitivity(fits[0])
     content["total_errors"] = by_stem(total_error.total_errors(main))
     content["error_shares"] = {source: by_stem(part) for source, part in total_error.error_shares(main).items()}
@@ -245,13 +261,16 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
         ("G'", sweep.storage, sweep.storage_sd, fit.storage, BLUE, lines[0], "o", "x"),
         ("G''", sweep.loss, sweep.loss_sd, fit.loss, ORANGE, lines[1], "s", "+"),
     )
+    bands = _bands(closed, sweep)
     for symbol, data, sd, fitted, colour, line, marker, cross in rows:
         if sd is not None:  # a bar below zero has no place on a log axis
             low = np.minimum(sd, 0.9 * data)
             top.errorbar(f, data, yerr=[low, sd], fmt="none", ecolor=colour, alpha=0.35, capsize=2)
         measured = f"{symbol} measured" + ("" if sd is None else " ± sd")
         top.plot(f, data, marker, color=colour, ms=4, mfc="none", label=measured)
-        top.plot(fine, line, "-", color=colour, lw=1.2, label=f"{symbol} closed form")
+        top.plot(fine, line, "-", color=colour, lw=1.2, label=f"{symbol} closed form" + (" and 95 %" if bands else ""))
+        if symbol in bands:
+            top.fill_between(f, *bands[symbol], color=colour, alpha=0.2, lw=0)
         if fit.method == "torsion":
             top.plot(f, fitted, cross, color="black", ms=5, label=f"{symbol} simulated")
         rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
@@ -269,6 +288,16 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
         rest.text(1.05 * f[-1], 0.02, "instrument", fontsize=7, **place)
     rest.axhline(0, color=GREY, lw=0.8)
     rest.set(xscale="log", xlabel="frequency [Hz]", ylabel="fit - data [%]")
+
+
+def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Ends of the 95 % intervals of G' and G'' at the data; none of a compressed sample, which shows other moduli."""
+    if "precompression" in closed.details:
+        return {}
+    found = moduli_errors.fitted_moduli(closed, sweep.angular_frequency, sweep.noise_given)
+    half = found.quantile * np.where(np.isfinite(found.standard_errors), found.standard_errors, 0.0)
+    low, high = (np.split(end, 2) for end in (np.maximum(found.values - half, 0.1 * found.values), found.values + half))
+    return {symbol: (low[k], high[k]) for k, symbol in enumerate(("G'", "G''"))}
 
 
 def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

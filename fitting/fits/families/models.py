@@ -12,7 +12,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.families.choice import contains, label_of, preferred
-from fitting.fits.viscoelastic import Fit, Kind, information_criterion
+from fitting.fits.viscoelastic import Fit, Kind, information_criterion, number_of_parameters
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Spectrum
@@ -212,6 +212,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
         run_time=sum(fit.run_time for fit in tried),
         compile_time=sum(fit.compile_time for fit in tried),
         details=chosen.details | {"models_compared": _compared(sweep, tried)},
+        rivals=tuple(fit for fit in able if fit is not chosen),
     )
 
 
@@ -221,7 +222,7 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
     rows = [
         {
             "model": fit.kind.name,
-            "parameters": len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective,
+            "parameters": number_of_parameters(fit),
             "modes": fit.modes,
             "information_criterion": information_criterion(fit),
             "above_the_lowest": information_criterion(fit) - best,

@@ -1,0 +1,70 @@
+"""Errors of the fitted moduli, the choice of the model among them.
+
+Models that explain the data about as well have moduli of their own. Each weighs by its Akaike weight, and the
+differences between them are part of the error (Buckland, Burnham and Augustin 1997, Biometrics 53, 603; for few data
+Hurvich and Tsai 1989, Biometrika 76, 297).
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from fitting.fits.viscoelastic import Fit, mean_square, number_of_parameters
+from fitting.methods import generalised_maxwell
+from fitting.methods.estimate import Estimate, errors_and_correlation, estimated, wider
+from fitting.methods.host import Array
+
+#: Weight below which a model is left out.
+NEGLIGIBLE = 1e-4
+
+
+def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
+    """G' then G'' (2n,) [Pa] of a fit in closed form, by the delta method.
+
+    Args:
+        fit: with `rivals`, where it was chosen from several models.
+        omega: angular frequencies (n,) [rad/s].
+        noise_given: whether the data have standard deviations.
+    """
+    found = _of_one_model(fit, omega, noise_given)
+    others = [(w, _of_one_model(other, omega, noise_given)) for w, other in _weighed(fit)]
+    if others:
+        own = 1 - sum(weight for weight, _ in others)
+        columns = [np.sqrt(own) * found.root]
+        for weight, other in others:
+            columns += [np.sqrt(weight) * other.root, np.sqrt(weight) * (other.values - found.values)[:, None]]
+        root = np.concatenate(columns, axis=1)
+        errors, correlation = errors_and_correlation(root)
+        found = found._replace(root=root, standard_errors=errors, correlation=correlation)
+    return wider(found, fit.details["gap_error"] * found.values) if "gap_error" in fit.details else found
+
+
+def model_weights(fit: Fit) -> dict[str, float]:
+    """Weight of each model [1] in the errors of the moduli, by its name: the chosen one first; empty without others."""
+    others = {other.kind.name: weight for weight, other in _weighed(fit)}
+    return {fit.kind.name: 1 - sum(others.values())} | others if others else {}
+
+
+def _weighed(fit: Fit) -> list[tuple[float, Fit]]:
+    """The rivals that weigh anything, with their weights."""
+    evidence = np.array([_akaike(own) for own in (fit, *fit.rivals)])
+    shares = np.exp(-0.5 * (evidence - evidence.min()))
+    shares /= shares.sum()
+    return [(float(w), own) for w, own in zip(shares[1:], fit.rivals, strict=True) if w > NEGLIGIBLE]
+
+
+def _akaike(fit: Fit) -> float:
+    """Akaike's criterion with the correction for few data."""
+    m, k = 2 * len(fit.storage), number_of_parameters(fit)
+    return float(m * np.log(mean_square(fit)) + 2 * k * m / max(1.0, m - k - 1))
+
+
+def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
+    def of(u: Array) -> Array:
+        if fit.kind.moduli is not None:
+            G = fit.kind.moduli(u, omega)
+            return jnp.concatenate([jnp.real(G), jnp.imag(G)])
+        halves = generalised_maxwell.moduli(fit.kind.maxwell(u), omega)
+        return (np if isinstance(u, np.ndarray) else jnp).concatenate(halves, axis=-1)
+
+    names = [f"{part} at {at:.3g} rad/s" for part in ("storage", "loss") for at in omega]
+    return estimated(names, of, fit.solution, 2 * len(fit.storage), noise_given, fit.kind.effective)

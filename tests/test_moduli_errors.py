@@ -1,0 +1,91 @@
+"""Errors of fitted moduli: those of repeated measurements, and the choice of the model among them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fitting.__main__ import main
+from fitting.fits import instrument, viscoelastic
+from fitting.fits.families import models
+from fitting.fits.honesty import moduli_errors
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
+
+pytestmark = pytest.mark.quick_to_compile
+
+OMEGA, NOISE = np.geomspace(0.1, 100, 31), 0.02
+MODE = Maxwell(np.float64(700.0), np.array([0.5]), np.array([0.3]))
+
+
+def measured(G: np.ndarray, seed: int) -> Sweep:
+    """Complex moduli with noise, which the file does not state."""
+    halves = np.stack([G.real, G.imag])
+    return Sweep(OMEGA, *(halves * (1 + NOISE * np.random.default_rng(seed).standard_normal(halves.shape))))
+
+
+def one_mode(seed: int) -> Sweep:
+    storage, loss = generalised_maxwell.moduli(MODE, OMEGA)
+    return measured(storage + 1j * loss, seed)
+
+
+def test_of_one_model_they_are_those_of_repeated_measurements():
+    at, repeats = np.array([0.1, 3.0, 300.0]), 80  # the last is beyond the band
+    found = [moduli_errors.fitted_moduli(viscoelastic.closed_form(one_mode(k), 1), at, False) for k in range(repeats)]
+    spread = np.std([f.values for f in found], axis=0, ddof=1)
+    stated = np.mean([f.standard_errors for f in found], axis=0)
+    # A deviation from 80 draws is good to 1 in sqrt(2 * 79): four times that.
+    assert np.all(np.abs(spread / stated - 1) < 4 / np.sqrt(2 * (repeats - 1)))
+
+
+@pytest.fixture(scope="module")
+def chosen() -> viscoelastic.Fit:
+    """A solid whose equilibrium modulus is too small for the noise; a fluid and a spectrum follow the data, too."""
+    model = Maxwell(np.float64(700.0), np.array([0.999]), np.array([3.0]))
+    storage, loss = generalised_maxwell.moduli(model, OMEGA)
+    sweep = measured(storage + 1j * loss, 3)
+    dense = generalised_maxwell.spectrum(sweep)
+    rivals = (models.fluid(sweep, dense), models.spectrum_fit(sweep))
+    return viscoelastic.closed_form(sweep, 1)._replace(rivals=rivals)
+
+
+def test_the_choice_of_the_model_is_among_them(chosen):
+    """Buckland's formula by hand: variances and squared differences by weight."""
+    weights = moduli_errors.model_weights(chosen)
+    assert len(weights) > 1 and sum(weights.values()) == pytest.approx(1, abs=1e-3)
+    assert next(iter(weights)) == chosen.kind.name and all(0 < w < 1 for w in weights.values())
+    alone = {f.kind.name: f._replace(rivals=()) for f in (chosen, *chosen.rivals)}
+    each = {name: moduli_errors.fitted_moduli(alone[name], OMEGA, False) for name in weights}
+    values = each[chosen.kind.name].values
+    variance = sum(w * (each[n].standard_errors ** 2 + (each[n].values - values) ** 2) for n, w in weights.items())
+    found = moduli_errors.fitted_moduli(chosen, OMEGA, False)
+    np.testing.assert_array_equal(found.values, values)
+    np.testing.assert_allclose(found.standard_errors, np.sqrt(variance), rtol=1e-10)
+    # Corrected for few data, from sums of squares alone.
+    rss = [np.sum(np.asarray(f.solution.residuals)[:62] ** 2) for f in alone.values()]
+    k = [len(f.solution.u) if f.kind.effective is None else f.kind.effective for f in alone.values()]
+    aicc = np.array([62 * np.log(s / 62) + 2 * n + 2 * n * (n + 1) / (62 - n - 1) for s, n in zip(rss, k, strict=True)])
+    by_hand = np.exp(-0.5 * (aicc - aicc.min()))
+    by_hand = dict(zip(alone, by_hand / by_hand.sum(), strict=True))
+    assert all(weights[name] == pytest.approx(by_hand[name], abs=1e-3) for name in weights)
+
+
+def test_the_error_of_the_gap_is_in_all_of_them(chosen):
+    alone, wide = chosen, instrument.with_gap_error(chosen, 0.03)
+    a, b = (moduli_errors.fitted_moduli(fit, OMEGA, False) for fit in (alone, wide))
+    np.testing.assert_allclose(b.standard_errors, np.hypot(a.standard_errors, 0.03 * a.values), rtol=1e-12)
+
+
+def test_fit_json_has_them(tmp_path):
+    sweep = one_mode(0)
+    rows = [f"{w:.12g},{a:.12g},{b:.12g}" for w, a, b in zip(*sweep[:3], strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["angular_frequency_rad/s,storage_Pa,loss_Pa", *rows]) + "\n")
+    asked = ["--method", "closed-form", "--modes", "1", "--out", str(tmp_path / "out")]
+    assert main([str(tmp_path / "a.csv"), *asked]) == 0
+    content = json.loads((tmp_path / "out" / "fit.json").read_text())["moduli"]
+    exact = generalised_maxwell.moduli(MODE, np.array(content["angular_frequency"]))
+    for name, true in zip(("storage", "loss"), exact, strict=True):
+        off = np.abs(np.array(content[name]) - true) / np.array(content["standard_errors"][name])
+        assert 0 < off.max() < 5
+    assert content["weights_of_models"] == {}
