@@ -18,6 +18,7 @@ from liverjax.reduced.correction import Learnt, _least_squares, correction_at, l
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
 from liverjax.reduced.run import _updated
 from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
+from liverjax.reduced.tangent import ReducedTangent, in_single_precision, solved_by_tangent, tangent_matrix
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -159,6 +160,27 @@ def test_an_inverse_follows_the_forces_and_stays_symmetric_and_positive():
     assert np.array_equal(found, found.T) and np.linalg.eigvalsh(found)[0] > 0
     assert np.array_equal(_updated(jnp.asarray(inverse), jnp.asarray(moved), -jnp.asarray(change)), inverse)
     assert np.array_equal(_updated(jnp.asarray(inverse), jnp.zeros(6), jnp.zeros(6)), inverse)
+
+
+@pytest.mark.parametrize("small", [1e-1, 1e-9])
+def test_solves_are_exact_though_the_inverse_is_near(small):
+    """Also where the matrix has so small an eigenvalue that single precision loses it."""
+    rng, n, S = np.random.default_rng(2), 8, 20
+    half, slopes = rng.normal(size=(9, 9, S)), rng.normal(size=(9, S, n))
+    slopes[..., -1] = slopes[..., 0] + np.sqrt(small) * slopes[..., -1]
+    moduli = jnp.asarray(np.einsum("iks,jks->ijs", half, half))
+    b = jnp.asarray(rng.normal(size=n))
+
+    def both(stiffer):
+        K = ReducedTangent(jnp.asarray(slopes), stiffer * moduli, jnp.zeros((n, n)))
+        return solved_by_tangent(K, in_single_precision(K.slopes), b), tangent_matrix(K)
+
+    (x, K), (change, _) = jax.jit(lambda one: jax.jvp(both, (one,), (one,)))(jnp.ones(()))
+    exact = np.linalg.solve(K, b)
+    # Roundoff times the condition number, some thousands over the small number.
+    limit = 1e-12 / small * np.abs(exact).max()
+    assert np.allclose(x, exact, rtol=0, atol=limit)
+    assert np.allclose(change, -exact, rtol=0, atol=limit)
 
 
 def test_a_state_that_is_inside_out_or_at_rest_has_no_say_in_the_points(trained):

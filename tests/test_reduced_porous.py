@@ -17,6 +17,7 @@ from liverjax.physics.porosity import Inlet
 from liverjax.reduced import run, training
 from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points
 from liverjax.reduced.model import with_all_points
+from liverjax.reduced.tangent import in_single_precision, tangent_matrix
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -95,11 +96,12 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     elastic = replace(scene, viscosity=None, porosity=None)
     acting = run.solid_at_points(model, elastic).freeze(None, None)
     rest, none = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)), jnp.zeros(n)
-    e = run._Equations(model, acting, none, rest, None, none, None, jnp.asarray(0.05), None, None, 0.0, fluid)
+    light = in_single_precision(model.slopes)
+    e = run._Equations(model, acting, none, rest, None, none, None, jnp.asarray(0.05), None, None, 0.0, fluid, light)
     q = jnp.asarray(1e-4 * rng.normal(size=n))
     # One program: by themselves the operations take ten times as long to compile.
     exact = jax.jit(jax.jacfwd(lambda q: run._residual(e, q, run._deformation(e, q))[0]))(q)
-    found = jax.jit(lambda q: run._reduced_tangent(e, q))(q)
+    found = jax.jit(lambda q: tangent_matrix(run._reduced_tangent(e, q)))(q)
     assert np.allclose(found, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
     assert np.allclose(found, found.T, rtol=0, atol=1e-12 * np.abs(exact).max())
 
@@ -177,6 +179,9 @@ def test_derivatives_by_numbers_of_the_fluid(trained):
     errors = np.abs((lanes[:7] - lanes[7:]) / (2 * steps) / found - 1)
     # Second order, then the run's tolerance: the curve falls and rises.
     assert errors.min() < 1e-6 and errors[0] > 1e3 * errors.min() and errors[-1] > errors.min()
+    slope = jax.jit(jax.grad(tip))
+    second = (slope(2.001) - slope(1.999)) / 0.002
+    assert jax.jit(jax.hessian(tip))(2.0) == pytest.approx(float(second), rel=1e-4)
 
 
 def test_files_keep_the_pressure_and_other_fluids_are_refused(trained, tmp_path):

@@ -11,8 +11,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.versions import versions
 from liverjax.reduced.correction import Correction
-from liverjax.reduced.model import ReducedModel
-from liverjax.reduced.pressure_modes import PressureModes
+from liverjax.reduced.model import PressureModes, ReducedModel
 
 if TYPE_CHECKING:
     import h5py

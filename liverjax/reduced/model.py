@@ -16,6 +16,8 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.laws import Law
+from liverjax.mesh.basis import basis
+from liverjax.mesh.nodal import interpolated
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Physics
 from liverjax.physics.elasticity import Elasticity
@@ -23,11 +25,21 @@ from liverjax.physics.loads import follows
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.reduced.correction import Correction
-from liverjax.reduced.pressure_modes import PressureModes, pressure_modes
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import Matrix, deformation_gradient
+from liverjax.tensors.places import taken
+
+
+@struct
+class PressureModes:
+    """m modes of the fluid's pressure, which vanish where it is drained, and their values at the points."""
+
+    modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
+    values: jax.Array = param("1", "at the points (S, m)")
+    parts: jax.Array = param("1", "at the vertices of each point's element, times the root of their part (m, 4, S)")
+    slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
 
 
 @struct
@@ -58,6 +70,21 @@ def flat_gradient(mesh: TetMesh, x: jax.Array) -> jax.Array:
 def as_matrix(flat: jax.Array) -> Matrix:
     """A tuple matrix from its nine entries (9, S)."""
     return tuple(tuple(flat[3 * i + j] for j in range(3)) for i in range(3))
+
+
+def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
+    """Modes (m, V) of the vertices, with their values at all points."""
+    L = jnp.full((4, 1), 0.25) if mesh.order == 1 else jnp.asarray(basis(mesh.order).L)
+
+    def at_points(mode: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        corner = jnp.stack([taken(mode, mesh.tetrahedra[:, a]) for a in range(4)])
+        parts = (jnp.sqrt(L)[:, :, None] * corner[:, None]).reshape(4, -1)
+        slope = jnp.sum((corner[1:] - corner[:1])[:, None] * mesh.shape_vectors, axis=0)
+        slopes = jnp.broadcast_to(slope[:, None], (3, L.shape[1], slope.shape[1]))
+        return interpolated(mesh, mode).ravel(), parts, slopes.reshape(3, -1)
+
+    values, parts, slopes = jax.lax.map(at_points, modes)
+    return PressureModes(modes=modes, values=values.T, parts=parts, slopes=slopes)
 
 
 def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None = None) -> ReducedModel:

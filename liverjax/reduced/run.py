@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
@@ -38,6 +39,13 @@ from liverjax.reduced.model import (
     refuse_another_scene,
     solid_at_points,
 )
+from liverjax.reduced.tangent import (
+    ReducedTangent,
+    SinglePrecision,
+    in_single_precision,
+    near_inverse,
+    solved_by_tangent,
+)
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import check_before_run
 from liverjax.tensors.matrices import IDENTITY, add_matrices, determinant
@@ -65,10 +73,12 @@ class ReducedResult:
 
 
 class ReducedMotion(NamedTuple):
-    """Velocity and acceleration of the coordinates (n,)."""
+    """Velocity and acceleration of the coordinates (n,), and how the acceleration goes on."""
 
     velocity: jax.Array  # [m/s]
     acceleration: jax.Array  # [m/s^2]
+    change: jax.Array  # of the acceleration in the last step [m/s^2]
+    steady: jax.Array  # that change is nearer to the change before it than to zero
 
 
 class _Given(NamedTuple):
@@ -93,6 +103,7 @@ class _Equations(NamedTuple):
     spread: jax.Array | None  # sizes of the slopes (9, S, n) [1/m] where a part of the body is moved
     noise: jax.Array  # size of forces whose roundoff is the tolerance [N]: no load leaves only these
     fluid: Flowing | None  # of a porous scene
+    light: SinglePrecision
 
 
 def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
@@ -103,7 +114,9 @@ def _kinematics(e: _Equations, q: jax.Array) -> ReducedMotion:
     if e.newmark:
         acceleration = 4 * acceleration - e.motion.acceleration
         velocity = e.motion.velocity + 0.5 * e.dt * (e.motion.acceleration + acceleration)
-    return ReducedMotion(velocity, acceleration)
+    change = acceleration - e.motion.acceleration
+    steady = jnp.linalg.norm(change - e.motion.change) < jnp.linalg.norm(change)
+    return ReducedMotion(velocity, acceleration, change, steady)
 
 
 def _deformation(e: _Equations, q: jax.Array) -> jax.Array:
@@ -142,9 +155,9 @@ def _residual(e: _Equations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax
     return r, size
 
 
-def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
-    """Derivative of the residual (n, n): the elements' own blocks, with the axes for shape vectors."""
-    B, F = e.model.slopes, _deformation(e, q)
+def _reduced_tangent(e: _Equations, q: jax.Array) -> ReducedTangent:
+    """Derivative of the residual: the elements' own blocks, with the axes for shape vectors."""
+    F = _deformation(e, q)
     blocks = e.acting.blocks(as_matrix(F), list(IDENTITY), _PAIRS)
     if e.fluid is not None:
         more = volume_blocks(e.model, e.fluid, as_matrix(F), _PAIRS)
@@ -155,13 +168,12 @@ def _reduced_tangent(e: _Equations, q: jax.Array) -> jax.Array:
             for c in range(3):
                 A[3 * r + i][3 * c + j] = A[3 * c + j][3 * r + i] = jnp.broadcast_to(K[r][c], F.shape[1:])
     moduli = e.model.weights[None, None] * jnp.stack([jnp.stack(row) for row in A])
-    AB = jnp.sum(moduli[..., None] * B[None], axis=1)
-    elastic = jnp.tensordot(B, AB, axes=((0, 1), (0, 1)))
+    rest = jnp.zeros((len(q), len(q)), q.dtype)
     if e.fluid is not None:
-        elastic = elastic + stiffness_of_pressures(e.model, e.fluid, as_matrix(F))
-    if e.mass is None:
-        return elastic
-    return elastic + FACTOR["newmark" if e.newmark else "euler"] / e.dt**2 * e.mass
+        rest = rest + stiffness_of_pressures(e.model, e.fluid, as_matrix(F))
+    if e.mass is not None:
+        rest = rest + FACTOR["newmark" if e.newmark else "euler"] / e.dt**2 * e.mass
+    return ReducedTangent(e.model.slopes, moduli, rest)
 
 
 class _Found(NamedTuple):
@@ -277,13 +289,15 @@ def _solved(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse:
         return jax.lax.while_loop(going, lambda at: _corrected(e, at), at._replace(slow=jnp.array(False)))
 
     def refreshed(at: _ReducedIterate) -> _ReducedIterate:
-        own = jnp.linalg.inv(_reduced_tangent(e, at.q))
+        own = near_inverse(_reduced_tangent(e, at.q), e.light)
         return at._replace(inverse=own, fresh=jnp.array(True), tangents=at.tangents + 1)
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # A parabola through the last coordinates. Accelerations of Newmark's method ring: they foretell nothing.
-        start = start + e.dt**2 * e.motion.acceleration
+        # A parabola or a cubic through the last coordinates: that which would have foretold the step before better.
+        # Accelerations of Newmark's method ring: they foretell nothing.
+        more = jnp.where(e.motion.steady, e.motion.change, 0.0)
+        start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = _deformation(e, start), jnp.zeros((), jnp.int32)
     good = _upright(foretold)
     start = jnp.where(good, start, e.q)
@@ -299,17 +313,24 @@ def _solved(newmark: bool, most: int, e: _Equations, tolerance: Number, inverse:
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 
-@_newton.defjvp
+@partial(_newton.defjvp, symbolic_zeros=True)
 def _newton_derivative(newmark: bool, most: int, primals: tuple, tangents: tuple) -> tuple[_Found, _Found]:
     e, de = primals[0]._replace(newmark=newmark), tangents[0]
     found = _newton(newmark, most, *primals)
     without = e._replace(newmark=None)
 
-    def forces(e: _Equations) -> jax.Array:
+    # Derivatives by what is differentiated alone: those by the slopes would take longer than all the others.
+    numbers, tree = jax.tree.flatten(without)
+    changes = jax.tree.leaves(de)
+    live = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
+
+    def forces(values: list[jax.Array]) -> jax.Array:
+        own = dict(zip(live, values, strict=True))
+        e = jax.tree.unflatten(tree, [own.get(k, number) for k, number in enumerate(numbers)])
         return _residual(e._replace(newmark=newmark), found.q, _deformation(e, found.q))[0]
 
-    change = jax.jvp(forces, (without,), (de,))[1]
-    dq = -jnp.linalg.solve(_reduced_tangent(e, found.q), change)
+    change = jax.jvp(forces, ([numbers[k] for k in live],), ([changes[k] for k in live],))[1]
+    dq = -solved_by_tangent(_reduced_tangent(e, found.q), e.light, change)
     whole = np.zeros((), jax.dtypes.float0)
     return found, _Found(dq, jnp.zeros_like(found.residual), whole, jnp.zeros_like(found.inverse))
 
@@ -363,7 +384,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
     mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
     newmark = scene.solve.integrator == "newmark"
-    motion = ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q)
+    motion = ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q, q, jnp.array(False))
     return q, memory, fluid, motion, inverse, mass
 
 
@@ -373,6 +394,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
+    light = in_single_precision(model.slopes)
     noise, sponge = _noise(model, scene), None if scene.porosity is None else porosity_at_points(model, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
@@ -382,7 +404,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
         newmark = solve.integrator == "newmark"
         load, gradient = given
         flow = None if sponge is None else flowing(model, sponge, fluid, solve.dt)
-        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise, flow)
+        e = _Equations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise, flow, light)
         found = _newton(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
         flat = _deformation(e, found.q)
