@@ -152,6 +152,8 @@ def test_bad_histories_are_refused(table, words):
         (b"# alone\n\n", "is empty"),
         (b"time;factor\n0,0;0,5\n1,0;1,0\n", "has rows of different lengths: .* commas between them and points"),
         (b"time,factor\n0,0\n1\n", "has rows of different lengths"),
+        (b"time;factor\n0;1\n1;2\n", "has one column: .* commas between them"),
+        (b"time\tfactor\n0\t1\n1\t2\n", "has one column"),
         (b"\xff\xfe\x00", "is not text"),
         (b"time,force\n0,0\n1,1\n", "has columns"),
         (b"time,factor\n0,zero\n1,1\n", "must hold finite numbers"),

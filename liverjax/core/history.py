@@ -58,10 +58,11 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         raise InputError(f"{name} history {path} is empty: give columns {wanted}")
-    if len({line.count(",") for line in lines}) > 1:
+    commas = {line.count(",") for line in lines}
+    if len(commas) > 1 or commas == {0}:
+        why = "has rows of different lengths" if len(commas) > 1 else "has one column"
         raise InputError(
-            f"{name} history {path} has rows of different lengths: give columns {wanted}, with commas between them and "
-            "points in numbers"
+            f"{name} history {path} {why}: give columns {wanted}, with commas between them and points in numbers"
         )
     data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
     found = next((kind for kind in kinds if set(kind) <= set(data.dtype.names or ())), None)
