@@ -23,6 +23,7 @@ from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.correction import correction_at, stated_at
 from liverjax.reduced.fluid import (
     Flowing,
+    ReducedFluid,
     advanced_fluid,
     flowing,
     fluid_at_rest,
@@ -384,8 +385,18 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
     mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
     newmark = scene.solve.integrator == "newmark"
+    if newmark and fluid is not None and scene.porosity is not None and scene.porosity.initial_pressure is not None:
+        load = load - _forces_of_fluid(model, scene, fluid)
     motion = ReducedMotion(q, jnp.linalg.solve(mass, load) if newmark else q, q, jnp.array(False))
     return q, memory, fluid, motion, inverse, mass
+
+
+def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
+    """Forces (n,) [N] of a given pressure at rest, as of `liverjax.simulation.equations.initial_state`."""
+    sponge = porosity_at_points(model, scene)
+    flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))
+    p = pressure_coordinates(flow, flow.J)
+    return jnp.tensordot(model.weights[None] * volume_stress(model, sponge, p, fluid.F), model.slopes, axes=2)
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
