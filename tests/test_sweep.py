@@ -269,6 +269,18 @@ def test_rows_are_checked_as_the_scene_is(files, column, value, words):
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 
+def test_rows_that_nothing_holds_are_refused(files):
+    """Fibres of 5 cm and more hold the body up; longer ones at rest are slack."""
+    own = PARTS[PARTS.index("[[ligament]]") :].replace("pre_tension = 0.05", "rest_length = 0.04")
+    loose = SCENE.replace("z_min = 0.1", "x_max = 0.0") + own
+    (files / "scene.toml").write_text(loose.replace("[solve]", 'axes = "xy"\n[solve]'))
+    (files / "rows.csv").write_text("ligament.0.rest_length\n0.04\n0.2\n")
+    with pytest.raises(lj.InputError, match="row 2: nothing holds the body"):
+        sweep.read_sweep(files / "scene.toml", files / "rows.csv")
+    (files / "scene.toml").write_text(loose)  # held along z too
+    assert len(sweep.read_sweep(files / "scene.toml", files / "rows.csv").rows) == 2
+
+
 def test_what_cannot_be_resumed_is_refused(files, capsys):
     table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)
     out = files / "rows.h5"

@@ -27,7 +27,7 @@ from liverjax.core.versions import versions
 from liverjax.jobs import resumable_parts
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
-from liverjax.scenes.scene_checks import check_numbers, check_physics
+from liverjax.scenes.scene_checks import check_hold, check_numbers, check_physics, holding
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import simulate_batch
 
@@ -84,12 +84,14 @@ def read_sweep(
         if np.shape(numbers_at(scene, name)):
             raise InputError(f"parameter {name!r} is no number of the scene file: it is a list, name one number of it")
     parts = {".".join(name.split(".")[:2]) for name in names}
+    held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):
         values = dict(zip(names, row, strict=True))
         try:
             own = with_parameters(scene, values)
             check_numbers(own)
             check_physics(own, parts)
+            check_hold(own, held)
         except InputError as error:
             raise InputError(f"{parameters}: row {k + 1}: {error}") from None
     for name in outputs:

@@ -225,6 +225,23 @@ def check_scene(scene: Scene) -> None:
         _held(scene)
 
 
+def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
+    """How many directions of nodes each of the further physics holds at the beginning, by names as `check_physics`."""
+    named = [(name, physics) for name, physics in _named_physics(scene) if only is None or name in only]
+    return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
+
+
+def check_hold(scene: Scene, before: dict[str, int]) -> None:
+    """Refuse numbers with which physics hold a body at rest less than `before` (see `holding`), and too little.
+
+    Raises:
+        InputError: nothing holds a connected piece any more.
+    """
+    still = scene.solve.kind == "static" or scene.points_are == "loaded"
+    if still and any(number < before[name] for name, number in holding(scene, before).items()):
+        _held(scene)
+
+
 def _places(scene: Scene) -> None:
     """Refuse node numbers and triangles that are not in the mesh."""
     mesh = scene.mesh
