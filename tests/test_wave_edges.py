@@ -178,7 +178,7 @@ def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, verifi
 
 @pytest.mark.slow
 def test_intervals_of_a_map_hold_the_truth_beside_edges():
-    """The map is linear in its bricks and sees no edge: without the place within a brick too few voxels are held."""
+    """The map is linear in its bricks and sees no edge: without the place within its slopes too few voxels are held."""
     field = beside_a_cylinder(0.006, (3e-4, -4e-4), 2e-3, 100.0)
     own = organ_of(field)
     found = elastography.regions_of(own._replace(field=field._replace(labels=None)))

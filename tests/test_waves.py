@@ -288,18 +288,19 @@ def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
         stiffness_map._first_or_resumed(different, file)
 
 
-def test_changes_over_a_brick_are_those_of_a_linear_field():
+def test_changes_over_a_slope_are_those_of_a_linear_field():
+    """Over the length, and over a brick's side where that is longer."""
     spacing = np.array([1e-3, 2e-3, 3e-3])
     body = voxels.voxel_body(np.ones((7, 7, 9), bool), spacing)
     a = np.array([3.0, -2.0, 5.0 + 1j])
     field = np.asarray(body.linear.points) @ a + 7
-    slopes = stiffness_map._changes_over_bricks(body, stiffness_map._mean_of_corners(body))
-    for D, expected in zip(slopes, a * 2 * spacing, strict=True):
+    slopes = stiffness_map._changes_over_slopes(body, stiffness_map._mean_of_corners(body), 0.005)
+    for D, expected in zip(slopes, a * [0.005, 0.005, 0.006], strict=True):
         np.testing.assert_allclose(D @ field, expected, rtol=1e-9)
 
 
 def test_samples_of_the_map_scatter_as_its_deviations_say():
-    """Of 400 samples the deviation is known to 3.5 %. It is of the posterior and of the place within a brick."""
+    """Of 400 samples the deviation is known to 3.5 %. It is of the posterior and of the place."""
     own = organ(noise=5e-7)
     course = stiffness_map.course_of(own.body, own.matrices, own.waves, 1.3 * modulus(HERTZ), 0.01)
     drawn = stiffness_map.map_of(course, draws=400)

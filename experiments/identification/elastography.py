@@ -8,6 +8,7 @@ The voxels have 2 mm (the published ones 1 mm), with noise of 2 % of the motion'
 ``python -m experiments elastography`` (5 minutes) writes results/elastography.json and elastography.png.
 """
 
+import itertools
 import time
 
 import numpy as np
@@ -24,6 +25,8 @@ CYLINDERS = (((0.025, 0.07), 0.010), ((0.055, 0.07), 0.005), ((0.025, 0.03), 0.0
 HERTZ = np.array(either([50.0, 75.0, 100.0], [100.0]))
 VOXEL, NOISE = 2e-3, 0.02
 VOXELS = either((39, 49, 5), (19, 25, 5))
+#: Ends [m] of the distances from the nearest edge for which intervals are looked at, inside negative.
+ENDS = (-np.inf, -4e-3, -2e-3, 0.0, 2e-3, 4e-3, 8e-3, np.inf)
 
 
 def stiff_part(xy: np.ndarray) -> np.ndarray:
@@ -71,18 +74,32 @@ def measured() -> tuple[WaveField, np.ndarray]:
     return field._replace(noise=noise_of(field)), part
 
 
-def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> dict[str, list[float]]:
-    """Part of the voxels whose true modulus is in the 90 % interval, at every frequency."""
-    out: dict[str, list[float]] = {"storage": [], "loss": []}
-    sd = waves_report.at_voxels(organ, drawn.sd)
+def held(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the true storage and loss modulus are in the 90 % interval (2, F, known voxels), and those voxels' (n, 2)
+    places [m]."""
+    sd, out = waves_report.at_voxels(organ, drawn.sd), []
+    known = np.isfinite(sd)
     for f, hertz in enumerate(HERTZ):
         G = waves_report.at_voxels(organ, drawn.modulus[f])
         exact = SOFT + (STIFF - SOFT) * part + 2j * np.pi * hertz * VISCOSITY
-        known = np.isfinite(sd)
         off, allowed = (G - exact)[known], 1.645 * stiffness_map.sd_of_modulus(G, sd)[known]
-        out["storage"].append(float(np.mean(np.abs(off.real) < allowed.real)))
-        out["loss"].append(float(np.mean(np.abs(off.imag) < allowed.imag)))
-    return out
+        out.append((np.abs(off.real) < allowed.real, np.abs(off.imag) < allowed.imag))
+    places = organ.field.origin[:2] + VOXEL * np.argwhere(known)[:, :2]
+    return np.moveaxis(np.array(out), 1, 0), places
+
+
+def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> dict:
+    """Part of the voxels whose true modulus is in the 90 % interval: of all at every frequency, and by the distance
+    from the nearest edge of all frequencies."""
+    inside, places = held(organ, drawn, part)
+    distance = np.min([np.hypot(*(places - np.array(c)).T) - r for c, r in CYLINDERS], axis=0)
+    rows = []
+    for low, high in itertools.pairwise(ENDS):
+        near = (distance >= low) & (distance < high)
+        ends = {"from_m": None if np.isinf(low) else low, "to_m": None if np.isinf(high) else high}
+        if near.any():
+            rows.append(ends | {"voxels": int(near.sum()), "storage": float(inside[0][:, near].mean())})
+    return {"storage": inside[0].mean(axis=1).tolist(), "loss": inside[1].mean(axis=1).tolist(), "by_distance": rows}
 
 
 def rows_of(organ, found, drawn, usual) -> list[dict]:

@@ -93,10 +93,22 @@ def plate() -> str:
         f"{data['map_s']:.0f} s, with {data['unknowns']:,} unknowns at {len(hertz)} frequencies.",
         f"90 % intervals of the map hold the true storage modulus in {percent(min(cover['storage']))} to "
         f"{percent(max(cover['storage']))} of the voxels, and the loss modulus in {percent(min(cover['loss']))} to "
-        f"{percent(max(cover['loss']))}. The map is smooth at edges; there its deviation is that of a place known to a "
-        "brick.",
+        f"{percent(max(cover['loss']))}. The map is smooth at edges; there its deviation is that of a place known "
+        "to the prior's length. By the distance from the nearest edge:",
+        "",
+        "| " + " | ".join(_between(row) for row in cover["by_distance"]) + " |",
+        "|" + len(cover["by_distance"]) * "---|",
+        "| " + " | ".join(percent(row["storage"]) for row in cover["by_distance"]) + " |",
     ]
     return "\n".join(rows)
+
+
+def _between(row: dict) -> str:
+    """Where voxels of a row lie, from the nearest edge."""
+    low, high = (None if row[key] is None else 1e3 * row[key] for key in ("from_m", "to_m"))
+    side = "inside" if high is not None and high <= 0 else "outside"
+    ends = [abs(end) for end in (low, high) if end is not None]
+    return f"{min(ends):g} to {max(ends):g} mm {side}" if len(ends) == 2 else f"beyond {ends[0]:g} mm {side}"
 
 
 def liver_waves_came_out() -> str:

@@ -8,8 +8,9 @@ deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 o
 Gauss-Newton.
 
 The uncertainty has two parts. One comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value. The
-other is the place of what varies. A field that is linear in the bricks shows a step as a slope, wherever in a brick the
-step is. So a place is known to a brick's side w, with the variance w^2/12, and c has |w dc/dx|^2/12 of it.
+other is the place of what varies. The prior shows a step as a slope over its correlation length, or over a brick where
+that is longer, wherever within the slope the step is. So a place is known to this length w, with the variance w^2/12,
+and c has |w dc/dx|^2/12 of it.
 """
 
 import time
@@ -44,7 +45,7 @@ class WaveMap(NamedTuple):
     sd: np.ndarray  # (P,) complex: of its real part (logarithm of the size), and of its imaginary part (loss angle)
     posterior_sd: np.ndarray  # (P,) of both, without the place of what varies
     prior_sd: np.ndarray  # (P,)
-    draws: np.ndarray  # (D, P) complex: samples of the posterior, each displaced within a brick
+    draws: np.ndarray  # (D, P) complex: samples of the posterior, each displaced by what a place is known to
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # the prior's, chosen
     length: float  # [m]
@@ -62,7 +63,7 @@ class Course(NamedTuple):
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex
     mean: scipy.sparse.csr_array  # (E, P): the corners' mean
-    slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over a brick's side, along x, y, z
+    slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over what a place is known to, along x, y, z
     p: smooth.Prior
     length: float  # [m]
 
@@ -131,7 +132,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
         length: correlation length of the prior [m].
     """
     mean, p = _mean_of_corners(body), smooth.prior(body.linear, length)
-    return Course(m, waves, np.asarray(whole, complex), mean, _changes_over_bricks(body, mean), p, length)
+    return Course(m, waves, np.asarray(whole, complex), mean, _changes_over_slopes(body, mean, length), p, length)
 
 
 def map_of(
@@ -189,7 +190,7 @@ def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations (P,) with a place that is known to a brick; slopes (3, P) are changes over a brick."""
+    """Standard deviations (P,) with a place that is known to a length; slopes (3, P) are changes over it."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
 
 
@@ -200,17 +201,22 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.full(rows.size, 0.25), (rows, tets.ravel())), shape=shape)
 
 
-def _changes_over_bricks(body: VoxelBody, mean: scipy.sparse.csr_array) -> tuple[scipy.sparse.csr_array, ...]:
-    """Change (P, P) of a field over a brick's side: at each corner the mean of its elements' slopes, by volume."""
+def _changes_over_slopes(
+    body: VoxelBody, mean: scipy.sparse.csr_array, length: float
+) -> tuple[scipy.sparse.csr_array, ...]:
+    """Change (P, P) of a field over a length [m], or over a brick's side where that is longer.
+
+    At each corner it is the mean of its elements' slopes, by volume.
+    """
     tets, volumes = np.asarray(body.linear.tetrahedra), np.asarray(body.linear.volumes)
     D = np.moveaxis(np.asarray(body.linear.shape_vectors), -1, 0)
     gradients = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)
     around = scipy.sparse.diags_array(1 / (mean.T @ volumes)) @ mean.T @ scipy.sparse.diags_array(volumes)
-    sides = np.ptp(np.asarray(body.linear.points)[tets[0]], axis=0)
+    over = np.maximum(np.ptp(np.asarray(body.linear.points)[tets[0]], axis=0), length)
     rows, columns = np.repeat(np.arange(len(tets)), 4), tets.ravel()
     of_elements = [
-        scipy.sparse.csr_array((side * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
-        for a, side in enumerate(sides)
+        scipy.sparse.csr_array((w * gradients[:, :, a].ravel(), (rows, columns)), shape=mean.shape)
+        for a, w in enumerate(over)
     ]
     return tuple((around @ own).tocsr() for own in of_elements)
 
