@@ -155,35 +155,36 @@ def pulled_phantom() -> lj.Scene:
     return replace(scene, traction=(load,))
 
 
-def ends() -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest values of all numbers (9,)."""
-    low, high = zip(*RANGES.values(), strict=True)
+def ends(ranges: dict = RANGES) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest values of all n numbers (n,)."""
+    low, high = zip(*ranges.values(), strict=True)
     return np.concatenate([np.ravel(a) for a in low]), np.concatenate([np.ravel(b) for b in high])
 
 
-def named(unit: np.ndarray) -> dict[str, np.ndarray]:
-    """Rows of numbers from places (N, 9) in the ranges, 0 to 1."""
-    low, high = ends()
+def named(unit: np.ndarray, ranges: dict = RANGES) -> dict[str, np.ndarray]:
+    """Rows of numbers from places (N, n) in the ranges, 0 to 1."""
+    low, high = ends(ranges)
     table, rows, k = low + unit * (high - low), {}, 0
-    for name, (a, _) in RANGES.items():
+    for name, (a, _) in ranges.items():
         n = np.size(a)
         rows[name] = table[:, k : k + n] if n > 1 else table[:, k]
         k += n
     return rows
 
 
-def drawn(count: int, wider: float, seed: int) -> dict[str, np.ndarray]:
+def drawn(count: int, wider: float, seed: int, ranges: dict = RANGES) -> dict[str, np.ndarray]:
     """Rows of all numbers: a Latin hypercube in the ranges, stretched by a part about their middles."""
     from scipy.stats import qmc
 
-    return named(0.5 + (1 + wider) * (qmc.LatinHypercube(len(ends()[0]), seed=seed).random(count) - 0.5))
+    places = qmc.LatinHypercube(len(ends(ranges)[0]), seed=seed).random(count)
+    return named(0.5 + (1 + wider) * (places - 0.5), ranges)
 
 
-def with_corners(count: int, corners: Any) -> dict[str, np.ndarray]:
+def with_corners(count: int, corners: Any, ranges: dict = RANGES) -> dict[str, np.ndarray]:
     """A Latin hypercube of rows, then some corners of the ranges, by their numbers."""
-    every = np.array(list(itertools.product((0.0, 1.0), repeat=len(ends()[0]))))
-    more = named(every[np.asarray(corners, int)])
-    return {name: np.concatenate([rows, more[name]]) for name, rows in drawn(count, 0.0, 1).items()}
+    every = np.array(list(itertools.product((0.0, 1.0), repeat=len(ends(ranges)[0]))))
+    more = named(every[np.asarray(corners, int)], ranges)
+    return {name: np.concatenate([rows, more[name]]) for name, rows in drawn(count, 0.0, 1, ranges).items()}
 
 
 def row_of(rows: dict[str, np.ndarray], k: int) -> dict[str, Any]:

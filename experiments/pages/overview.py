@@ -338,6 +338,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         reduced.came_out,
         "weighs its model against reduced bases and names no error",
     ),
+    "reduced_porous": (
+        "a reduced model of the complete liver, porous and viscous: error, stated error and time a step",
+        reduced.porous_came_out,
+        "weighs its model against reduced bases and names no error",
+    ),
     "separated": (
         "the phantom at rest as a sum of products (proper generalised decomposition), beside a reduced basis",
         reduced.separated_came_out,

@@ -1,0 +1,152 @@
+"""A reduced model of the complete liver phantom, porous and viscous: error, stated error, and run time.
+
+Gravity, a pull on a patch of the tip, the modulus, one ratio and one relaxation time are free as in `reduced.py`; the
+permeability and the bulk modulus of the sponge are free beside them. The training rows are drawn in a box of them and
+at some of its corners, the unseen runs in a box 10 % wider. The full model on the same mesh is the truth.
+
+``python -m experiments reduced_porous`` (25 minutes on one core) writes results/reduced_porous.json after each part,
+and the trained model into out/reduced_porous.h5. If the script is ended, it goes on from there; delete the model to run
+all anew. Times are the processor's, of one core: other work beside it counts less than on a clock.
+"""
+
+import os
+
+# Matrices of 80 x 80: threads of the BLAS cost more than they do.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import liverjax as lj
+from experiments.benchmarks import reduced
+from experiments.benchmarks.reduced import MM, farthest, loosely, one_core, pulled_phantom, ratios, row_of, summary
+from experiments.common import RESULTS, ROOT, either, save
+from experiments.liver import models
+from liverjax.core.struct import replace
+
+#: Lowest and highest number of the training rows, beside those of `reduced.py`.
+RANGES = reduced.RANGES | {"porosity.permeability": (1e-5, 4e-5), "porosity.bulk": (300.0, 500.0)}
+#: Drawn rows, and corners: those of `reduced.py`, with the sponge's two numbers at their four pairs of ends in turn.
+ROWS, CORNERS = either((420, 60), (8, 2))
+#: Unseen runs, and those of these whose error is asked of the full mesh too.
+UNSEEN, MESH_CHECKS = either((100, 6), (2, 1))
+#: The most modes, and what the points may leave out.
+MODES, POINT_TOLERANCE = either((80, 5e-3), (20, 1e-1))
+#: Lanes of vmap.
+LANES = either(64, 4)
+KEPT = ROOT / "out" / f"{either('', 'quick_')}reduced_porous.h5"
+
+
+def pulled_sponge() -> lj.Scene:
+    """The complete phantom with a load on a patch at its tip, 1.2 s in steps of 0.05 s."""
+    return replace(pulled_phantom(), porosity=models()["complete"].porosity)
+
+
+def trained(scene: lj.Scene) -> tuple[lj.ReducedModel, dict]:
+    """The model, and what it took."""
+    corners = [4 * corner + k % 4 for k, corner in enumerate(reduced.CORNERS[:CORNERS])]
+    rows, begin, cpu = reduced.with_corners(ROWS, corners, RANGES), time.perf_counter(), time.process_time()
+    model = lj.reduce_scene(scene, rows, 1e-5, MODES, POINT_TOLERANCE)
+    took = {"training_s": time.perf_counter() - begin, "training_cpu_s": time.process_time() - cpu}
+    assert model.pressures is not None
+    took |= {"rows": ROWS + CORNERS, "modes": model.number_of_modes, "points": len(model.points)}
+    return model, took | {"pressures": len(model.pressures.modes), "elements": scene.mesh.number_of_elements}
+
+
+def unseen(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict:
+    """True and stated errors of runs with the rows."""
+    found, failed, bare = [], 0, replace(model, correction=None)
+    mesh: list[tuple[float, float]] = []
+    for k in range(UNSEEN):
+        full = lj.simulate(lj.with_parameters(scene, row_of(rows, k)))
+        own = loosely(lj.with_parameters(scene, row_of(rows, k)))
+        small = lj.simulate_reduced(model, own)
+        if np.any(full.status) or np.any(small.status):
+            failed += 1
+            continue
+        x, plain = (lj.reduced_positions(m, own, small) for m in (model, bare))
+        P = np.asarray(lj.reduced_pressure(model, own, small))
+        stated = float(np.max(lj.stated_error(model, own, small))) / MM
+        moved, most = farthest(full.positions - own.mesh.points), float(np.abs(full.pressure).max())
+        true, off = farthest(x - full.positions), float(np.abs(P - full.pressure).max())
+        found.append((true, farthest(plain - full.positions), stated, moved, off / most, most))
+        if len(mesh) < MESH_CHECKS:
+            asked = lj.reduced_error(model, own, small)
+            mesh.append((float(asked.error.max()) / MM / true, float(asked.pressure_error.max()) / off))
+    true, without, stated, moved, pressure, most = np.array(found).T
+    row: dict = {"runs": UNSEEN, "failed": failed, "largest_displacement_mm": float(moved.max())}
+    row |= {"largest_pressure": float(most.max()), "mesh_ratios": mesh}
+    for kind, errors in (("relative", true / moved), ("uncorrected", without / moved), ("pressure", pressure)):
+        row |= {f"{kind}_{k}": v for k, v in summary(errors).items()}
+    row |= ratios(stated / true) | {"within_one_percent": float(np.mean(true / moved <= 0.01))}
+    return row | {"relative": (true / moved).tolist(), "effectivity": (stated / true).tolist()}
+
+
+def times(scene: lj.Scene, model: lj.ReducedModel) -> dict:
+    """Milliseconds a step on one core: reduced run, its gradient, many lanes, and the full run."""
+    back, steps, small = one_core(), scene.solve.steps, loosely(scene)
+    start = [jnp.asarray(v, float) for v in (715.0, 2e-5)]
+
+    def tip(values: list, model: lj.ReducedModel) -> jax.Array:
+        own = lj.with_parameters(small, dict(zip(("law.mu", "porosity.permeability"), values, strict=True)))
+        return jnp.sum(lj.simulate_reduced(model, own).coordinates[-1] ** 2)
+
+    result, run = processor_s(lambda s, model: lj.simulate_reduced(model, s), small, model, rounds=15)
+    _, plain = processor_s(tip, start, model, rounds=15)
+    _, gradient = processor_s(jax.value_and_grad(tip), start, model, rounds=9)
+    lanes = [jnp.linspace(0.9, 1.1, LANES) * v for v in start]
+    _, many = processor_s(jax.vmap(tip, in_axes=(0, None)), lanes, model, rounds=1)
+    _, full = processor_s(lj.simulate, scene, rounds=3)
+    back()
+    return {
+        "step_ms": 1e3 * run / steps,
+        "iterations_per_step": float(np.mean(np.asarray(result.iterations))),
+        "gradient_over_run": gradient / plain,
+        "lanes": LANES,
+        "step_of_a_lane_ms": 1e3 * many / steps / LANES,
+        "full_step_ms": 1e3 * full / steps,
+    }
+
+
+def processor_s(function: Callable, *arguments: object, rounds: int) -> tuple:
+    """Result, and processor time [s] of a jitted function after a first run: the median of some rounds."""
+    compiled = jax.jit(function).lower(*arguments).compile()
+    result, seconds = jax.block_until_ready(compiled(*arguments)), []
+    for _ in range(rounds):
+        begin = time.process_time()
+        jax.block_until_ready(compiled(*arguments))
+        seconds.append(time.process_time() - begin)
+    return result, statistics.median(seconds)
+
+
+def main() -> None:
+    """All parts that are not there yet, written after each."""
+    scene, rows = pulled_sponge(), reduced.drawn(UNSEEN, 0.1, 2, RANGES)
+    results = RESULTS / "reduced_porous.json"
+    if KEPT.exists() and results.exists():
+        model, content = lj.load_reduced(KEPT), json.loads(results.read_text())
+    else:
+        model, took = trained(scene)
+        content = {"training": took}
+        KEPT.parent.mkdir(exist_ok=True)
+        lj.save_reduced(model, KEPT)
+        save("reduced_porous", content)
+    parts = {
+        "unseen": lambda: unseen(scene, model, rows),
+        "times": lambda: times(lj.with_parameters(scene, row_of(rows, 0)), model),
+    }
+    for name, part in parts.items():
+        if name not in content:
+            content[name] = part()
+            save("reduced_porous", content)
+        print({k: v for k, v in content[name].items() if not isinstance(v, list) or len(v) == 2}, flush=True)
+
+
+if __name__ == "__main__":
+    main()
