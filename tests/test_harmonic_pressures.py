@@ -217,6 +217,7 @@ def test_derivatives_of_a_sponge():
     check_derivatives(column(4, 1, 1.0), at, np.array([SLOW, FAST]))
 
 
+@pytest.mark.slow
 def test_derivatives_of_mixed_elements_about_a_state():
     scene = replace(slab(3, 2), viscosity=replace(PRONY, part="isochoric"), solve=lj.Solve(volumetric="mixed"))
     about = scene.mesh.points * jnp.array([[1.0, 1.0, 1.1]])

@@ -114,6 +114,7 @@ def test_derivatives_go_through_the_first_acceleration():
     assert np.isclose((tip(1000.0 + h) - tip(1000.0 - h)) / (2 * h), slope, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_estimate_in_free_fall_is_nothing():
     """The richer functions have weight and as much mass: a body of linear elements falls as one in both spaces."""
     scene = falling(1, "lumped", tolerance=1e-10)

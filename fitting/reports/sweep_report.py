@@ -268,9 +268,9 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
             top.errorbar(f, data, yerr=[low, sd], fmt="none", ecolor=colour, alpha=0.35, capsize=2)
         measured = f"{symbol} measured" + ("" if sd is None else " ± sd")
         top.plot(f, data, marker, color=colour, ms=4, mfc="none", label=measured)
-        top.plot(fine, line, "-", color=colour, lw=1.2, label=f"{symbol} closed form" + (" and 95 %" if bands else ""))
+        top.plot(fine, line, "-", color=colour, lw=1.2, label=f"{symbol} closed form")
         if symbol in bands:
-            top.fill_between(f, *bands[symbol], color=colour, alpha=0.2, lw=0)
+            top.fill_between(f, *bands[symbol], color=colour, alpha=0.2, lw=0, label=f"{symbol} 95 %")
         if fit.method == "torsion":
             top.plot(f, fitted, cross, color="black", ms=5, label=f"{symbol} simulated")
         rest.plot(f, 100 * (fitted / data - 1), marker, color=colour, ms=3, label=symbol)
