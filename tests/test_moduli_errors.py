@@ -10,6 +10,7 @@ from fitting.fits import instrument, viscoelastic
 from fitting.fits.families import models
 from fitting.fits.honesty import moduli_errors
 from fitting.methods import generalised_maxwell
+from fitting.methods.estimate import wider
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
 
@@ -75,6 +76,19 @@ def test_the_error_of_the_gap_is_in_all_of_them(chosen):
     alone, wide = chosen, instrument.with_gap_error(chosen, 0.03)
     a, b = (moduli_errors.fitted_moduli(fit, OMEGA, False) for fit in (alone, wide))
     np.testing.assert_allclose(b.standard_errors, np.hypot(a.standard_errors, 0.03 * a.values), rtol=1e-12)
+
+
+def test_errors_of_the_instrument_are_those_of_the_modes():
+    """An error that moves all modes at once moves the moduli by as much as modes moved by it have them moved."""
+    fit, move = viscoelastic.closed_form(one_mode(0), 1), np.array([7.0, 0.01, -0.02])
+    wide = fit._replace(uncertainty=wider(fit.uncertainty, move))
+    a, b = (moduli_errors.fitted_moduli(f, OMEGA, False).standard_errors for f in (fit, wide))
+    ends = [
+        np.concatenate(generalised_maxwell.moduli(Maxwell(p[0], p[1:2], p[2:]), OMEGA))
+        for p in (fit.uncertainty.values + sign * 1e-4 * move for sign in (1, -1))
+    ]
+    # Central differences: an error of the step squared, 1e-8, and of roundoff over the step.
+    np.testing.assert_allclose(np.sqrt(b**2 - a**2), np.abs(ends[0] - ends[1]) / 2e-4, rtol=1e-6, atol=1e-6)
 
 
 def test_fit_json_has_them(tmp_path):

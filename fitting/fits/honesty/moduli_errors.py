@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits.viscoelastic import Fit, mean_square, number_of_parameters
-from fitting.methods import generalised_maxwell
+from fitting.methods import generalised_maxwell, host
 from fitting.methods.estimate import Estimate, errors_and_correlation, estimated, wider
+from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array
 
 #: Weight below which a model is left out.
@@ -19,6 +20,8 @@ NEGLIGIBLE = 1e-4
 
 def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     """G' then G'' (2n,) [Pa] of a fit in closed form, by the delta method.
+
+    The errors are those of noise, of gap and instrument where the fit knows them, and of the choice of the model.
 
     Args:
         fit: with `rivals`, where it was chosen from several models.
@@ -35,7 +38,9 @@ def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
         root = np.concatenate(columns, axis=1)
         errors, correlation = errors_and_correlation(root)
         found = found._replace(root=root, standard_errors=errors, correlation=correlation)
-    return wider(found, fit.details["gap_error"] * found.values) if "gap_error" in fit.details else found
+    for direction in _shared_errors(fit, omega):
+        found = wider(found, direction)
+    return found
 
 
 def model_weights(fit: Fit) -> dict[str, float]:
@@ -56,6 +61,20 @@ def _akaike(fit: Fit) -> float:
     """Akaike's criterion with the correction for few data."""
     m, k = 2 * len(fit.storage), number_of_parameters(fit)
     return float(m * np.log(mean_square(fit)) + 2 * k * m / max(1.0, m - k - 1))
+
+
+def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
+    """What one standard deviation of each error that all points share changes (s, 2n) [Pa]: gap, instrument."""
+    shared, n = fit.uncertainty.shared, fit.modes
+    if shared is None:
+        return np.zeros((0, 2 * len(omega)))
+
+    def of(p: np.ndarray) -> np.ndarray:
+        model = Maxwell(p[..., 0], p[..., 1 : n + 1], p[..., n + 1 :])
+        return np.concatenate(generalised_maxwell.moduli(model, omega), axis=-1)
+
+    _, slope = host.with_jacobian(of, np.asarray(fit.uncertainty.values, float))
+    return (slope @ shared).T
 
 
 def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
