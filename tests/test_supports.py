@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.jobs.reactions import reaction_table
@@ -40,6 +41,19 @@ def pulled(mesh: lj.TetMesh, value, **more) -> lj.Scene:
     triangles = jnp.asarray(lj.boundary.boundary_triangles(mesh, part(mesh, z_min=SIDE)))
     traction = (lj.Traction(triangles=triangles, value=jnp.array(value)),)
     return lj.Scene(mesh=mesh, law=LAW, traction=traction, **more)
+
+
+def test_springs_stiffer_than_the_digits_allow_are_told_as_roundoff():
+    """1e14 Pa/m times the rounding of positions is above the tolerance: no shorter step helps, and none is tried."""
+    mesh = box()
+    scene = pulled(
+        mesh, [0.0, 0.0, 30.0], physics=(springs(mesh, part(mesh, z_max=0.0), normal=1e14, tangential=1e14),)
+    )
+    glued = pulled(mesh, [0.0, 0.0, 30.0], fixed=(lj.Fixed(nodes=part(mesh, z_max=0.0)),))
+    result, held = lj.simulate(scene), lj.simulate(glued).check().positions[-1]
+    assert int(result.status[-1]) == status.STALLED and int(result.statistics.cuts[-1]) == 0
+    # The residual that is left times the compliance of a tissue of 1 kPa.
+    assert np.abs(result.positions[-1] - held).max() < 1e-5 * np.abs(held - mesh.points).max()
 
 
 def test_springs_along_the_normal_carry_the_whole_pull():

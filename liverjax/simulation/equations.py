@@ -144,7 +144,32 @@ def force_sizes(scene: Scene) -> Sizes:
         return jnp.linalg.norm(jax.jvp(lambda x: mjed.internal_force(mesh, law, x), (mesh.points,), (motion,))[1])
 
     # One loop for both: a third of the program that two products with a linearised force take.
-    return Sizes(*jax.lax.stop_gradient(jax.lax.map(size, jnp.stack([along, rounded]))))
+    unit_strain, roundoff = jax.lax.map(size, jnp.stack([along, rounded]))
+    return Sizes(*jax.lax.stop_gradient((unit_strain, roundoff + _roundoff_at_nodes(scene, rounded))))
+
+
+def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
+    """Size [N] of what stiff springs make of rounded positions, a motion (V, 3) [m], in the reference shape.
+
+    Contact is left out: what touches is not known before the step.
+    """
+    x = scene.mesh.points
+    begin = _first_step(scene, x, free_directions(scene))
+    acting = [p.freeze(None, begin) for p in physics_of(scene) if type(p).begin is Physics.begin]
+    springs = [a for a in acting if isinstance(a, NodalForce) and _is_spring(a) and not a.kinked]
+    if not springs:
+        return jnp.zeros((), x.dtype)
+
+    def force(x: jax.Array) -> jax.Array:
+        return sum((a.force(scene.mesh, x, 0.0) for a in springs), jnp.zeros_like(x))
+
+    return jnp.linalg.norm(jax.jvp(force, (x,), (rounded,))[1])
+
+
+def _is_spring(acting: NodalForce) -> bool:
+    """Whether its force changes with positions by a stiffness of its own."""
+    own = type(acting)
+    return own.stiffness is not NodalForce.stiffness or own.attached is not NodalForce.attached
 
 
 def equations(scene: Scene, state: State, k: Number, sizes: Sizes | None = None) -> Equations:
