@@ -201,3 +201,26 @@ def test_laws_lists_every_parameter(capsys):
     assert liverjax_main(["laws"]) == 0
     out = capsys.readouterr().out
     assert "arruda_boyce" in out and "chain_length" in out and "[Pa]  > 0" in out
+
+
+def test_a_run_in_single_precision_writes_its_files(tmp_path):
+    """A scene in single precision keeps a mesh in double: what is made of both is in the mesh's digits."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        """
+        mesh = {shape = "box", size = [0.1, 0.1, 0.1], cells = [2, 2, 2]}
+        law = {name = "neo_hookean", mu = 800.0, bulk = 4000.0}
+        body = {density = 1000.0, gravity = [0.0, 0.0, -3.0]}
+        support = [{where = {z_max = 0.0}, normal = 1e5, tangential = 1e5}]
+        obstacle = [{shape = "plane", position = [0.1, 0.0, 0.0], axis = [-1.0, 0.0, 0.0]}]
+        solve = {precision = "float32", tolerance = 1e-4}
+        """
+    )
+    options = "--vtu --reactions --fields cauchy_stress".split()
+    assert liverjax_main(["simulate", str(scene), "--out", str(tmp_path), *options]) == 0
+    with h5py.File(tmp_path / "result.h5") as file:
+        assert file["positions"].dtype == np.float32
+    # The support carries the weight, to the tolerance of its run.
+    lines = (tmp_path / "reactions.csv").read_text().splitlines()
+    last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
+    assert np.isclose(float(last["support.0.z_N"]), 3.0, rtol=1e-3)

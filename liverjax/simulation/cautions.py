@@ -95,7 +95,8 @@ def _of_locking(scene: Scene) -> list[str]:
 def _of_volumes(scene: Scene, result: Result) -> list[str]:
     """A sentence on elements beyond `LEAST_J` or `MOST_J` at any step."""
     said = []
-    positions = jnp.asarray(result.positions)
+    # A run in single precision has a mesh in double.
+    positions = jnp.asarray(result.positions, scene.mesh.points.dtype)
     found = [np.asarray(a) for a in compiled(_extremes, scene.mesh, positions)(scene.mesh, positions)]
     kinds = ((np.less, LEAST_J, "shrank below"), (np.greater, MOST_J, "grew above"))
     for k, (beyond, bound, words) in enumerate(kinds):
