@@ -216,7 +216,7 @@ def test_a_run_in_single_precision_writes_its_files(tmp_path):
         solve = {precision = "float32", tolerance = 1e-4}
         """
     )
-    options = "--vtu --reactions --fields cauchy_stress".split()
+    options = ["--vtu", "--reactions", "--fields", "cauchy_stress"]
     assert liverjax_main(["simulate", str(scene), "--out", str(tmp_path), *options]) == 0
     with h5py.File(tmp_path / "result.h5") as file:
         assert file["positions"].dtype == np.float32

@@ -16,8 +16,8 @@ from liverjax.core.struct import replace
 from liverjax.reduced import training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
-from liverjax.reduced.run import _updated
 from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
+from liverjax.reduced.step import _updated
 from liverjax.reduced.tangent import ReducedTangent, in_single_precision, solved_by_tangent, tangent_matrix
 
 pytestmark = pytest.mark.quick_to_compile

@@ -14,9 +14,9 @@ from liverjax.core.struct import replace
 from liverjax.jobs import reduction
 from liverjax.mesh.nodal import integrals
 from liverjax.physics.porosity import Inlet
-from liverjax.reduced import run, training
+from liverjax.reduced import step, training
 from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points
-from liverjax.reduced.model import with_all_points
+from liverjax.reduced.model import solid_at_points, with_all_points
 from liverjax.reduced.tangent import in_single_precision, tangent_matrix
 
 pytestmark = pytest.mark.quick_to_compile
@@ -94,14 +94,16 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     memory = memory._replace(pressure=jnp.asarray(rng.normal(size=len(memory.pressure))), F=memory.F + 0.01)
     fluid = flowing(model, porosity_at_points(model, scene), memory, 0.05)
     elastic = replace(scene, viscosity=None, porosity=None)
-    acting = run.solid_at_points(model, elastic).freeze(None, None)
+    acting = solid_at_points(model, elastic).freeze(None, None)
     rest, none = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)), jnp.zeros(n)
     light = in_single_precision(model.slopes)
-    e = run._Equations(model, acting, none, rest, None, none, None, jnp.asarray(0.05), None, None, 0.0, fluid, light)
+    e = step.ReducedEquations(
+        model, acting, none, rest, None, none, None, jnp.asarray(0.05), None, None, 0.0, fluid, light
+    )
     q = jnp.asarray(1e-4 * rng.normal(size=n))
     # One program: by themselves the operations take ten times as long to compile.
-    exact = jax.jit(jax.jacfwd(lambda q: run._residual(e, q, run._deformation(e, q))[0]))(q)
-    found = jax.jit(lambda q: tangent_matrix(run._reduced_tangent(e, q)))(q)
+    exact = jax.jit(jax.jacfwd(lambda q: step._residual(e, q, step.gradients_at(e, q))[0]))(q)
+    found = jax.jit(lambda q: tangent_matrix(step._reduced_tangent(e, q)))(q)
     assert np.allclose(found, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
     assert np.allclose(found, found.T, rtol=0, atol=1e-12 * np.abs(exact).max())
 

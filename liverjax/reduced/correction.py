@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import Number, param, static, struct
-from liverjax.reduced.principal_fields import principal_fields
+from liverjax.tensors.principal_fields import principal_fields
 
 #: Groups of runs that are left out in turn, and the fewest runs that are corrected.
 GROUPS, FEWEST_RUNS = 12, 6

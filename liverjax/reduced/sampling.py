@@ -19,10 +19,10 @@ from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points, storage_and_flow, volume_stress
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
-from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
+from liverjax.tensors.principal_fields import principal_fields
 
 #: The most states whose forces are taken: memory and time grow with them.
 MOST_STATES = 240

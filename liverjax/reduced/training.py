@@ -14,11 +14,11 @@ from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.prescribed import free_degrees
 from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
 from liverjax.reduced.model import ReducedModel, refuse_unknown_physics, with_all_points
-from liverjax.reduced.principal_fields import principal_fields
 from liverjax.reduced.run import simulate_reduced
 from liverjax.reduced.sampling import Coordinates, sampled
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
+from liverjax.tensors.principal_fields import principal_fields
 
 #: A porous scene has at most one mode of pressure for so many modes of motion.
 PRESSURES = 2
