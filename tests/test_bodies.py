@@ -159,6 +159,13 @@ def check_sweep_and_gradient(scene: lj.Scene, numbers: tuple[str, ...]) -> None:
         assert errors[1:3].min() <= errors[0] + small and errors[1:3].min() <= errors[3] + small, (name, errors)
 
 
+@pytest.fixture(autouse=True)
+def without_programs():
+    """A program of all physics takes half a gigabyte, and no two tests share one."""
+    yield
+    jax.clear_caches()
+
+
 EVERY_FORM = pytest.mark.parametrize("form", FORMS)
 
 

@@ -97,9 +97,8 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     acting = solid_at_points(model, elastic).freeze(None, None)
     rest, none = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)), jnp.zeros(n)
     light = in_single_precision(model.slopes)
-    e = step.ReducedEquations(
-        model, acting, none, rest, None, none, None, jnp.asarray(0.05), None, None, 0.0, fluid, light
-    )
+    known, dt = (model, acting, none, rest), jnp.asarray(0.05)
+    e = step.ReducedEquations(*known, None, none, None, dt, None, None, 0.0, fluid, light, dt)
     q = jnp.asarray(1e-4 * rng.normal(size=n))
     # One program: by themselves the operations take ten times as long to compile.
     exact = jax.jit(jax.jacfwd(lambda q: step._residual(e, q, step.gradients_at(e, q))[0]))(q)

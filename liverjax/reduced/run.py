@@ -137,6 +137,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
     light = in_single_precision(model.slopes)
+    steepest = jax.lax.stop_gradient(jnp.linalg.norm(model.slopes))
     noise, sponge = reduced_noise(model, scene), None if scene.porosity is None else porosity_at_points(model, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
@@ -146,7 +147,9 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
         newmark = solve.integrator == "newmark"
         load, gradient = given
         flow = None if sponge is None else flowing(model, sponge, fluid, solve.dt)
-        e = ReducedEquations(model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise, flow, light)
+        e = ReducedEquations(
+            model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise, flow, light, steepest
+        )
         found = step_end(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
         flat = gradients_at(e, found.q)

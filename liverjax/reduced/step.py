@@ -51,6 +51,7 @@ class ReducedEquations(NamedTuple):
     noise: jax.Array  # size of forces whose roundoff is the tolerance [N]: no load leaves only these
     fluid: Flowing | None  # of a porous scene
     light: SinglePrecision
+    steepest: jax.Array  # root of the sum of squares of all slopes [1/m]
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
@@ -88,15 +89,32 @@ def reduced_noise(model: ReducedModel, scene: Scene) -> jax.Array:
 
 def _residual(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Out-of-balance forces (n,) and the size of all forces, with the deformation gradients F (9, S) of q."""
+    P = _point_forces(e, F)
+    return _unbalanced(e, q, P, _added_up(e, P))
+
+
+def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
+    """Stresses times weights (9, S) [N m] of the points."""
     P = _stresses(e.acting, F)
     if e.fluid is not None:
         p = pressure_coordinates(e.fluid, determinant(as_matrix(F)))
         P = P + volume_stress(e.model, e.fluid.porosity, p, F)
-    internal = jnp.tensordot(e.model.weights[None] * P, e.model.slopes, axes=2)
+    return e.model.weights[None] * P
+
+
+def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
+    """Forces (n,) [N] of the points' (9, S)."""
+    return jnp.tensordot(P, e.model.slopes, axes=2)
+
+
+def _unbalanced(
+    e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Out-of-balance forces (n,) and the size of all, of the points' forces (9, S) and what they add up to (n,)."""
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
         # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
-        size = size + jnp.linalg.norm(jnp.tensordot(e.model.weights[None] * jnp.abs(P), e.spread, axes=2))
+        size = size + jnp.linalg.norm(jnp.tensordot(jnp.abs(P), e.spread, axes=2))
     if e.mass is not None:
         inertia = e.mass @ reduced_kinematics(e, q).acceleration
         r, size = r + inertia, size + jnp.linalg.norm(inertia)
@@ -138,8 +156,11 @@ class _ReducedIterate(NamedTuple):
 
     q: jax.Array
     F: jax.Array  # (9, S)
+    P: jax.Array  # forces of the points (9, S)
+    internal: jax.Array  # what they add up to (n,)
     r: jax.Array
     size: jax.Array  # of r, relative to the forces at work
+    rounded: jax.Array  # the part of that which single precision may have added or taken away since it was exact
     inverse: jax.Array  # of the tangent, or near it (n, n) [m/N]
     fresh: jax.Array  # the inverse is that of the tangent at q
     slow: jax.Array  # the last iteration gained little
@@ -149,6 +170,8 @@ class _ReducedIterate(NamedTuple):
 
 #: An iteration that leaves more than this part of the residual calls for the tangent at hand, which costs ten of them.
 _LITTLE_GAIN = 0.95
+#: Part of the tolerance that single precision may have rounded away before forces are added up anew.
+_DOUBT = 0.1
 
 
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
@@ -163,8 +186,18 @@ def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Arr
     return inverse - half - half.T
 
 
-def _judged(e: ReducedEquations, q: jax.Array, F: jax.Array) -> tuple[jax.Array, jax.Array]:
-    r, size = _residual(e, q, F)
+def _in_double_precision(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
+    """The iterate with forces from its coordinates and gradients, in double precision."""
+    P = _point_forces(e, at.F)
+    internal = _added_up(e, P)
+    r, size = _relative_residual(e, at.q, P, internal)
+    return at._replace(P=P, internal=internal, r=r, size=size, rounded=jnp.zeros_like(size))
+
+
+def _relative_residual(
+    e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    r, size = _unbalanced(e, q, P, internal)
     return r, jnp.linalg.norm(r) / jnp.maximum(size, jnp.finfo(r.dtype).tiny)
 
 
@@ -173,22 +206,33 @@ def _upright(F: jax.Array) -> jax.Array:
 
 
 def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
-    """One iteration with the inverse at hand, which is then updated with the new forces."""
+    """One iteration with the inverse at hand, which is then updated with the new forces.
+
+    Changes of gradients and forces are small: single precision gives their digits, in half the time.
+    """
     dq = at.inverse @ at.r
-    dF = e.model.slopes @ dq
+    dF = (e.light.slopes @ dq.astype(jnp.float32)).astype(dq.dtype)
     # Halved until no sampled point is inverted, six times at most.
     part = jax.lax.while_loop(
         lambda part: (part > 0.02) & ~_upright(at.F - part * dF), lambda part: 0.5 * part, jnp.ones((), dq.dtype)
     )
     q, F = at.q - part * dq, at.F - part * dF
-    r, size = _judged(e, q, F)
+    P = _point_forces(e, F)
+    change = P - at.P
+    more = jnp.tensordot(change.astype(jnp.float32), e.light.slopes, axes=2).astype(dq.dtype)
+    internal = at.internal + more
+    r, size = _relative_residual(e, q, P, internal)
+    # Of r over the forces at work: a bound of what the products have rounded away.
+    lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
+    rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
     # An old inverse may lead astray: such a step is not taken.
     before, after = jnp.linalg.norm(at.r), jnp.linalg.norm(r)
     good = at.fresh | (after < before)
-    new = _ReducedIterate(q, F, r, size, inverse, jnp.array(False), jnp.array(False), at.iterations, at.tangents)
+    no = jnp.array(False)
+    new = _ReducedIterate(q, F, P, internal, r, size, rounded, inverse, no, no, at.iterations, at.tangents)
     new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, at)
-    return new._replace(slow=~(after < _LITTLE_GAIN * before), fresh=jnp.array(False), iterations=at.iterations + 1)
+    return new._replace(slow=~(after < _LITTLE_GAIN * before), fresh=no, iterations=at.iterations + 1)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -233,8 +277,15 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
         return (at.size > tolerance) & (at.tangents < most)
 
     def inner(at: _ReducedIterate) -> _ReducedIterate:
+        def corrected(at: _ReducedIterate) -> _ReducedIterate:
+            at = _corrected(e, at)
+            doubtful = (at.size <= tolerance) & (at.rounded > _DOUBT * tolerance)
+            return jax.lax.cond(
+                doubtful, lambda: _in_double_precision(e, at._replace(F=gradients_at(e, at.q))), lambda: at
+            )
+
         going = lambda at: (at.size > tolerance) & ~at.slow  # noqa: E731
-        return jax.lax.while_loop(going, lambda at: _corrected(e, at), at._replace(slow=jnp.array(False)))
+        return jax.lax.while_loop(going, corrected, at._replace(slow=jnp.array(False)))
 
     def refreshed(at: _ReducedIterate) -> _ReducedIterate:
         own = near_inverse(_reduced_tangent(e, at.q), e.light)
@@ -250,8 +301,9 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     good = _upright(foretold)
     start = jnp.where(good, start, e.q)
     F = jax.lax.cond(good, lambda: foretold, lambda: gradients_at(e, e.q))
-    r, size = _judged(e, start, F)
-    begin = _ReducedIterate(start, F, r, size, inverse, jnp.array(False), jnp.array(False), none, none)
+    zero, no = jnp.zeros((), e.q.dtype), jnp.array(False)
+    begin = _ReducedIterate(start, F, F, e.q, e.q, zero, zero, inverse, no, no, none, none)
+    begin = _in_double_precision(e, begin)
     at = inner(begin)
     # Where the old inverse does not lead to the end, the step begins again.
     begin = begin._replace(iterations=at.iterations)
