@@ -107,9 +107,7 @@ def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
     return jnp.tensordot(P, e.model.slopes, axes=2)
 
 
-def _unbalanced(
-    e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Out-of-balance forces (n,) and the size of all, of the points' forces (9, S) and what they add up to (n,)."""
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:

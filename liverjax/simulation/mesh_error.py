@@ -58,7 +58,9 @@ _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
 BAR = 1.25
 #: Where a surface touches: linear solves of a step at most, and the forces out of balance that end them, over all.
-_ROUNDS, _SETTLED = 12, 1e-3
+_ROUNDS, _SETTLED = 24, 1e-3
+#: Halvings of such a solve that leaves more out of balance than before.
+_HALVINGS = 4
 
 
 @struct
@@ -192,19 +194,33 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
     if not any(a.kinked for a in e.nodal):
         return q, solved(q)
 
+    def size(q: jax.Array) -> jax.Array:
+        r, force, _ = residual(e, q, one)
+        return jnp.linalg.norm(r) / force
+
     def go_on(c: tuple) -> jax.Array:
         q, (dq, iterations, positive), k = c
-        r, force, _ = residual(e, q + dq, one)
         well = positive & (iterations < MOST_LINEAR_ITERATIONS) & jnp.all(jnp.isfinite(dq))
-        return (k == 0) | (well & (k < _ROUNDS) & (jnp.linalg.norm(r) > _SETTLED * force))
+        return (k == 0) | (well & (k < _ROUNDS) & (size(q + dq) > _SETTLED))
 
     def again(c: tuple) -> tuple:
         q, (dq, _, _), k = c
-        return q + dq, solved(q + dq), k + 1
+        q = q + _shortened(size, q, dq) * dq
+        return q, solved(q), k + 1
 
     nothing, none = (jnp.zeros_like(q), jnp.zeros((), jnp.int32), jnp.array(True)), jnp.zeros((), jnp.int32)
     q, (dq, iterations, positive), k = jax.lax.while_loop(go_on, again, (q, nothing, none))
     return q, (dq, iterations, positive & (k < _ROUNDS))
+
+
+def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
+    """The part of dq, halved `_HALVINGS` times at most, that leaves less out of balance than there is at q."""
+    before = size(q)
+
+    def go_on(t: jax.Array) -> jax.Array:
+        return ~(size(q + t * dq) < before) & (t > 0.5**_HALVINGS)
+
+    return jax.lax.while_loop(go_on, lambda t: 0.5 * t, jnp.ones((), q.dtype))
 
 
 def padded(rich: TetMesh, x: jax.Array) -> jax.Array:
