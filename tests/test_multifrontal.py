@@ -12,7 +12,7 @@ import pytest
 import scipy.sparse
 
 import liverjax as lj
-from liverjax.solvers import multifrontal
+from liverjax.solvers.factors import dissection, multifrontal
 from liverjax.waves import sparse
 
 pytestmark = pytest.mark.quick_to_compile
@@ -32,7 +32,7 @@ def system(kind: type) -> tuple[scipy.sparse.csr_array, list[multifrontal.Front]
     lines, columns = np.broadcast_arrays(at[:, None], at[None])
     n = 2 * len(points)
     A = scipy.sparse.coo_array((blocks.ravel(), (lines.ravel(), columns.ravel())), shape=(n, n)).tocsr()
-    return A, multifrontal.fronts(neighbours(tets), multifrontal.dissected(tets, points), np.arange(n) // 2)
+    return A, multifrontal.fronts(neighbours(tets), dissection.dissected(tets, points), np.arange(n) // 2)
 
 
 def neighbours(tets: np.ndarray) -> scipy.sparse.csr_array:
@@ -68,14 +68,14 @@ def test_against_a_dense_solution(kind, single, small, together, monkeypatch):
 @pytest.mark.parametrize("single", [False, True])
 def test_groups_whose_nodes_are_all_held(single, monkeypatch):
     """They have no unknown of their own, and some no border: LAPACK refuses a matrix of no lines."""
-    monkeypatch.setattr(multifrontal, "LEAF", 8)
+    monkeypatch.setattr(dissection, "LEAF", 8)
     A, _ = system(complex)
     box = lj.shapes.box((1.0, 1.0, 2.0), (5, 5, 10))
     points = np.asarray(box.points)
     keep = np.flatnonzero(np.repeat(points[:, 2] > 0.7, 2))
     free = A[keep][:, keep].tocsr()
     tets = np.asarray(box.tetrahedra).T
-    plan = multifrontal.fronts(neighbours(tets), multifrontal.dissected(tets, points), keep // 2)
+    plan = multifrontal.fronts(neighbours(tets), dissection.dissected(tets, points), keep // 2)
     assert any(len(front.own) == 0 for front in plan)
     known = np.random.default_rng(2).normal(size=len(keep)) + 0j
     _, error = multifrontal.refined_solution(multifrontal.factorised(free, plan, single), free @ known)
@@ -131,7 +131,7 @@ def test_derivatives_take_the_factors_of_the_values(monkeypatch):
     assert made == [(False, False)] * 2
     # Two factors that only fit in 16 bits.
     monkeypatch.setattr(multifrontal, "SINGLE_FROM", 0)
-    monkeypatch.setattr(multifrontal, "LEAF", 8)
+    monkeypatch.setattr(dissection, "LEAF", 8)
     sparse._factors.clear()
     sparse._orders.clear()
     lj.harmonic(body, [40.0, 60.0])

@@ -1,8 +1,8 @@
 """Complex sparse solves of harmonic motion, by a factorisation on the host for every frequency.
 
 The matrix is symmetric, not Hermitian, so one factor serves the equations, their derivatives and their adjoints: it is
-kept for them (`KEPT`). See `liverjax.solvers.multifrontal`; SciPy's SuperLU, which chooses its pivots in the whole
-matrix, follows where that fails.
+kept for them (`KEPT`). See `liverjax.solvers.factors.multifrontal`; SciPy's SuperLU, which chooses its pivots in the
+whole matrix, follows where that fails.
 """
 
 import hashlib
@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.solvers import multifrontal
 from liverjax.solvers.blas import one_blas_thread
 from liverjax.solvers.direct import across
+from liverjax.solvers.factors import multifrontal
+from liverjax.solvers.factors.dissection import dissected
 from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_part
 
 #: Motions of every frequency: (F, V, 3), and (F, P) or None.
@@ -144,7 +145,7 @@ def _order(A: Any, free: np.ndarray) -> _Order:
             near = near + scipy.sparse.coo_array((np.ones(len(at[0])), at), shape=(V, V))
         most = max(len(nodes) for nodes in widths)
         elements = np.concatenate([np.pad(nodes, ((0, most - len(nodes)), (0, 0)), "edge") for nodes in widths], axis=1)
-        groups = multifrontal.dissected(elements, np.asarray(A.points))
+        groups = dissected(elements, np.asarray(A.points))
         plan = multifrontal.fronts(near.tocsr(), groups, np.where(free < 3 * V, free // 3, free - 3 * V))
         _orders.clear()
         _orders[key] = _Order(pairs, blocks, free, plan)
@@ -183,6 +184,8 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:
     """The solution, with the factor kept for the next one: under which key, and whether in 16 bits."""
+    for other in [other for other in _factors if other[:16] != kept[0][:16]]:
+        del _factors[other]  # before the new one is made: their memory serves it
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue
@@ -198,9 +201,7 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:
-    """Keep factors up to `KEPT` bytes; of one matrix, those of the first frequencies."""
-    for other in [other for other in _factors if other[:16] != key[:16]]:
-        del _factors[other]
+    """Keep factors up to `KEPT` bytes: of one matrix, those of the first frequencies."""
     if factor.nbytes + sum(own.nbytes for own in _factors.values()) < KEPT:
         _factors[key] = factor
 

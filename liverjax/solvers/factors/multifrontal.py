@@ -1,13 +1,12 @@
 """Factorisation of sparse symmetric matrices of a mesh, on the host, by dense matrices: real or complex symmetric.
 
-Nested dissection (George 1973, SIAM J. Numer. Anal. 10, 345): the elements are halved across their longest side again
-and again, and the nodes between two halves come after both. Each group of nodes is eliminated in a dense matrix of
-itself and its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is
-products of matrices. Groups whose children are done are eliminated side by side, one a core. By symmetry the lower
-triangles are enough. Pivots are chosen within the unknowns that are eliminated together. Large matrices are factorised
-in single precision and solved with refinement: half the time and memory, and the same digits. Where that does not
-converge, double precision follows. Factors that are too many for the memory are kept as whole numbers of 16 bits, each
-row with a size of its own: half the memory again, with about two more steps of refinement.
+`liverjax.solvers.factors.dissection` has the order. Each group of nodes is eliminated in a dense matrix of itself and
+its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is products of
+matrices. Groups whose children are done are eliminated side by side, one a core. By symmetry the lower triangles are
+enough. Pivots are chosen within the unknowns that are eliminated together. Large matrices are factorised in single
+precision and solved with refinement: half the time and memory, and the same digits. Where that does not converge,
+double precision follows. Factors that are too many for the memory are kept as whole numbers of 16 bits, each row with
+a size of its own: half the memory again, with about two more steps of refinement.
 """
 
 import itertools
@@ -17,13 +16,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from liverjax.solvers.factors.dissection import work
+
 if TYPE_CHECKING:
     import scipy.sparse
 
-#: Nodes of a group that is not halved any more; unknowns from which on single precision pays.
-LEAF, SINGLE_FROM = 40, 20_000
-#: Unknowns of a group that are eliminated together, and the side of the tiles of what they change.
-PIVOTS, TILE = 256, 256
+#: Unknowns from which on single precision pays.
+SINGLE_FROM = 20_000
+#: Unknowns of a group that are eliminated together; columns and lines of the tiles of what they change.
+PIVOTS, TILE, LINES = 256, 256, 1024
 #: Part of all work below which groups are eliminated with their descendants, in one piece.
 PIECE = 1 / 32
 #: Steps of refinement, and the part of the terms of an equation that may be out of balance.
@@ -73,49 +74,6 @@ class Factor(NamedTuple):
         return self.matrix.data.nbytes + sum(step.inverse.nbytes + step.X.nbytes for step in self.steps)
 
 
-def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
-    """Groups of nodes with the numbers of their children; a group stands after its children.
-
-    Args:
-        elements: nodes (n, E) of every element; one that has fewer repeats one of them.
-        points: positions (V, 3).
-    """
-    centres, taken = points[elements].mean(axis=0), np.zeros(len(points), bool)
-    groups: list[tuple[np.ndarray, list[int]]] = []
-
-    def halved(part: np.ndarray, nodes: np.ndarray) -> int:
-        children: list[int] = []
-        if len(nodes) > LEAF and len(part) > 1:
-            side = centres[part, np.argmax(np.ptp(centres[part], axis=0))]
-            order = np.argpartition(side, len(part) // 2)
-            halves = [part[order[: len(part) // 2]], part[order[len(part) // 2 :]]]
-            within = [np.unique(elements[:, half]) for half in halves]
-            within = [own[~taken[own]] for own in within]
-            between = np.intersect1d(within[0], within[1], assume_unique=True)
-            taken[between] = True
-            for half, own in zip(halves, within, strict=True):
-                rest = own[~taken[own]]
-                if len(rest):
-                    children.append(halved(half, rest))
-            nodes = between
-        taken[nodes] = True
-        groups.append((_neighbours_together(nodes, points), children))
-        return len(groups) - 1
-
-    halved(np.arange(elements.shape[1]), np.unique(elements))
-    return groups
-
-
-def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The nodes in an order in which those of a part of space follow each other."""
-    if len(nodes) <= 8:
-        return nodes
-    side = points[nodes, np.argmax(np.ptp(points[nodes], axis=0))]
-    order = np.argsort(side, kind="stable")
-    halves = nodes[order[: len(nodes) // 2]], nodes[order[len(nodes) // 2 :]]
-    return np.concatenate([_neighbours_together(half, points) for half in halves])
-
-
 def fronts(
     neighbours: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray
 ) -> list[Front]:
@@ -123,7 +81,7 @@ def fronts(
 
     Args:
         neighbours: (V, V), an entry for each two nodes whose unknowns are coupled.
-        groups: `dissected`.
+        groups: of `liverjax.solvers.factors.dissection.dissected`.
         node: (N,) the node of each unknown.
     """
     order = np.argsort(node, kind="stable")
@@ -184,27 +142,47 @@ class _Elimination(NamedTuple):
     plan: list[Front]
     kind: np.dtype
     small: bool
-    rests: list[np.ndarray | None]  # what each group leaves to the next
+    rests: list[list[np.ndarray] | None]  # what each group leaves to the next: `_lower`
     steps: list[list[Eliminated]]  # of each group
 
     def piece(self, groups: list[int]) -> None:
         """Eliminate some groups, one after the other."""
-        place = np.full(self.A.shape[0], -1)
-        size = max(len(front.own) + len(front.border) for front in (self.plan[k] for k in groups))
-        memory, scratch = np.empty(size**2, self.kind), np.empty(min(size, TILE) ** 2, self.kind)
+        place, scratch = np.full(self.A.shape[0], -1), np.empty(LINES * max(PIVOTS, TILE), self.kind)
         for k in groups:
-            front = self.plan[k]
-            F, n = _matrix_of_group(self.A, front, place, memory), len(front.own)
-            for c in front.children:
-                rest = self.rests[c]
-                if rest is not None:  # a part of the body that nothing couples with the others has left nothing
-                    _add(F, place[self.plan[c].border], rest)
-                    self.rests[c] = None
-            place[front.own] = place[front.border] = -1
-            steps = _eliminated(F, front, scratch)
+            own, rest = self.taken_in(k, place)
+            X = np.empty(own.shape, self.kind).T
+            steps = _eliminated(own, X, self.plan[k], scratch)
             self.steps[k] = [_in_whole_numbers(step) for step in steps] if self.small else steps
-            if len(front.border):
-                self.rests[k] = F[n:, n:].copy(order="F")
+            ahead = len(self.plan[k].own)
+            for part in rest:
+                _take_off(part, own[ahead:], X[:, ahead : ahead + part.shape[1]], scratch)
+                ahead += TILE
+            self.rests[k] = rest
+
+    def taken_in(self, k: int, place: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+        """The columns of a group itself (n + m, n), and those of its border, with what its children left."""
+        front = self.plan[k]
+        n, m = len(front.own), len(front.border)
+        place[front.own], place[front.border] = np.arange(n), np.arange(n, n + m)
+        own, rest = np.zeros((n + m, n), self.kind, order="F"), _lower(m, self.kind)
+        mirrored = self.A[front.own].tocoo()
+        row = place[mirrored.col]
+        below = row >= mirrored.row
+        own[row[below], mirrored.row[below]] = mirrored.data[below]
+        for c in front.children:
+            left, self.rests[c] = self.rests[c], None
+            if left:  # a part of the body that nothing couples with the others has left nothing
+                _add(own, rest, place[self.plan[c].border], left)
+        place[front.own] = place[front.border] = -1
+        return own, rest
+
+
+def _lower(m: int, kind: np.dtype) -> list[np.ndarray]:
+    """The lower triangle of a matrix (m, m) of 0: `TILE` columns each, from the diagonal down.
+
+    One array would be twice as large, and the system takes longer to give much memory than the sums in it take.
+    """
+    return [np.zeros((m - j, min(TILE, m - j)), kind, order="F") for j in range(0, m, TILE)]
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
@@ -235,11 +213,11 @@ def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]
     n, m = (
         np.array([len(part) for part in parts], float) for parts in zip(*(front[:2] for front in plan), strict=True)
     )
-    work = n**3 / 3 + n**2 * m + n * m**2
-    below = work.copy()
+    below = work(n, m)
+    least = PIECE * below.sum()
     for k, front in enumerate(plan):
         below[k] += below[front.children].sum()
-    small, piece_of = below < PIECE * work.sum(), np.full(len(plan), -1)
+    small, piece_of = below < least, np.full(len(plan), -1)
     pieces: list[list[int]] = []
     for k in range(len(plan) - 1, -1, -1):  # parents first
         if piece_of[k] < 0:
@@ -269,40 +247,33 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
     return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape), scale
 
 
-def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """The columns of A of the group itself, on and below the diagonal; `place` says where its unknowns and border
-    are."""
-    n, size = len(front.own), len(front.own) + len(front.border)
-    place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
-    F = memory[: size * size].reshape((size, size), order="F")
-    F[...] = 0
-    mirrored = A[front.own].tocoo()
-    row = place[mirrored.col]
-    below = row >= mirrored.row
-    F[row[below], mirrored.row[below]] = mirrored.data[below]
-    return F
-
-
-def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
-    """Add a lower triangle to F at rising places `at`, of which many follow each other."""
-    ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1), len(at)]
-    runs = [(a, b, at[a]) for a, b in itertools.pairwise(ends) if a < b]
+def _add(own: np.ndarray, rest: list[np.ndarray], at: np.ndarray, more: list[np.ndarray]) -> None:
+    """Add a lower triangle to that of `own` and `rest` at rising places `at`, of which many follow each other."""
+    n, of_more = own.shape[1], np.arange(len(at))
+    new = (np.diff(at, prepend=-2) != 1) | (of_more % TILE == 0) | (at == n) | ((at > n) & ((at - n) % TILE == 0))
+    ends = [*np.flatnonzero(new).tolist(), len(at)]
+    runs = [(a, b, int(at[a])) for a, b in itertools.pairwise(ends)]
     for k, (a, b, column) in enumerate(runs):
+        part, first = more[a // TILE], a // TILE * TILE
+        to, above = (own, 0) if column < n else (rest[(column - n) // TILE], n + (column - n) // TILE * TILE)
+        left = 0 if column < n else above
         for c, d, row in runs[k:]:
-            F[row : row + d - c, column : column + b - a] += rest[c:d, a:b]
+            to[row - above : row - above + d - c, column - left : column - left + b - a] += part[
+                c - first : d - first, a - first : b - first
+            ]
 
 
-def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
-    """Eliminate a group in its matrix F (n + m, n + m), whose lower triangle becomes that of what is left."""
+def _eliminated(own: np.ndarray, X: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
+    """Eliminate a group in its own columns (n + m, n), of which A^-1 times the transposed lower parts go to X."""
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     for a in range(0, n, PIVOTS):
         b = min(a + PIVOTS, n)
-        A = np.tril(F[a:b, a:b])
+        if a:
+            _take_off(own[a:, a:b], own[a:, :a], X[:a, a:b], scratch)
+        A = np.tril(own[a:b, a:b])
         inverse = _inverted(A + np.tril(A, -1).T)
-        B = F[b:, a:b].T
-        X = inverse @ B
-        found.append(Eliminated(every[a:b], every[b:], inverse, X))
-        _take_off(F[b:, b:], B, X, scratch)
+        np.matmul(inverse, own[b:, a:b].T, out=X[a:b, b:])
+        found.append(Eliminated(every[a:b], every[b:], inverse, X[a:b, b:].copy()))
     return found
 
 
@@ -326,14 +297,13 @@ def _inverted(A: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _take_off(rest: np.ndarray, B: np.ndarray, X: np.ndarray, scratch: np.ndarray) -> None:
-    """Take B^T X, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile."""
-    for j in range(0, len(rest), TILE):
-        for i in range(j, len(rest), TILE):
-            tile = rest[i : i + TILE, j : j + TILE]
-            product = scratch[: tile.size].reshape(tile.shape, order="F")
-            np.matmul(B[:, i : i + TILE].T, X[:, j : j + TILE], out=product)
-            tile -= product
+def _take_off(part: np.ndarray, B: np.ndarray, X: np.ndarray, scratch: np.ndarray) -> None:
+    """Take B X off."""
+    for k in range(0, len(part), LINES):
+        some = part[k : k + LINES]
+        product = scratch[: some.size].reshape(some.shape, order="F")
+        np.matmul(B[k : k + LINES], X, out=product)
+        some -= product
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:

@@ -1,0 +1,1 @@
+"""Factors of the sparse symmetric matrices of a mesh."""
