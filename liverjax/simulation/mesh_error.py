@@ -205,7 +205,8 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
     def again(c: tuple) -> tuple:
         q, (dq, _, _), k = c
-        q = q + _shortened(size, q, dq) * dq
+        # The first round has no motion yet.
+        q = q + jax.lax.cond(k == 0, lambda: one, lambda: _shortened(size, q, dq)) * dq
         return q, solved(q), k + 1
 
     nothing, none = (jnp.zeros_like(q), jnp.zeros((), jnp.int32), jnp.array(True)), jnp.zeros((), jnp.int32)

@@ -184,8 +184,6 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:
     """The solution, with the factor kept for the next one: under which key, and whether in 16 bits."""
-    for other in [other for other in _factors if other[:16] != kept[0][:16]]:
-        del _factors[other]  # before the new one is made: their memory serves it
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue
@@ -201,7 +199,9 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:
-    """Keep factors up to `KEPT` bytes: of one matrix, those of the first frequencies."""
+    """Keep factors up to `KEPT` bytes; of one matrix, those of the first frequencies."""
+    for other in [other for other in _factors if other[:16] != key[:16]]:
+        del _factors[other]
     if factor.nbytes + sum(own.nbytes for own in _factors.values()) < KEPT:
         _factors[key] = factor
 

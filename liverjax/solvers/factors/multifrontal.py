@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 #: Unknowns from which on single precision pays.
 SINGLE_FROM = 20_000
-#: Unknowns of a group that are eliminated together; columns and lines of the tiles of what they change.
-PIVOTS, TILE, LINES = 256, 256, 1024
+#: Unknowns of a group that are eliminated together, and the side of the tiles of what they change.
+PIVOTS, TILE = 256, 256
 #: Part of all work below which groups are eliminated with their descendants, in one piece.
 PIECE = 1 / 32
 #: Steps of refinement, and the part of the terms of an equation that may be out of balance.
@@ -142,47 +142,27 @@ class _Elimination(NamedTuple):
     plan: list[Front]
     kind: np.dtype
     small: bool
-    rests: list[list[np.ndarray] | None]  # what each group leaves to the next: `_lower`
+    rests: list[np.ndarray | None]  # what each group leaves to the next
     steps: list[list[Eliminated]]  # of each group
 
     def piece(self, groups: list[int]) -> None:
         """Eliminate some groups, one after the other."""
-        place, scratch = np.full(self.A.shape[0], -1), np.empty(LINES * max(PIVOTS, TILE), self.kind)
+        place = np.full(self.A.shape[0], -1)
+        size = max(len(front.own) + len(front.border) for front in (self.plan[k] for k in groups))
+        memory, scratch = np.empty(size**2, self.kind), np.empty(min(size, TILE) ** 2, self.kind)
         for k in groups:
-            own, rest = self.taken_in(k, place)
-            X = np.empty(own.shape, self.kind).T
-            steps = _eliminated(own, X, self.plan[k], scratch)
+            front = self.plan[k]
+            F, n = _matrix_of_group(self.A, front, place, memory), len(front.own)
+            for c in front.children:
+                rest = self.rests[c]
+                if rest is not None:  # a part of the body that nothing couples with the others has left nothing
+                    _add(F, place[self.plan[c].border], rest)
+                    self.rests[c] = None
+            place[front.own] = place[front.border] = -1
+            steps = _eliminated(F, front, scratch)
             self.steps[k] = [_in_whole_numbers(step) for step in steps] if self.small else steps
-            ahead = len(self.plan[k].own)
-            for part in rest:
-                _take_off(part, own[ahead:], X[:, ahead : ahead + part.shape[1]], scratch)
-                ahead += TILE
-            self.rests[k] = rest
-
-    def taken_in(self, k: int, place: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """The columns of a group itself (n + m, n), and those of its border, with what its children left."""
-        front = self.plan[k]
-        n, m = len(front.own), len(front.border)
-        place[front.own], place[front.border] = np.arange(n), np.arange(n, n + m)
-        own, rest = np.zeros((n + m, n), self.kind, order="F"), _lower(m, self.kind)
-        mirrored = self.A[front.own].tocoo()
-        row = place[mirrored.col]
-        below = row >= mirrored.row
-        own[row[below], mirrored.row[below]] = mirrored.data[below]
-        for c in front.children:
-            left, self.rests[c] = self.rests[c], None
-            if left:  # a part of the body that nothing couples with the others has left nothing
-                _add(own, rest, place[self.plan[c].border], left)
-        place[front.own] = place[front.border] = -1
-        return own, rest
-
-
-def _lower(m: int, kind: np.dtype) -> list[np.ndarray]:
-    """The lower triangle of a matrix (m, m) of 0: `TILE` columns each, from the diagonal down.
-
-    One array would be twice as large, and the system takes longer to give much memory than the sums in it take.
-    """
-    return [np.zeros((m - j, min(TILE, m - j)), kind, order="F") for j in range(0, m, TILE)]
+            if len(front.border):
+                self.rests[k] = F[n:, n:].copy(order="F")
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
@@ -247,33 +227,40 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
     return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape), scale
 
 
-def _add(own: np.ndarray, rest: list[np.ndarray], at: np.ndarray, more: list[np.ndarray]) -> None:
-    """Add a lower triangle to that of `own` and `rest` at rising places `at`, of which many follow each other."""
-    n, of_more = own.shape[1], np.arange(len(at))
-    new = (np.diff(at, prepend=-2) != 1) | (of_more % TILE == 0) | (at == n) | ((at > n) & ((at - n) % TILE == 0))
-    ends = [*np.flatnonzero(new).tolist(), len(at)]
-    runs = [(a, b, int(at[a])) for a, b in itertools.pairwise(ends)]
+def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
+    """The columns of A of the group itself, on and below the diagonal; `place` says where its unknowns and border
+    are."""
+    n, size = len(front.own), len(front.own) + len(front.border)
+    place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
+    F = memory[: size * size].reshape((size, size), order="F")
+    F[...] = 0
+    mirrored = A[front.own].tocoo()
+    row = place[mirrored.col]
+    below = row >= mirrored.row
+    F[row[below], mirrored.row[below]] = mirrored.data[below]
+    return F
+
+
+def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
+    """Add a lower triangle to F at rising places `at`, of which many follow each other."""
+    ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1), len(at)]
+    runs = [(a, b, at[a]) for a, b in itertools.pairwise(ends) if a < b]
     for k, (a, b, column) in enumerate(runs):
-        part, first = more[a // TILE], a // TILE * TILE
-        to, above = (own, 0) if column < n else (rest[(column - n) // TILE], n + (column - n) // TILE * TILE)
-        left = 0 if column < n else above
         for c, d, row in runs[k:]:
-            to[row - above : row - above + d - c, column - left : column - left + b - a] += part[
-                c - first : d - first, a - first : b - first
-            ]
+            F[row : row + d - c, column : column + b - a] += rest[c:d, a:b]
 
 
-def _eliminated(own: np.ndarray, X: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
-    """Eliminate a group in its own columns (n + m, n), of which A^-1 times the transposed lower parts go to X."""
+def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
+    """Eliminate a group in its matrix F (n + m, n + m), whose lower triangle becomes that of what is left."""
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     for a in range(0, n, PIVOTS):
         b = min(a + PIVOTS, n)
-        if a:
-            _take_off(own[a:, a:b], own[a:, :a], X[:a, a:b], scratch)
-        A = np.tril(own[a:b, a:b])
+        A = np.tril(F[a:b, a:b])
         inverse = _inverted(A + np.tril(A, -1).T)
-        np.matmul(inverse, own[b:, a:b].T, out=X[a:b, b:])
-        found.append(Eliminated(every[a:b], every[b:], inverse, X[a:b, b:].copy()))
+        B = F[b:, a:b].T
+        X = inverse @ B
+        found.append(Eliminated(every[a:b], every[b:], inverse, X))
+        _take_off(F[b:, b:], B, X, scratch)
     return found
 
 
@@ -297,13 +284,14 @@ def _inverted(A: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _take_off(part: np.ndarray, B: np.ndarray, X: np.ndarray, scratch: np.ndarray) -> None:
-    """Take B X off."""
-    for k in range(0, len(part), LINES):
-        some = part[k : k + LINES]
-        product = scratch[: some.size].reshape(some.shape, order="F")
-        np.matmul(B[k : k + LINES], X, out=product)
-        some -= product
+def _take_off(rest: np.ndarray, B: np.ndarray, X: np.ndarray, scratch: np.ndarray) -> None:
+    """Take B^T X, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile."""
+    for j in range(0, len(rest), TILE):
+        for i in range(j, len(rest), TILE):
+            tile = rest[i : i + TILE, j : j + TILE]
+            product = scratch[: tile.size].reshape(tile.shape, order="F")
+            np.matmul(B[:, i : i + TILE].T, X[:, j : j + TILE], out=product)
+            tile -= product
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
