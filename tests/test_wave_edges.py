@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from experiments.sources import cylinders_in_waves
 from fitting.reports import waves_report
-from fitting.waves import balance, edges, elastography, regions, stiffness_map, voxels
+from fitting.waves import balance, edge_places, edges, elastography, regions, stiffness_map, voxels
 from fitting.waves.wave_field import WaveField
 
 pytestmark = pytest.mark.quick_to_compile
@@ -112,7 +112,7 @@ def test_small_labels_keep_their_volume():
     grid = np.stack(np.meshgrid(*[np.arange(11)] * 3, indexing="ij"), axis=-1)
     labels = 1 + (np.linalg.norm(grid - 5.0, axis=-1) < 2.1)
     body = voxels.voxel_body(np.ones(labels.shape, bool), np.ones(3))
-    s, above = edges.places(labels, body, np.array([1, 2])), np.zeros(labels.shape)
+    s, above = edge_places.places(labels, body, np.array([1, 2])), np.zeros(labels.shape)
     above[tuple(body.voxel.T)] = s[1] - s[0]
     fine = ndimage.zoom(above, 8, order=1, grid_mode=True, mode="grid-constant")
     assert np.sum(fine > 0) / 8**3 == pytest.approx(np.sum(labels == 2), rel=0.03)
@@ -120,18 +120,20 @@ def test_small_labels_keep_their_volume():
 
 def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
     """chi^2 with edges a fiftieth of a voxel farther out, up to the second order that its Hessian has."""
-    monkeypatch.setattr(edges, "FARTHER", 0.02)
+    monkeypatch.setattr(edge_places, "FARTHER", 0.02)
     field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
     own = organ_of(field)
-    s = [edges.places(field.labels, own.body, np.array([1, 2]), farther) for farther in (0.0, edges.FARTHER)]
+    s = [
+        edge_places.places(field.labels, own.body, np.array([1, 2]), farther) for farther in (0.0, edge_places.FARTHER)
+    ]
     m = edges.region_matrices(own.matrices, own.body, DENSITY, *s)
     at = np.array([3000 + 600j, 9000 + 600j]), own.waves.omega[0], own.waves.motion[0], own.waves.sd[0]
     here = regions._state_of_regions(m, *at)
-    there = regions._state_of_regions(m.farther._replace(near=m.near, kinks=m.kinks), *at)
-    gradient, curvature = here.gradient[5], here.hessian[5, 5]
-    expected = edges.FARTHER * gradient + 0.5 * edges.FARTHER**2 * curvature
+    there = regions._state_of_regions(m.farther._replace(patches=m.patches, patch=m.patch, kinks=m.kinks), *at)
+    gradient, curvature = here.gradient[4:].sum(), here.hessian[4:, 4:].sum()  # of all patches together
+    expected = edge_places.FARTHER * gradient + 0.5 * edge_places.FARTHER**2 * curvature
     assert 0.5 * (there.here.chi2 - here.here.chi2) == pytest.approx(expected, rel=0.1)
-    assert here.gradient[4] == 0  # the surroundings have no edge of their own
+    assert np.all(m.patches.region == 1)  # the surroundings have no edge of their own
 
 
 def test_smoothed_labels_keep_place_and_volume():
@@ -139,40 +141,44 @@ def test_smoothed_labels_keep_place_and_volume():
     labels = np.where(np.linalg.norm(grid - [7.2, 6.9, 7.0], axis=-1) < 3, 7, 2)
     labels[:, :, :2] = 4
     body = voxels.voxel_body(np.ones(labels.shape, bool), np.ones(3))
-    s = edges.places(labels, body, np.array([2, 4, 7]))
+    s = edge_places.places(labels, body, np.array([2, 4, 7]))
     own = np.array([2, 4, 7])[s.argmax(axis=0)]
     volume = np.sum(labels == 7)
     assert abs(np.sum(own == 7) / volume - 1) < 0.1
     assert np.linalg.norm(body.voxel[own == 7].mean(axis=0) - grid[labels == 7].mean(axis=0)) < 0.1
     assert np.all((own == 4) == (labels[tuple(body.voxel.T)] == 4))  # a plane edge stays between its voxels
-    farther = edges.places(labels, body, np.array([2, 4, 7]), 0.5)
+    farther = edge_places.places(labels, body, np.array([2, 4, 7]), 0.5)
     assert np.sum(farther.argmax(axis=0) == 2) > 1.2 * volume
 
 
 @pytest.mark.parametrize(
-    ("radius", "centre", "spacing"),
+    ("radius", "centre", "spacing", "elements"),
     [
-        (0.005, (3e-4, -4e-4), 1e-3),
-        (0.005, (1.3e-3, 1e-4), 2e-3),
-        pytest.param(0.005, (8e-4, 1e-4), 1e-3, marks=pytest.mark.slow),
-        pytest.param(0.003, (3e-4, -4e-4), 1e-3, marks=pytest.mark.slow),
-        pytest.param(0.010, (3e-4, -4e-4), 2e-3, marks=pytest.mark.slow),
+        (0.005, (3e-4, -4e-4), 1e-3, 0.01),
+        (0.005, (1.3e-3, 1e-4), 2e-3, 0.07),
+        pytest.param(0.005, (8e-4, 1e-4), 1e-3, 0.01, marks=pytest.mark.slow),
+        pytest.param(0.003, (3e-4, -4e-4), 1e-3, 0.01, marks=pytest.mark.slow),
+        pytest.param(0.010, (3e-4, -4e-4), 2e-3, 0.01, marks=pytest.mark.slow),
+        pytest.param(0.010, (1e-3, 1e-5), 2e-3, 0.01, marks=pytest.mark.slow),
     ],
 )
-def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, verified):
-    """2 % of noise, 2.5 to 5 voxels of radius: within 5 %, and within three standard errors."""
+def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, elements, verified):
+    """2 % of noise: within three standard errors and the elements' own error, which edges in their true place leave.
+
+    That is 7 % for 2.5 voxels of radius in this place, and below 1 % for 3 to 5 voxels.
+    """
     own = organ_of(beside_a_cylinder(radius, centre, spacing, 100.0))
     found = elastography.regions_of(own).parts
     off = found.modulus[0] - (np.array([SOFT, STIFF]) + 200j * np.pi)
-    e = found.standard_errors[0]
+    e, most = found.standard_errors[0], elements * STIFF
     assert found.converged[0]
-    assert np.all(np.abs(off[1].real) < 3 * e[1].real) and np.all(np.abs(off[1].imag) < 3 * e[1].imag)
+    assert abs(off[1].real) < 3 * e[1].real + most and abs(off[1].imag) < 3 * e[1].imag + most
     assert abs(off[0]) < 0.02 * SOFT
     verified(
         f"stiff cylinder of {radius / spacing:g} voxels in shear waves, 2 % noise",
         "closed form",
         abs(off[1].real) / STIFF,
-        0.05,
+        0.05 if radius > 2.5 * spacing else 0.08,
     )
 
 
@@ -190,40 +196,34 @@ def test_intervals_of_a_map_hold_the_truth_beside_edges():
     assert 0.85 < held[0] < 0.99 and held[1] < 0.85, held
 
 
+def in_its_true_place(field, radius, centre, farther=0.0):
+    """Distances from a cylinder's edge [voxels] as `places` has them (2, V)."""
+    X = np.asarray(elastography.body_of(field).mesh.points)
+    inside = (radius - np.hypot(X[:, 0] - centre[0], X[:, 1] - centre[1])) / field.spacing[0] + farther
+    return np.stack([-inside / 2, inside / 2])
+
+
 @pytest.mark.slow
-def test_what_the_elements_do_to_a_large_cylinder(verified):
-    """Without any noise 10 mm at 100 Hz come out too stiff by 4.8 % at 4.2 elements a wave, by 2.3 % at 5.6."""
+@pytest.mark.parametrize(("radius", "most", "edges_do"), [(0.010, 0.01, 0.025), (0.005, 0.07, 0.0)])
+def test_what_labels_and_elements_do_to_a_cylinder(radius, most, edges_do, monkeypatch):
+    """Without noise: with edges in their true place, and of labels with one place for each whole edge.
+
+    Of 5 voxels, labels do 3 to 4 % here, by where the cylinder lies among the voxels, and elements below 1 %.
+    """
     off = []
-    for spacing, voxels_across in ((2e-3, 23), (1.5e-3, 31)):
-        field = beside_a_cylinder(0.010, (3e-4, -4e-4), spacing, 100.0, noise=0.0, voxels_across=voxels_across)
-        off.append(float(elastography.regions_of(organ_of(field)).parts.modulus[0, 1].real) / STIFF - 1)
-    assert 0 < off[1] < 0.6 * off[0] and off[0] < 0.06
-    order = np.log2(off[0] / off[1]) / np.log2(2 / 1.5)
-    verified(
-        "stiff cylinder of 10 mm at 100 Hz, 5.6 elements a wave, no noise", "closed form", off[1], 0.036, float(order)
-    )
-
-
-def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
-    """Twelve measurements scatter as the standard errors say: their ratio has itself a deviation of a fifth."""
-    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, noise=0.0, voxels_across=13)
-    own = organ_of(field)
-    m = edges.region_matrices(own.matrices, own.body, DENSITY, edges.places(field.labels, own.body, np.array([1, 2])))
-    moduli, rng, start = [], np.random.default_rng(0), np.array([3000 + 600j, 9000 + 600j])
-    for _ in range(12):
-        noise = rng.normal(size=own.waves.motion.shape) + 1j * rng.normal(size=own.waves.motion.shape)
-        found = regions.moduli_of_regions(m, own.waves._replace(motion=own.waves.motion + field.noise * noise), start)
-        moduli.append(found.modulus[0, 1])
-    e = found.standard_errors[0, 1] / found.noise_factor[0]
-    assert 0.5 < np.std(np.real(moduli), ddof=1) / e.real < 1.6 and 0.5 < np.std(np.imag(moduli), ddof=1) / e.imag < 1.6
-
-
-def test_a_region_that_says_nothing_is_told():
-    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
-    labels = field.labels.copy()
-    labels[0, 0, 0] = 9  # at a corner, where no force is known
-    own = organ_of(field._replace(labels=labels))
-    found = elastography.regions_of(own)
-    assert np.all(np.isfinite(found.parts.modulus))
-    told = waves_report._cautions(own, found, None)
-    assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)
+    for centre in ((3e-4, -4e-4), (1e-3, 1e-5)):
+        field = beside_a_cylinder(radius, centre, 2e-3, 100.0, noise=0.0, voxels_across=23)
+        own, known = organ_of(field), np.array([1, 2])
+        for patch, of_labels in ((0.13, True), (1e-3, True), (1e-3, False)):
+            monkeypatch.setattr(edge_places, "PATCH", patch)
+            out = (0.0, edge_places.FARTHER)
+            if of_labels:
+                s = [edge_places.places(field.labels, own.body, known, far) for far in out]
+            else:
+                s = [in_its_true_place(field, radius, centre, far) for far in out]
+            m = edges.region_matrices(own.matrices, own.body, DENSITY, *s)
+            found = regions.moduli_of_regions(m, own.waves, np.array([SOFT, STIFF]) + 200j * np.pi)
+            off.append(found.modulus[0, 1].real / STIFF - 1)
+    patches, whole, true = np.abs(np.reshape(off, (2, 3))).max(axis=0)
+    assert true < most and patches < most + 0.01, off
+    assert whole >= edges_do, off

@@ -15,21 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
-from scipy import ndimage
 
-from fitting.waves import balance
+from fitting.waves import balance, edge_places
 from fitting.waves.balance import Matrices
+from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
-#: Standard deviation of the Gaussian that smooths the steps of labels [voxels].
-SMOOTHING = 1.0
-#: Parts of a voxel's side by which volumes are counted.
-FINE = 4
 #: Levels of halving of cut elements, in whose parts edges are planes; and elements at a time.
 HALVINGS, CHUNK = 3, 60
-#: How far edges are moved to see what their place does [voxels].
-FARTHER = 0.1
 
 
 class RegionMatrices(NamedTuple):
@@ -41,8 +35,9 @@ class RegionMatrices(NamedTuple):
     forces: scipy.sparse.csr_array  # (I, P) of pressures, each with the same large variance
     pressure: np.ndarray  # their covariance, as of `Matrices`
     kinks: int  # unknowns that are not measured
-    near: np.ndarray  # (I,) region whose edge each row is nearest to, -1: none
-    farther: "RegionMatrices | None" = None  # the same with all edges farther out by `FARTHER`
+    patches: Patches
+    patch: np.ndarray  # (I,) patch of the edges that each row is nearest to, -1: none
+    farther: "RegionMatrices | None" = None  # the same with all edges farther out by `edge_places.FARTHER`
 
     @property
     def balances(self) -> int:
@@ -58,14 +53,14 @@ class RegionMatrices(NamedTuple):
         return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
-        """Derivatives (I, R) of C u - B p by how far the edges of each region lie outwards [voxels]."""
-        out = np.zeros((len(self.near), len(self.stiffness)), complex)
+        """Derivatives (I, P) of C u - B p by how far each patch of the edges lies outwards [voxels]."""
+        out = np.zeros((len(self.patch), len(self.patches.region)), complex)
         if self.farther is not None:
             p = self.forces.T @ here.multipliers
             changed = (self.farther.rows(G, omega) - self.rows(G, omega)) @ here.motion
             changed = changed - (self.farther.forces - self.forces) @ p
-            known = np.flatnonzero(self.near >= 0)
-            out[known, self.near[known]] = changed[known] / FARTHER
+            known = np.flatnonzero(self.patch >= 0)
+            out[known, self.patch[known]] = changed[known] / edge_places.FARTHER
         return out
 
     def _filled(self, entries: np.ndarray) -> scipy.sparse.csr_array:
@@ -83,49 +78,6 @@ class _CutElements(NamedTuple):
     divergence: np.ndarray  # (K, n, 3, 4): integrals of the divergence times the corners' linear functions
 
 
-def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: float = 0.0) -> np.ndarray:
-    """Smoothed places s_k (R, V) of the labels `known` (R,) at the nodes.
-
-    Smoothed twice, so that curved edges stay nearly where they are, and shifted to the volume that the labels have.
-
-    Args:
-        labels: (nx, ny, nz).
-        body: its voxels hold labels; outside the nearest label goes on.
-        known: (R,).
-        farther: how far [voxels] the edges of all regions but the largest are moved outwards.
-    """
-    measured = np.zeros(labels.shape, bool)
-    measured[tuple(body.voxel.T)] = True
-    nearest = ndimage.distance_transform_edt(~measured, return_distances=False, return_indices=True)
-    whole = labels[tuple(nearest)]
-    s = np.array([_smoothed(whole == label) for label in known])
-    counts = [int(np.sum(whole == label)) for label in known]
-    largest, out = int(np.argmax(counts)), s.copy()
-    for k in range(len(known)):
-        if k != largest:
-            others = np.delete(s, k, axis=0).max(axis=0)
-            out[k] += _level(s[k] - others, whole == known[k], counts[k])
-            if farther:
-                slope = np.gradient(out[k])
-                out[k] = out[k] + farther * np.sqrt(sum(g**2 for g in slope))
-    return np.asarray(out[(slice(None), *body.voxel.T)])
-
-
-def _smoothed(place: np.ndarray) -> np.ndarray:
-    once = ndimage.gaussian_filter(place.astype(float), SMOOTHING, mode="nearest")
-    return 2 * once - ndimage.gaussian_filter(once, SMOOTHING, mode="nearest")
-
-
-def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
-    """What to add to a field so that it is positive in as much of the volume as the label has, near its voxels."""
-    reach = ndimage.find_objects(place.astype(int))[0]
-    box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
-    # Values within the voxels, linear between the centres.
-    inside = [np.clip(np.arange(n * FINE) / FINE + (0.5 / FINE - 0.5), 0, n - 1) for n in above[box].shape]
-    fine = ndimage.map_coordinates(above[box], np.meshgrid(*inside, indexing="ij"), order=1)
-    return -float(np.partition(fine.ravel(), -count * FINE**3)[-count * FINE**3])
-
-
 def region_matrices(
     m: Matrices, body: VoxelBody, density: float, s: np.ndarray, farther: np.ndarray | None = None
 ) -> RegionMatrices:
@@ -135,7 +87,7 @@ def region_matrices(
         m, body: `balance.matrices` and its elements.
         density: [kg/m^3].
         s: `places` (R, V).
-        farther: the same with edges that are `FARTHER` out.
+        farther: the same with edges that are `edge_places.FARTHER` out.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]
@@ -143,21 +95,19 @@ def region_matrices(
     cut = np.flatnonzero(np.any(own != own[0], axis=0))
     kinked = np.unique(tets[cut])
     parts = [_cut_parts(body, each, cut, kinked) if len(cut) else [] for each in both]
-    alive = _with_forces(parts[0] + parts[-1], len(kinked), body.mesh.number_of_nodes)
+    alive = _with_forces(parts[0], len(kinked), body.mesh.number_of_nodes)
     kinked = kinked[alive]
     rows = _numbers_of_rows(body, kinked)
     whole = _whole_parts(m, body, own[0], np.setdiff1d(np.arange(nodes.shape[1]), cut), density)
-    near = np.full(int(rows.max()) + 1, -1)
-    if len(s) > 1:
-        smaller = np.arange(len(s)) != np.bincount(s.argmax(axis=0), minlength=len(s)).argmax()
-        nearest = np.flatnonzero(smaller)[s[smaller].argmax(axis=0)]
-        at = np.concatenate([np.arange(body.mesh.number_of_nodes), kinked])
-        known = rows >= 0
-        near[rows[known]] = np.repeat(nearest[at], 3)[known]
+    patches, of_node = patches_of(s, body, np.unique(nodes[:, cut]))
+    at = np.concatenate([np.arange(body.mesh.number_of_nodes), kinked])
+    patch, known = np.full(int(rows.max()) + 1, -1), rows >= 0
+    patch[rows[known]] = np.repeat(of_node[at], 3)[known]
     found = []
     for own_parts in parts:
         each = [_renumbered(p, alive, body.mesh.number_of_nodes) for p in own_parts]
-        found.append(_all_together([whole, *each], rows, len(s), density)._replace(kinks=3 * len(kinked), near=near))
+        own_matrices = _all_together([whole, *each], rows, len(s), density)
+        found.append(own_matrices._replace(kinks=3 * len(kinked), patches=patches, patch=patch))
     return found[0] if farther is None else found[0]._replace(farther=found[1])
 
 
@@ -282,7 +232,9 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
     corners = 1 + max(int(p.corners.max()) for p in parts)
     B = _pressure_columns(parts, rows, (I, corners * R), corners)
     forces = balance.freely(B, balance.TYPICAL * stiffness.sum(axis=0))
-    return RegionMatrices(stiffness, mass, pattern, forces, balance.by_diagonals(forces @ forces.T), 0, np.zeros(0))
+    return RegionMatrices(
+        stiffness, mass, pattern, forces, balance.by_diagonals(forces @ forces.T), 0, NO_PATCHES, np.zeros(0)
+    )
 
 
 def _pattern(

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.waves import balance, edges, regions, stiffness_map, voxels
+from fitting.waves import balance, edge_places, edges, regions, stiffness_map, voxels
 from fitting.waves.balance import Matrices, gigabytes
 from fitting.waves.regions import MeasuredWaves, Regions
 from fitting.waves.voxels import VoxelBody
@@ -68,7 +68,7 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     if labels is None:
         return Found(whole, None, None, bias)
     known = np.unique(labels[tuple(body.voxel.T)])
-    each = [edges.places(labels, body, known, farther) for farther in (0.0, edges.FARTHER)]
+    each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
     matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
     parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress)
     return Found(whole, known, parts, bias)
