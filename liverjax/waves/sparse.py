@@ -7,7 +7,7 @@ whole matrix, follows where that fails.
 
 import hashlib
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ from liverjax.solvers.direct import across
 from liverjax.solvers.factors import multifrontal
 from liverjax.solvers.factors.dissection import dissected
 from liverjax.waves.operator import Motion, Operator, forces_of_motion, free_part
+
+if TYPE_CHECKING:
+    import scipy.sparse
 
 #: Motions of every frequency: (F, V, 3), and (F, P) or None.
 Motions = Motion
@@ -85,8 +88,9 @@ class _Order(NamedTuple):
     """
 
     pairs: np.ndarray  # (n n E,) place of each two nodes of an element among the blocks
-    blocks: Any  # csr (V, V): two nodes of an element
+    blocks: "scipy.sparse.csr_array"  # (V, V): two nodes of an element
     free: np.ndarray  # numbers of the free unknowns
+    entries: "scipy.sparse.csr_array"  # of the free unknowns of nodes: places of the entries among those of the blocks
     plan: list[multifrontal.Front]
 
 
@@ -148,8 +152,17 @@ def _order(A: Any, free: np.ndarray) -> _Order:
         groups = dissected(elements, np.asarray(A.points))
         plan = multifrontal.fronts(near.tocsr(), groups, np.where(free < 3 * V, free // 3, free - 3 * V))
         _orders.clear()
-        _orders[key] = _Order(pairs, blocks, free, plan)
+        _orders[key] = _Order(pairs, blocks, free, _entries_of_free(blocks, free[free < 3 * V]), plan)
     return _orders[key]
+
+
+def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "scipy.sparse.csr_array":
+    """Places of the entries of free unknowns among those of all blocks."""
+    import scipy.sparse
+
+    every = np.arange(9 * blocks.nnz).reshape(-1, 3, 3)
+    size = 3 * blocks.shape[0]
+    return scipy.sparse.bsr_array((every, blocks.indices, blocks.indptr), shape=(size, size)).tocsr()[free][:, free]
 
 
 def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
@@ -157,17 +170,13 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
     import scipy.sparse
 
     V, blocks = len(A.points), order.blocks
-    size, data = 3 * V, np.empty((blocks.nnz, 3, 3), complex)
-    for r, s in np.ndindex(3, 3):
-        own = factor * A.relaxing[:, r, :, s]
-        if A.rest is not None:
-            own += A.rest[:, r, :, s]
-        if r == s and A.mass is not None and A.mass.ndim == 3:
-            own -= omega**2 * A.mass
-        for part, to in ((own.real, data.real), (own.imag, data.imag)):
-            to[:, r, s] = np.bincount(order.pairs, part.ravel(), blocks.nnz)
-    K = scipy.sparse.bsr_array((data, blocks.indices, blocks.indptr), shape=(size, size)).tocsr()
+    size, data = 3 * V, _blocks_of_nodes(A, order, factor, omega)
     more = _entries_beside(A, omega)
+    if not more and A.free.normals is None:
+        entries = order.entries
+        values = data.ravel()[entries.data]
+        return scipy.sparse.csr_array((values, entries.indices, entries.indptr), shape=entries.shape)
+    K = scipy.sparse.bsr_array((data, blocks.indices, blocks.indptr), shape=(size, size)).tocsr()
     if more:
         size += 0 if A.pressures is None else len(A.pressures.mask)
         values, lines, columns = (np.concatenate(a) for a in zip(*more, strict=True))
@@ -180,6 +189,32 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
         inside = scipy.sparse.eye_array(size) - normals
         K = (inside @ K @ inside + abs(K.diagonal()).mean() * normals).tocsr()
     return K if len(order.free) == size else K[order.free][:, order.free]
+
+
+def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) -> np.ndarray:
+    """Sums over the elements, (blocks, 3, 3) complex.
+
+    Real sums, and as few of them as there are different ones: large new arrays cost more here than their numbers.
+    """
+    number = order.blocks.nnz
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        return np.bincount(order.pairs, values.ravel(), number)
+
+    data = np.empty((number, 3, 3), complex)
+    inertia = None if A.mass is None or A.mass.ndim == 1 else omega**2 * summed(A.mass)
+    for r, s in np.ndindex(3, 3):
+        own, to = A.relaxing[:, r, :, s], data[:, r, s]
+        if factor.ndim:  # by element
+            to.real, to.imag = summed(factor.real * own), summed(factor.imag * own)
+        else:
+            whole = summed(own)
+            to.real, to.imag = factor.real * whole, factor.imag * whole
+        if A.rest is not None:
+            to.real += summed(A.rest[:, r, :, s])
+        if r == s and inertia is not None:
+            to.real -= inertia
+    return data
 
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:

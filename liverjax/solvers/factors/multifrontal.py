@@ -3,10 +3,11 @@
 `liverjax.solvers.factors.dissection` has the order. Each group of nodes is eliminated in a dense matrix of itself and
 its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is products of
 matrices. Groups whose children are done are eliminated side by side, one a core. By symmetry the lower triangles are
-enough. Pivots are chosen within the unknowns that are eliminated together. Large matrices are factorised in single
-precision and solved with refinement: half the time and memory, and the same digits. Where that does not converge,
-double precision follows. Factors that are too many for the memory are kept as whole numbers of 16 bits, each row with
-a size of its own: half the memory again, with about two more steps of refinement.
+enough. A piece that nothing else runs beside has its tiles side by side instead. Pivots are chosen within the unknowns
+that are eliminated together. Large matrices are factorised in single precision and solved with refinement: half the
+time and memory, and the same digits. Where that does not converge, double precision follows. Factors that are too many
+for the memory are kept as whole numbers of 16 bits, each row with a size of its own: half the memory again, with about
+two more steps of refinement.
 """
 
 import itertools
@@ -145,11 +146,11 @@ class _Elimination(NamedTuple):
     rests: list[np.ndarray | None]  # what each group leaves to the next
     steps: list[list[Eliminated]]  # of each group
 
-    def piece(self, groups: list[int]) -> None:
-        """Eliminate some groups, one after the other."""
+    def piece(self, groups: list[int], cores: int) -> None:
+        """Eliminate some groups, one after the other, the tiles of each on this number of cores."""
         place = np.full(self.A.shape[0], -1)
         size = max(len(front.own) + len(front.border) for front in (self.plan[k] for k in groups))
-        memory, scratch = np.empty(size**2, self.kind), np.empty(min(size, TILE) ** 2, self.kind)
+        memory, scratch = np.empty(size**2, self.kind), np.empty((cores, min(size, TILE) ** 2), self.kind)
         for k in groups:
             front = self.plan[k]
             F, n = _matrix_of_group(self.A, front, place, memory), len(front.own)
@@ -162,7 +163,7 @@ class _Elimination(NamedTuple):
             steps = _eliminated(F, front, scratch)
             self.steps[k] = [_in_whole_numbers(step) for step in steps] if self.small else steps
             if len(front.border):
-                self.rests[k] = F[n:, n:].copy(order="F")
+                self.rests[k] = _lower_triangle(F[n:, n:])
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
@@ -172,7 +173,8 @@ def _all_pieces(own: _Elimination) -> list[Eliminated]:
     with ThreadPoolExecutor(_cores()) as pool:
         ready = [k for k, missing in enumerate(waits_for) if not missing]
         while ready or running:
-            running |= {pool.submit(own.piece, pieces[k]): k for k in ready}
+            cores = _cores() if len(ready) == 1 and not running else 1
+            running |= {pool.submit(own.piece, pieces[k], cores): k for k in ready}
             over = wait(running, return_when=FIRST_COMPLETED).done
             ended = {running.pop(future) for future in over}
             for future in over:
@@ -241,6 +243,14 @@ def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray
     return F
 
 
+def _lower_triangle(F: np.ndarray) -> np.ndarray:
+    """A copy of it, with what stands above it in the tiles of the diagonal: half of the memory is never touched."""
+    out = np.zeros(F.shape, F.dtype, order="F")
+    for a in range(0, len(F), TILE):
+        out[a:, a : a + TILE] = F[a:, a : a + TILE]
+    return out
+
+
 def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
     """Add a lower triangle to F at rising places `at`, of which many follow each other."""
     ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1), len(at)]
@@ -258,9 +268,8 @@ def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Elimin
         A = np.tril(F[a:b, a:b])
         inverse = _inverted(A + np.tril(A, -1).T)
         B = F[b:, a:b].T
-        X = inverse @ B
+        X = _taken_off(F[b:, b:], B, inverse, scratch)
         found.append(Eliminated(every[a:b], every[b:], inverse, X))
-        _take_off(F[b:, b:], B, X, scratch)
     return found
 
 
@@ -284,14 +293,29 @@ def _inverted(A: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _take_off(rest: np.ndarray, B: np.ndarray, X: np.ndarray, scratch: np.ndarray) -> None:
-    """Take B^T X, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile."""
-    for j in range(0, len(rest), TILE):
-        for i in range(j, len(rest), TILE):
-            tile = rest[i : i + TILE, j : j + TILE]
-            product = scratch[: tile.size].reshape(tile.shape, order="F")
-            np.matmul(B[:, i : i + TILE].T, X[:, j : j + TILE], out=product)
-            tile -= product
+def _taken_off(rest: np.ndarray, B: np.ndarray, inverse: np.ndarray, scratch: np.ndarray) -> np.ndarray:
+    """Take B^T A^-1 B, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile; return A^-1 B.
+
+    On as many cores as there are rows of `scratch`, each of which is a tile.
+    """
+    X, starts = np.empty(B.shape, B.dtype), range(0, len(rest), TILE)
+
+    def columns(own: range, memory: np.ndarray) -> None:
+        for j in own:
+            X[:, j : j + TILE] = inverse @ B[:, j : j + TILE]
+            for i in range(j, len(rest), TILE):
+                tile = rest[i : i + TILE, j : j + TILE]
+                product = memory[: tile.size].reshape(tile.shape, order="F")
+                np.matmul(B[:, i : i + TILE].T, X[:, j : j + TILE], out=product)
+                tile -= product
+
+    if len(scratch) == 1 or len(starts) < 4:
+        columns(starts, scratch[0])
+    else:
+        # Columns of tiles grow shorter: dealt out in turn, each core has about the same.
+        with ThreadPoolExecutor(len(scratch)) as pool:
+            list(pool.map(columns, [starts[k :: len(scratch)] for k in range(len(scratch))], scratch))
+    return X
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
