@@ -280,3 +280,22 @@ def test_density_is_one_number_or_one_a_node():
         for refused in (lj.simulate, lj.check_scene):
             with pytest.raises(lj.InputError, match=re.escape(sentence)):
                 refused(body)
+
+
+@pytest.mark.parametrize(
+    ("parts", "sentence"),
+    [
+        ({"fixed": np.arange(9)}, "fixed is of type ndarray: give a tuple, with an lj.Fixed in it"),
+        ({"fixed": (np.arange(9),)}, "fixed.0 is of type ndarray: give an lj.Fixed"),
+        ({"law": "neo_hookean"}, "law is of type str: give a law of lj.laws"),
+        ({"viscosity": {"ratios": [0.5]}}, "viscosity is of type dict: give an lj.Prony"),
+        ({"physics": (3.0,)}, "physics.0 is of type float: give a physics, such as lj.Obstacle"),
+    ],
+)
+def test_parts_of_another_type_are_refused(parts, sentence):
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+    given = {"mesh": mesh, "law": lj.laws.NeoHookean(mu=1.0, bulk=10.0)} | parts
+    for run in (lj.simulate, lambda scene: lj.harmonic(scene, [60.0])):
+        with pytest.raises(lj.InputError) as refused:
+            run(lj.Scene(**given))
+        assert str(refused.value) == sentence

@@ -9,17 +9,17 @@ from liverjax import laws
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.mesh.selection import AXES, check_nodes, check_triangles
-from liverjax.mesh.tetrahedra import check_mesh
+from liverjax.mesh.tetrahedra import TetMesh, check_mesh
 from liverjax.physics import porosity, viscosity
 from liverjax.physics.base import Physics
 from liverjax.physics.loads import Traction
-from liverjax.physics.prescribed import Displaced, free_places
+from liverjax.physics.prescribed import Displaced, Fixed, free_places
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.volumes.mixed import check_mixed_law
 from liverjax.scenes.region_checks import check_region_elements, check_region_numbers
-from liverjax.scenes.regions import laws_of
-from liverjax.scenes.scene import Body, Scene
-from liverjax.scenes.springpots import check_springpots
+from liverjax.scenes.regions import Region, laws_of
+from liverjax.scenes.scene import Body, Scene, Solve
+from liverjax.scenes.springpots import SpringpotSeries, check_springpots
 
 #: What the choices of [solve] may be.
 CHOICES = {
@@ -31,6 +31,17 @@ CHOICES = {
     "volumetric": ("element", "nodal", "mixed", "auto"),
     "robust": ("off", "projected", "regularised"),
 }
+#: Of what type the parts of a scene are: one, and several.
+PARTS = {
+    "mesh": TetMesh,
+    "law": laws.Law,
+    "viscosity": viscosity.Prony,
+    "springpots": SpringpotSeries,
+    "porosity": porosity.Porosity,
+    "body": Body,
+    "solve": Solve,
+}
+SEVERAL = {"region": Region, "fixed": Fixed, "displaced": Displaced, "traction": Traction, "physics": Physics}
 #: What [body] mass may be.
 MASSES = ("lumped", "consistent")
 
@@ -51,6 +62,7 @@ def check_choices(scene: Scene) -> None:
     Raises:
         InputError: unknown choices; a load or motion given twice, not at all, of wrong shape.
     """
+    _check_kinds(scene)
     for key, allowed in CHOICES.items():
         value = getattr(scene.solve, key)
         if value not in allowed:
@@ -76,6 +88,27 @@ def check_choices(scene: Scene) -> None:
         _body(scene.body, scene.mesh.number_of_nodes)
     for k, motion in enumerate(scene.displaced):
         _check_motion(motion, f"displaced.{k}")
+
+
+def _check_kinds(scene: Scene) -> None:
+    """Refuse parts that are something else, such as numbers of nodes in place of `Fixed`."""
+    for key, kind in PARTS.items():
+        own = getattr(scene, key)
+        if own is not None and not isinstance(own, kind):
+            raise InputError(f"{key} is of type {type(own).__name__}: give {_named(kind)}")
+    for key, kind in SEVERAL.items():
+        own = getattr(scene, key)
+        if not isinstance(own, tuple | list):
+            raise InputError(f"{key} is of type {type(own).__name__}: give a tuple, with {_named(kind)} in it")
+        for k, each in enumerate(own):
+            if not isinstance(each, kind):
+                raise InputError(f"{key}.{k} is of type {type(each).__name__}: give {_named(kind)}")
+
+
+def _named(kind: type) -> str:
+    """What a user writes for a value of a type."""
+    families = {laws.Law: "a law of lj.laws", Physics: "a physics, such as lj.Obstacle"}
+    return families.get(kind, f"an lj.{kind.__name__}")
 
 
 def _loaded(scene: Scene) -> None:
