@@ -95,19 +95,19 @@ def _check_kinds(scene: Scene) -> None:
     for key, kind in PARTS.items():
         own = getattr(scene, key)
         if own is not None and not isinstance(own, kind):
-            raise InputError(f"{key} is of type {type(own).__name__}: give {_named(kind)}")
+            raise InputError(f"{key} is of type {type(own).__name__}: give {_remedy(kind)}")
     for key, kind in SEVERAL.items():
         own = getattr(scene, key)
         if not isinstance(own, tuple | list):
-            raise InputError(f"{key} is of type {type(own).__name__}: give a tuple, with {_named(kind)} in it")
+            raise InputError(f"{key} is of type {type(own).__name__}: give a tuple, with {_remedy(kind)} in it")
         for k, each in enumerate(own):
             if not isinstance(each, kind):
-                raise InputError(f"{key}.{k} is of type {type(each).__name__}: give {_named(kind)}")
+                raise InputError(f"{key}.{k} is of type {type(each).__name__}: give {_remedy(kind)}")
 
 
-def _named(kind: type) -> str:
+def _remedy(kind: type) -> str:
     """What a user writes for a value of a type."""
-    families = {laws.Law: "a law of lj.laws", Physics: "a physics, such as lj.Obstacle"}
+    families: dict[object, str] = {laws.Law: "a law of lj.laws", Physics: "a physics, such as lj.Obstacle"}
     return families.get(kind, f"an lj.{kind.__name__}")
 
 
