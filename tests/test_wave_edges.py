@@ -136,6 +136,34 @@ def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
     assert np.all(m.patches.region == 1)  # the surroundings have no edge of their own
 
 
+def test_how_far_labels_tell_the_edge_of_a_circle():
+    """Circles of 2.5, 5 and 8 voxels anywhere among the voxels: deviations and length of `edge_places`.
+
+    The deviation of whole edges is larger there, for labels are rarely so good.
+    """
+    rng, around = np.random.default_rng(0), np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    way = np.stack([np.cos(around), np.sin(around), 0 * around], axis=-1)
+    for radius in (2.5, 5.0, 8.0):
+        n = int(2 * radius + 8) | 1
+        X = np.stack(np.meshgrid(np.arange(n), np.arange(n), np.arange(5), indexing="ij"), axis=-1)
+        body, out = voxels.voxel_body(np.ones(X.shape[:3], bool), np.ones(3)), []
+        for _ in range(30):
+            centre = np.array([n // 2, n // 2, 2]) + np.append(rng.uniform(-0.5, 0.5, 2), 0.0)
+            labels = 1 + (np.hypot(*np.moveaxis((X - centre)[..., :2], -1, 0)) < radius)
+            s, above = edge_places.places(labels, body, np.array([1, 2])), np.zeros(labels.shape)
+            above[tuple(body.voxel.T)] = s[1] - s[0]
+            at = radius + np.linspace(-1, 1, 81)
+            line = ndimage.map_coordinates(above, np.moveaxis(centre + at[:, None, None] * way, -1, 0), order=1)
+            out.append(at[np.argmax(line < 0, axis=0)] - radius)
+        whole = np.mean(out, axis=1)
+        local = np.array(out) - whole[:, None]
+        alike = np.mean(local * np.roll(local, -1, axis=1)) / np.mean(local**2)
+        step = 2 * np.pi * radius / 60
+        assert np.std(whole) < edge_places.WHOLE / 2 and abs(np.mean(whole)) < 0.05
+        assert np.std(local) == pytest.approx(edge_places.PATCH, rel=0.15)
+        assert step / np.sqrt(-2 * np.log(alike)) == pytest.approx(edge_places.ALIKE, rel=0.3)
+
+
 def test_smoothed_labels_keep_place_and_volume():
     grid = np.stack(np.meshgrid(*[np.arange(15)] * 3, indexing="ij"), axis=-1)
     labels = np.where(np.linalg.norm(grid - [7.2, 6.9, 7.0], axis=-1) < 3, 7, 2)
@@ -227,3 +255,30 @@ def test_what_labels_and_elements_do_to_a_cylinder(radius, most, edges_do, monke
     patches, whole, true = np.abs(np.reshape(off, (2, 3))).max(axis=0)
     assert true < most and patches < most + 0.01, off
     assert whole >= edges_do, off
+
+
+def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
+    """Twelve measurements scatter as the standard errors say: their ratio has itself a deviation of a fifth."""
+    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, noise=0.0, voxels_across=13)
+    own = organ_of(field)
+    m = edges.region_matrices(
+        own.matrices, own.body, DENSITY, edge_places.places(field.labels, own.body, np.array([1, 2]))
+    )
+    moduli, rng, start = [], np.random.default_rng(0), np.array([3000 + 600j, 9000 + 600j])
+    for _ in range(12):
+        noise = rng.normal(size=own.waves.motion.shape) + 1j * rng.normal(size=own.waves.motion.shape)
+        found = regions.moduli_of_regions(m, own.waves._replace(motion=own.waves.motion + field.noise * noise), start)
+        moduli.append(found.modulus[0, 1])
+    e = found.standard_errors[0, 1] / found.noise_factor[0]
+    assert 0.5 < np.std(np.real(moduli), ddof=1) / e.real < 1.6 and 0.5 < np.std(np.imag(moduli), ddof=1) / e.imag < 1.6
+
+
+def test_a_region_that_says_nothing_is_told():
+    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 100.0, voxels_across=13)
+    labels = field.labels.copy()
+    labels[0, 0, 0] = 9  # at a corner, where no force is known
+    own = organ_of(field._replace(labels=labels))
+    found = elastography.regions_of(own)
+    assert np.all(np.isfinite(found.parts.modulus))
+    told = waves_report._cautions(own, found, None)
+    assert any("region 9: its standard error" in one for one in told) and not any("region 2" in one for one in told)

@@ -55,7 +55,6 @@ class _State(NamedTuple):
     here: Balanced
     gradient: np.ndarray  # (2 R + P,) by storage, loss and patches of edges
     hessian: np.ndarray
-    labels: np.ndarray  # (2 R + P, 2 R + P): what the labels add to the Hessian
 
 
 def first_modulus(m: Matrices, waves: MeasuredWaves) -> complex:
@@ -97,7 +96,8 @@ def _one_frequency(m, waves, f, G, progress):
     """Modulus (R,), covariance (2 R, 2 R), places of edges (R,), chi^2, iterations, and whether they ended."""
     R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
     now, converged, k = _state_of_regions(m, G, *at), False, 0
-    step, covariance = _gauss_newton(now)
+    labels = _of_labels(m, R)
+    step, covariance = _gauss_newton(now, labels)
     for k in range(1, ITERATIONS + 1):
         both = step[:R] + 1j * step[R : 2 * R]
         part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # by half of itself at most
@@ -107,7 +107,7 @@ def _one_frequency(m, waves, f, G, progress):
         for _ in range(8):
             if np.all((now.G + part * both).real > 0):
                 new = _state_of_regions(m, now.G + part * both, *at)
-                if close or _least(new) <= _least(now) * (1 + 1e-10):
+                if close or _least(new, labels) <= _least(now, labels) * (1 + 1e-10):
                     break
                 new = None
             part *= 0.5
@@ -115,7 +115,7 @@ def _one_frequency(m, waves, f, G, progress):
             break
         now = new
         progress(k, now.here.chi2 / m.balances)
-        step, covariance = _gauss_newton(now)
+        step, covariance = _gauss_newton(now, labels)
         converged = _in_errors(step, covariance, R) < ENOUGH
         if converged or part < 1e-2:
             break
@@ -128,14 +128,14 @@ def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:
     return float(np.max(np.abs(step[: 2 * R]) / np.sqrt(np.diagonal(covariance)[: 2 * R])))
 
 
-def _gauss_newton(now: _State) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Step (2 R + P,) of storage, loss and edges, and their covariance.
 
     Edges begin each time where the labels have them: by their place the equations are nearly linear. The derivatives by
     the moduli are of these edges too. With those of the likeliest edges, the errors of edges would be in them twice:
     cylinders of 2.5 voxels come out a percent stiffer.
     """
-    H = now.hessian + now.labels
+    H = now.hessian + labels
     silent = np.diagonal(H) == 0  # a region without an element of its own
     H[silent, silent] = 1.0
     covariance = np.linalg.inv(H)
@@ -151,10 +151,10 @@ def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
     return out
 
 
-def _least(now: _State) -> float:
+def _least(now: _State, labels: np.ndarray) -> float:
     """chi^2 with the best places of the edges at these moduli."""
     R = len(now.G)
-    g, H = now.gradient[2 * R :], (now.hessian + now.labels)[2 * R :, 2 * R :]
+    g, H = now.gradient[2 * R :], (now.hessian + labels)[2 * R :, 2 * R :]
     return float(now.here.chi2 - g @ np.linalg.solve(H, g))
 
 
@@ -169,4 +169,4 @@ def _state_of_regions(m: RegionMatrices, G: np.ndarray, omega: float, motion: np
     # Loss acts as i times storage.
     X = np.concatenate([X[:, :R], 1j * X[:, :R], X[:, R:]], axis=1)
     gradient = np.concatenate([g[:R].real, g[:R].imag, g[R:].real])
-    return _State(G, here, gradient, np.real(X.conj().T @ X) / sd**2, _of_labels(m, R))
+    return _State(G, here, gradient, np.real(X.conj().T @ X) / sd**2)

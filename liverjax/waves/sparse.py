@@ -90,7 +90,7 @@ class _Order(NamedTuple):
     pairs: np.ndarray  # (n n E,) place of each two nodes of an element among the blocks
     blocks: "scipy.sparse.csr_array"  # (V, V): two nodes of an element
     free: np.ndarray  # numbers of the free unknowns
-    entries: "scipy.sparse.csr_array"  # of the free unknowns of nodes: places of the entries among those of the blocks
+    entries: "scipy.sparse.csr_array | None"  # of free unknowns: places among the blocks; None: there are other entries
     plan: list[multifrontal.Front]
 
 
@@ -137,7 +137,8 @@ def _order(A: Any, free: np.ndarray) -> _Order:
     import scipy.sparse  # a fifth of the time that importing the package takes: only where it is used
 
     V, widths = len(A.points), [A.nodes, *(own.nodes for own in A.attached)]
-    key = _digest((widths, A.points, free))
+    alone = _elements_alone(A)
+    key = _digest((widths, A.points, free)) + bytes([alone])
     if key not in _orders:
         lines, columns = (a.ravel() for a in np.broadcast_arrays(A.nodes[:, None], A.nodes[None]))
         known, pairs = np.unique(lines.astype(np.int64) * V + columns, return_inverse=True)
@@ -152,8 +153,14 @@ def _order(A: Any, free: np.ndarray) -> _Order:
         groups = dissected(elements, np.asarray(A.points))
         plan = multifrontal.fronts(near.tocsr(), groups, np.where(free < 3 * V, free // 3, free - 3 * V))
         _orders.clear()
-        _orders[key] = _Order(pairs, blocks, free, _entries_of_free(blocks, free[free < 3 * V]), plan)
+        _orders[key] = _Order(pairs, blocks, free, _entries_of_free(blocks, free) if alone else None, plan)
     return _orders[key]
+
+
+def _elements_alone(A: Any) -> bool:
+    """Whether all entries are those of the elements' motion, and no node slides."""
+    other = (A.springs, A.pressures, A.free.normals)
+    return all(own is None for own in other) and not A.attached and (A.mass is None or A.mass.ndim == 3)
 
 
 def _entries_of_free(blocks: "scipy.sparse.csr_array", free: np.ndarray) -> "scipy.sparse.csr_array":
@@ -170,13 +177,12 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
     import scipy.sparse
 
     V, blocks = len(A.points), order.blocks
-    size, data = 3 * V, _blocks_of_nodes(A, order, factor, omega)
-    more = _entries_beside(A, omega)
-    if not more and A.free.normals is None:
-        entries = order.entries
+    size, data, entries = 3 * V, _blocks_of_nodes(A, order, factor, omega), order.entries
+    if entries is not None:
         values = data.ravel()[entries.data]
         return scipy.sparse.csr_array((values, entries.indices, entries.indptr), shape=entries.shape)
     K = scipy.sparse.bsr_array((data, blocks.indices, blocks.indptr), shape=(size, size)).tocsr()
+    more = _entries_beside(A, omega)
     if more:
         size += 0 if A.pressures is None else len(A.pressures.mask)
         values, lines, columns = (np.concatenate(a) for a in zip(*more, strict=True))
