@@ -72,6 +72,7 @@ def test_the_modes_of_a_springpot_answer_as_mittag_leffler_functions(name):
     assert np.allclose(storage + 1j * loss, FORMULAS[name](1j * omega, *TRUTHS[name]), rtol=5e-4)
 
 
+@pytest.mark.slow
 def test_a_relaxation_test_gives_the_numbers_of_a_springpot_model_back(tmp_path, capsys):
     answer = inverse_laplace("fractional_zener", False) * (1 + 0.005 * np.random.default_rng(0).standard_normal(25))
     rows = [f"{t:.12g},{g:.12g}" for t, g in zip(TIMES, answer, strict=True)]

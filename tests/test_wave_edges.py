@@ -182,7 +182,7 @@ def test_smoothed_labels_keep_place_and_volume():
 @pytest.mark.parametrize(
     ("radius", "centre", "spacing", "elements"),
     [
-        (0.005, (3e-4, -4e-4), 1e-3, 0.01),
+        pytest.param(0.005, (3e-4, -4e-4), 1e-3, 0.01, marks=pytest.mark.slow),
         (0.005, (1.3e-3, 1e-4), 2e-3, 0.07),
         pytest.param(0.005, (8e-4, 1e-4), 1e-3, 0.01, marks=pytest.mark.slow),
         pytest.param(0.003, (3e-4, -4e-4), 1e-3, 0.01, marks=pytest.mark.slow),
