@@ -46,15 +46,28 @@ def test_affected_release_is_refused(release, monkeypatch):
         _import_again()
 
 
-def test_import_turns_on_64_bits_unless_the_user_chose(monkeypatch):
+def test_import_turns_on_64_bits_and_whole_products_unless_the_user_chose(monkeypatch):
     told = []
     monkeypatch.setattr(type(jax.config), "update", lambda _, *what: told.append(what))
     monkeypatch.setenv("JAX_ENABLE_X64", "0")
+    monkeypatch.setenv("JAX_DEFAULT_MATMUL_PRECISION", "bfloat16")
     _import_again()
     assert told == []
     monkeypatch.delenv("JAX_ENABLE_X64")
+    monkeypatch.delenv("JAX_DEFAULT_MATMUL_PRECISION")
     _import_again()
-    assert told == [("jax_enable_x64", True)]
+    assert told == [("jax_enable_x64", True), ("jax_default_matmul_precision", "highest")]
+
+
+@pytest.mark.skipif("JAX_DEFAULT_MATMUL_PRECISION" in os.environ, reason="chosen by the environment")
+def test_float32_is_multiplied_whole():
+    """A GPU takes 11 of its 24 bits by default."""
+    mesh = lj.quadratic(lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1)))
+    given = mesh, lj.laws.typical("neo_hookean"), mesh.points
+    single = jax.tree.map(lambda a: np.float32(a) if np.asarray(a).dtype == float else a, given)
+    text = jax.jit(lj.mjed.internal_force).lower(*single).as_text()
+    products = [line for line in text.splitlines() if "dot_general" in line]
+    assert products and all("[HIGHEST, HIGHEST]" in line and "f32" in line for line in products)
 
 
 def test_the_import_sets_64_bits_and_no_cache():

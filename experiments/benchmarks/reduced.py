@@ -11,6 +11,7 @@ each states the bias of that.
 ``python -m experiments reduced`` (18 minutes) writes results/reduced.json.
 """
 
+import argparse
 import itertools
 import os
 
@@ -415,11 +416,17 @@ def trained(
 
 def main() -> None:
     """All of it, written after each model."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--keep", type=Path, help="file for the model, as `accelerator.py` takes it")
+    parser.add_argument("--quick", action="store_true", help="fewer runs")
+    options = parser.parse_args()
     scene, rows = pulled_phantom(), drawn(UNSEEN, 0.1, 2)
     content: dict[str, Any] = {"elements": scene.mesh.number_of_elements, "order": scene.mesh.order, "models": []}
     for count, corners, modes, tolerance in either(((840, CORNERS, 80, 5e-3),), ((6, CORNERS[:2], 40, 1e-1),)):
         model, row = trained(scene, count, corners, modes, tolerance)
         print(row, flush=True)
+        if options.keep is not None:
+            lj.save_reduced(model, options.keep)
         example = lj.with_parameters(scene, row_of(rows, 0))
         row |= times(example, model)
         print(row, flush=True)

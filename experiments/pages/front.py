@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from experiments.pages import elements, identification
+from experiments.pages import accelerator, elements, identification
 from experiments.pages.results import error_text, load, percent
 from experiments.pages.stability import Returned, returned
 
@@ -249,5 +249,6 @@ SIMULATOR = {
     "runs": runs,
     "extremes": extremes,
     "elements": elements.sentences,
+    "accelerator": accelerator.sentences,
 }
 FITS = {"maps": maps, "together": together, "elastography": identification.plate}

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 
-from experiments.pages import bodies, elements, fits, identification, moving, reduced, rigs, stability
+from experiments.pages import accelerator, bodies, elements, fits, identification, moving, reduced, rigs, stability
 from experiments.pages.porosity import holding
 from experiments.pages.results import RESULTS, load, percent
 
@@ -266,6 +266,7 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
     ),
     "scaling": ("time and memory from 1,000 to 1,000,000 tetrahedra", _scaling, ""),
     "precision": ("float32 beside float64", _precision, ""),
+    "accelerator": ("one GPU beside the processor of its machine, both precisions", accelerator.came_out, ""),
     "jax_releases": ("the same programs with different releases of jax", _jax_releases, ""),
     "gradient_cost": ("what does a gradient through a run cost, by steps and what is stored?", _gradient, ""),
     "lesion": (

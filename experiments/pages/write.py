@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.pages import (
+    accelerator,
     bodies,
     elements,
     front,
@@ -33,7 +34,8 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     | identification.PARTS
     | stability.PARTS
     | bodies.PARTS
-    | reduced.PARTS,
+    | reduced.PARTS
+    | accelerator.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
 }
 

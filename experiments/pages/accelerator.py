@@ -1,0 +1,81 @@
+"""Table of one GPU beside the processor of the same machine."""
+
+import textwrap
+
+from experiments.pages.results import error_text, load, short
+
+#: What the size of a part counts.
+COUNTED = {"assembly": "tetrahedra", "static cube": "tetrahedra", "liver": "steps", "sweep": "rows", "reduced": "lanes"}
+
+
+def _by_case() -> dict[tuple, dict[tuple, dict]]:
+    """Rows of a part, a name and a size, by platform and precision."""
+    (data,) = load("accelerator")
+    found: dict[tuple, dict[tuple, dict]] = {}
+    for r in data["rows"]:
+        found.setdefault((r["part"], r["name"], r["size"]), {})[r["platform"], r["precision"]] = r
+    return found
+
+
+def _ms(row: dict | None) -> str:
+    """Run time, or why there is none."""
+    if row is None:
+        return ""
+    return row["failed"] if "failed" in row else f"{short(1e3 * row['run_s'])} ms"
+
+
+def table() -> str:
+    """All cases."""
+    (data,) = load("accelerator")
+    where = data["environment"]
+    rows = [
+        f"{', '.join(data['devices'])} beside {where['cores']} cores of the same machine, jax {where['jax']}.",
+        "",
+        "| case | size | processor, float64 | float32 | GPU, float64 | float32 | processor over GPU, float64 | "
+        "error on the GPU: float64 | float32 |",
+        "|---" * 9 + "|",
+    ]
+    for (part, name, size), of in _by_case().items():
+        cpu, gpu, single = (of.get(key) for key in (("cpu", "float64"), ("gpu", "float64"), ("gpu", "float32")))
+        times = " | ".join(_ms(of.get((p, q))) for p in ("cpu", "gpu") for q in ("float64", "float32"))
+        faster = f"{short(cpu['run_s'] / gpu['run_s'])}" if cpu and gpu and "run_s" in gpu else ""
+        errors = " | ".join(error_text(r["error"]) if r and "error" in r else "" for r in (gpu, single))
+        rows.append(f"| {part}, {name} | {size:,} {COUNTED[part]} | {times} | {faster} | {errors} |")
+    return "\n".join(rows)
+
+
+def _seconds(part: str, name: str, size: int, platform: str) -> float:
+    return _by_case()[part, name, size][platform, "float64"]["run_s"]
+
+
+def came_out() -> str:
+    """One line: large bodies and many rows gain most."""
+    gain = {
+        key: _seconds(*key, "cpu") / _seconds(*key, "gpu")
+        for key in (("static cube", "run", 257_250), ("sweep", "384 tetrahedra", 1000), ("liver", "complete", 40))
+    }
+    cube, rows, liver = gain.values()
+    return (
+        f"a static solve of 257,250 tetrahedra runs {short(cube)} times as fast, 1,000 rows of a sweep {short(rows)} "
+        f"times, the complete phantom's 5,351 tetrahedra {short(liver)} times; same digits in float64"
+    )
+
+
+def sentences() -> str:
+    """For the guide."""
+    (data,) = load("accelerator")
+    large, small = ("static cube", "run", 257_250), ("liver", "hyperelastic", 40)
+    lanes = _seconds("reduced", "phantom, runs", 1000, "gpu")
+    text = (
+        f"On one {data['devices'][0]} a static solve of 257,250 tetrahedra takes "
+        f"{short(1e3 * _seconds(*large, 'gpu'))} ms (the same machine's processor: "
+        f"{short(_seconds(*large, 'cpu'))} s), 1,000 rows of 384 tetrahedra "
+        f"{short(1e3 * _seconds('sweep', '384 tetrahedra', 1000, 'gpu'))} ms "
+        f"({short(_seconds('sweep', '384 tetrahedra', 1000, 'cpu'))} s), 1,000 runs of the reduced phantom "
+        f"{short(lanes)} s. A small body gains little: 40 steps of the hyperelastic phantom (5,351 tetrahedra) take "
+        f"{short(_seconds(*small, 'gpu'))} s ({short(_seconds(*small, 'cpu'))} s)."
+    )
+    return textwrap.fill(text, 118)
+
+
+PARTS = {"accelerator": table}
