@@ -53,6 +53,7 @@ def test_terzaghis_column_under_an_oscillating_load(verified):
     verified("oscillating column, 24 layers: settlement", "Biot 1941", errors[1, 0], 0.013, float(orders[0]))
 
 
+@pytest.mark.slow
 def test_quadratic_elements_and_fluid_that_is_pumped():
     """Eight quadratic layers settle as well as 24 linear ones; a pressure at the base drives what the load does not."""
     assert off_terzaghi(enriched(column(8, 1, 1.0)))[0] < 0.013
@@ -138,7 +139,9 @@ def test_waves_that_keep_the_volume(verified):
     verified("swinging sphere, K = 100,000 G, mixed quadratic elements", "closed form", errors[1], 3e-3, order)
 
 
-@pytest.mark.parametrize(("volumetric", "order"), [("mixed", 2), ("mixed", 1), ("nodal", 1)])
+@pytest.mark.parametrize(
+    ("volumetric", "order"), [("mixed", 2), pytest.param("mixed", 1, marks=pytest.mark.slow), ("nodal", 1)]
+)
 def test_about_a_stretched_state_with_pressures(volumetric, order):
     """The pressure of the state stiffens the slab too: its modulus there from derivatives of the energy alone."""
     n = 30 if order == 2 else 160

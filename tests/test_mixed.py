@@ -11,7 +11,7 @@ from conftest import ROOT
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.mesh import promotion
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.physics.volumes import mixed
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import equations, initial_state, positions, residual, settled, unknowns

@@ -14,8 +14,8 @@ from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh import promotion
-from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import load_volumes, nodal_volumes
+from liverjax.mesh.shape_functions import basis
 from liverjax.physics.attached import ligament, vessel
 from liverjax.physics.attached.membrane import Membrane
 from liverjax.physics.elastic_support import ElasticSupport

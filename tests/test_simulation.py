@@ -155,7 +155,7 @@ def march(scene: lj.Scene, runs: tuple[int, ...], duration: float, start: jax.Ar
     return results
 
 
-@pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("newmark", 2)])
+@pytest.mark.parametrize(("integrator", "order"), [pytest.param("euler", 1, marks=pytest.mark.slow), ("newmark", 2)])
 def test_order_of_the_integrators(integrator, order, verified):
     mesh = box()
 
@@ -292,7 +292,7 @@ def held_and_moved(mesh: lj.TetMesh, **motion) -> dict:
     }
 
 
-@pytest.mark.parametrize("name", FEBIO_LAWS)
+@pytest.mark.parametrize("name", [pytest.param("neo-Hookean", marks=pytest.mark.slow), "Veronda-Westmann"])
 def test_positions_and_reactions_of_febio(febio, name, verified):
     mesh = febio_cube(febio)
     rows = np.loadtxt(febio / f"a_{name}_nodes.csv", delimiter=",")

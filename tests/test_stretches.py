@@ -214,7 +214,9 @@ def test_derivatives_beyond_the_third_are_refused():
             function(F)
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] if n in ("bogen", "logarithmic") else []) for n in LAWS]
+)
 def test_single_precision(name):
     # float32 carries 6e-8; C = F^T F of these stretches is conditioned by (3.0/0.2)^2.
     F = np.asarray(gradients())

@@ -24,7 +24,7 @@ from fitting.fits import field, inclusion, scene_numbers
 from fitting.readers.displacements import read_displacements
 from fitting.reports.field_report import section
 from liverjax.core.plotting import ORANGE
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.physics.boundary import boundary_triangles
 
 MESH = ROOT / "data" / "liver_phantom.vtu"

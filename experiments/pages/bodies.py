@@ -95,7 +95,7 @@ def _clamps(data: dict) -> list[str]:
     """Why quadratic elements fail where the phantom is held at two places."""
     said = [
         f"{r['name']}: {r['elements']} at {r['time_s']:.2g} s, all within {_mm(r['away_m'])} of a held node; a "
-        f"place carries {r['mean_Pa']:.0f} Pa on average, the volume is gone at {r['gone_Pa']:.0f} Pa"
+        f"place carries {r['mean_Pa']:.0f} Pa on average; the law allows a volume of 0 at {r['gone_Pa']:.0f} Pa"
         for r in data.get("clamps", [])
     ]
     why = (

@@ -20,7 +20,7 @@ def job() -> str:
     return (
         f"Lion's mane mushroom (Hericium erinaceus), {used} of 31 measured frequencies (the last is the instrument's): "
         f"G0 = {kilo:.3g} kPa\nwith an error of {sd:.2g} kPa by noise and of {whole:.2g} kPa in all (the ends of the "
-        f"band decide the most of it), relaxation times\n{times} s; the fit misses the moduli by "
+        f"band cause most of it), relaxation times\n{times} s; the fit misses the moduli by "
         f"{percent(found['mean_relative_error'])} on average. No\nlinear material of any spectrum comes closer than "
         f"{percent(found['details']['consistency']['kramers_kronig_misfit'])} (root mean square of |G\\*|): so much is "
         "in the data.\n"

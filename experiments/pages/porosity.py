@@ -68,9 +68,9 @@ def porosity() -> str:
     finer = {r["varied"]: r for r in data["rows"]}["tetrahedra"]
     rows += [
         "",
-        "The chapter says that porosity prevents unrealistic large deformations. With its own numbers it does not, for",
-        f"the law's K = {data['law_bulk_Pa']:g} Pa is off and the sponge's K0 = {data['table_2']['bulk']:g} Pa acts, "
-        "with a fluid that flows out of what is compressed.",
+        "The chapter says that porosity prevents unrealistic large deformations. With its own numbers it does not:",
+        f"the law's K = {data['law_bulk_Pa']:g} Pa does not act; the sponge's K0 = {data['table_2']['bulk']:g} Pa does,"
+        " with a fluid that flows out of what is compressed.",
         f"The claim holds with {', or with '.join(found['it takes'])}.",
         f"It does not with {', nor with '.join(found['not enough'])}. These are numbers of linear",
         f"tetrahedra on one mesh of {data['tetrahedra']:,}, too stiff in bending: with eight times as many the first "

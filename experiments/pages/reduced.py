@@ -74,9 +74,10 @@ def identified(r: dict) -> str:
     errors = zip(r["identified"], r["identified_error"], r["identified_error_without_bias"], strict=True)
     each = "; ".join(f"`{name}` {percent(before)}, {percent(after)}" for name, before, after in errors)
     return (
-        f"Identified through the model from full runs, these numbers are off by at most (first as found, then with the "
-        f"bias taken off that one more full run states): {each}. A run takes {r['iterations_per_step']:.2g} iterations "
-        f"a step; one of 64 lanes of `vmap` takes {r['step_of_64_ms']:.2g} ms a step, compilation "
+        f"Identified through the model from full runs, these numbers are off by at most (first as found, then with "
+        f"the bias subtracted, which one more full run states): {each}. A run takes "
+        f"{r['iterations_per_step']:.2g} iterations a step; one of 64 lanes of `vmap` takes "
+        f"{r['step_of_64_ms']:.2g} ms a step, compilation "
         f"{r['compile_s']:.2g} s."
     )
 

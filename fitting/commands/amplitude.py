@@ -14,7 +14,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command = argparse.ArgumentParser(
         prog=prog,
         description="Fit the numbers of a hyperelastic law to moduli that change with the amplitude of the strain, at "
-        "one frequency, and show the third harmonic that the law foretells.",
+        "one frequency, and show the third harmonic that the law predicts.",
         epilog=EXIT_CODES,
     )
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
 def read_any(options: argparse.Namespace, path: Path) -> "Measured":
     """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep.
 
-    Points of a sweep that the instrument spoils are left out, as of the first sweep.
+    Points of a sweep that the instrument spoils are left out, as they are in the first sweep.
     """
     from fitting.methods import kramers_kronig
     from fitting.readers import rheometer, time_tests

@@ -15,7 +15,7 @@ from fitting.fits.field import Field, start_of
 from fitting.fits.scene_numbers import Problem, Unknowns, fit
 from fitting.methods.estimate import Estimate
 from liverjax.core.struct import Number
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
 #: Width of the edge over the mean distance of two points.

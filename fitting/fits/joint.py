@@ -108,8 +108,8 @@ def fit(
         tests: one or more.
         start: where to begin; its number of modes is kept.
         law: scaled to G0.
-        part: of the stress that relaxes, as of `Prony`.
-        max_iterations, progress: as of `levenberg_marquardt_host`.
+        part: of the stress that relaxes, as in `Prony`.
+        max_iterations, progress: as in `levenberg_marquardt_host`.
     """
     begin = time.perf_counter()
     worst: list[int] = []

@@ -91,7 +91,7 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """What relative errors of the reported numbers are relative to: the numbers, of tests in time not below a floor."""
+    """Scales of the relative errors of the reported numbers: the numbers; in tests in time not less than a floor."""
     _, measured, scales = reported_numbers(test)
     return scales if isinstance(test, TimeTest) else measured
 

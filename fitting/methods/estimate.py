@@ -60,7 +60,7 @@ def estimated(
         natural_of: u -> these numbers (P,).
         found: minimum over u; if it is NumPy's, `natural_of` is one for `host.with_jacobian`.
         components: how many of the residuals are measured; those that are not are 0 and count for nothing.
-        deviations_given: as of `noise_factor`.
+        deviations_given: as in `noise_factor`.
         effective: where a prior holds u: the number of parameters that the data determine. The rows of the prior
             then stand below the `components` rows of the data.
     """

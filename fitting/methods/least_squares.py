@@ -156,7 +156,7 @@ def from_starts(residuals: Callable[..., Any], starts: np.ndarray, *data: Any, m
     Args:
         residuals: of (u, *data), as `host.with_jacobian` asks for.
         starts: where to begin.
-        data: as of `residuals`.
+        data: as in `residuals`.
         max_iterations: of each fit.
     """
     going: np.ndarray = np.arange(len(starts))

@@ -79,8 +79,8 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
     exponentially. Two more terms stand for slower and faster times; they make G* exact at one slow and one fast real s.
 
     Args:
-        u, switches: as of `modulus`.
-        times: (K,) [s], descending, of equal ratio, as of `times_of_modes`.
+        u, switches: as in `modulus`.
+        times: (K,) [s], descending, of equal ratio, as in `times_of_modes`.
         reference: frequency [rad/s] that u is measured in.
     """
     step = jnp.log(times[0] / times[1])

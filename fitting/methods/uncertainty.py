@@ -40,7 +40,7 @@ def estimate(
 
     Args:
         found: minimum over u.
-        deviations_given: as of `noise_factor`.
+        deviations_given: as in `noise_factor`.
         maxwell: u -> Prony modes; the default is of their own parametrisation.
         components: number of measured residuals (default all), and of effective parameters (default those of u).
     """

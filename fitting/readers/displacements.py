@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from fitting.readers.tables.text_tables import EMPTY
 from liverjax.core.errors import InputError
-from liverjax.mesh.basis import functions
+from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.scenes.scene import Scene
 

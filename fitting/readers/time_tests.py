@@ -182,7 +182,7 @@ def from_rest(
     """The rows (n,), with one at 0 s if they begin later; then notes.
 
     Args:
-        time, driven, answer: (n,) as of `of_columns`.
+        time, driven, answer: (n,) as in `of_columns`.
         at_once: the first load was there from 0 s on; else it was raised from 0 until the first row.
     """
     if not time[0] > 0:

@@ -52,7 +52,7 @@ def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
 
 
 def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
-    """Moduli against strain with the best laws on the left, the third harmonics that they foretell on the right."""
+    """Moduli against strain with the best laws on the left, the third harmonics that they predict on the right."""
     fig = pyplot().figure(figsize=(10, 4.2), layout="constrained")
     left, right = fig.subplots(1, 2)
     percent = 100 * sweep.strain

@@ -24,7 +24,7 @@ def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
     """Write the page as PDF (or what else the name of the file says).
 
     Args:
-        sweep, fits: as of `sweep_report.write`.
+        sweep, fits: as in `sweep_report.write`.
         content: of fit.json.
     """
     save(page(sweep, fits, content), file)

@@ -43,7 +43,7 @@ class Cells(NamedTuple):
     growth: float = cylinders.GROWTH  # of cells away from rims and edge
     corners: int = 24  # of the polygon that stands for the circle, of which a sector has one edge
     order: int = 2  # of the elements
-    volumetric: str = "auto"  # how volume changes are treated, as of `lj.Solve`
+    volumetric: str = "auto"  # how volume changes are treated, as in `lj.Solve`
 
 
 @struct
@@ -155,10 +155,10 @@ def indentation(
     """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; the force on it.
 
     Args:
-        radius, height, dt, cell_size: as of `tension`; a ring of nodes is at the punch's edge.
+        radius, height, dt, cell_size: as in `tension`; a ring of nodes is at the punch's edge.
 
     Raises:
-        InputError: as of `tension`; a punch wider than the sample, or far narrower.
+        InputError: as in `tension`; a punch wider than the sample, or far narrower.
     """
     depths = _finite_history("depths", depths)
     cells = _cells(radius, height, dt, cell_size)

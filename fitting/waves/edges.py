@@ -33,7 +33,7 @@ class RegionMatrices(NamedTuple):
     mass: np.ndarray  # (N,) entries of C by -omega^2
     pattern: scipy.sparse.csr_array  # (I, U): their places
     forces: scipy.sparse.csr_array  # (I, P) of pressures, each with the same large variance
-    pressure: np.ndarray  # their covariance, as of `Matrices`
+    pressure: np.ndarray  # their covariance, as in `Matrices`
     kinks: int  # unknowns that are not measured
     patches: Patches
     patch: np.ndarray  # (I,) patch of the edges that each row is nearest to, -1: none

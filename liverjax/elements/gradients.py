@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.mesh.basis import functions
+from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_gradient, determinant, matvec
 

@@ -9,7 +9,7 @@ so the cost does not grow with the number of terms g^k h^k. No matrix is inverte
 gradient of the energy, f = + dW/dx (the chapter's nodal force is its negative).
 
 A linear element has one point. At each point of a quadratic element the same terms hold, for the corners that
-`liverjax.mesh.basis` describes.
+`liverjax.mesh.shape_functions` describes.
 """
 
 from functools import partial
@@ -23,7 +23,7 @@ from liverjax.core.errors import InputError
 from liverjax.laws.base import Law
 from liverjax.laws.terms import chapter_terms
 from liverjax.laws.terms.invariant_terms import blocks, first_piola, state
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.matrices import Matrix, deformation_gradient, dot, stored, transpose
 

@@ -12,7 +12,7 @@ import numpy as np
 from liverjax.elements.mjed import sparse
 from liverjax.laws.autodiff import derivative, first_piola, tangent
 from liverjax.laws.base import Law
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:

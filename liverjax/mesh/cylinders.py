@@ -87,7 +87,7 @@ def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1
     those of circles.
 
     Args:
-        radii, heights: as of `graded_cylinder`.
+        radii, heights: as in `graded_cylinder`.
         corners: of every ring of the whole cylinder, at least 3.
         slices: edges of a ring in the sector; `corners` / 4 of them are a quarter.
 

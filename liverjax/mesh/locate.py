@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.mesh.basis import functions
+from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import TetMesh
 
 #: Barycentric coordinate above minus this counts as inside.

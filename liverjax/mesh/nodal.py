@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.basis import FACES, basis
+from liverjax.mesh.shape_functions import FACES, basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.tensors.places import given, taken
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from liverjax.core.struct import Indices, replace
 from liverjax.mesh.adjacency import PAIRS, Clusters, function_clusters, node_numbers
-from liverjax.mesh.basis import FACES
+from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh
 
 

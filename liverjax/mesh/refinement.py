@@ -4,9 +4,9 @@ import numpy as np
 
 from liverjax.core.struct import Indices
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.basis import FACES
 from liverjax.mesh.promotion import of_faces, quadratic
 from liverjax.mesh.selection import boundary_triangles
+from liverjax.mesh.shape_functions import FACES
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
 

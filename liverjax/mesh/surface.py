@@ -6,7 +6,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from liverjax.core.struct import Indices
-from liverjax.mesh.basis import triangle_rule
+from liverjax.mesh.shape_functions import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle, in the order of its middles.

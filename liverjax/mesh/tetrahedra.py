@@ -14,7 +14,7 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices, Numbers, param, static, struct
 from liverjax.mesh.adjacency import PAIRS, Pattern, node_numbers, pattern
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.tensors.matrices import stored
 from liverjax.tensors.places import given, taken
 
@@ -91,8 +91,8 @@ class TetMesh:
     def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
         """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array a column, (E,) or (Q, E).
 
-        y_k are the corners of `liverjax.mesh.basis`; with shape vectors D_k the field's gradient is the sum of
-        (y_k - y_0) D_k.
+        y_k are the corners of `liverjax.mesh.shape_functions`; with shape vectors D_k the field's gradient is the sum
+        of (y_k - y_0) D_k.
         """
         if self.order == 1:
             corners = [taken(column, self.tetrahedra.T) for column in columns]

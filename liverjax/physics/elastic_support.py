@@ -17,7 +17,7 @@ from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, struct
 from liverjax.mesh import promotion, selection, surface
-from liverjax.mesh.basis import triangle_rule
+from liverjax.mesh.shape_functions import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.solvers.attached import Attached
@@ -175,7 +175,7 @@ class Springs(NodalForce):
 class Foundation(NodalForce):
     """Springs during a step at the points of triangles, for functions of order 3: each function has its integral."""
 
-    triangles: Indices = param("1", "(m, 4), as of `liverjax.mesh.promotion.with_faces`")
+    triangles: Indices = param("1", "(m, 4), as in `liverjax.mesh.promotion.with_faces`")
     blocks: Block = param("N/m", "3 x 3 of (Q, m)")
     wall: jax.Array | None = param(
         "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None

@@ -25,7 +25,7 @@ def reduced_bias(
     """Bias of identified numbers, in their own units and shapes: subtract it from them. One full run; host side.
 
     Args:
-        model, scene: as of `simulate_reduced`.
+        model, scene: as in `simulate_reduced`.
         values: dotted names -> numbers that were identified through the model.
         observed: what was fitted to data, from positions (T, V, 3) [m]; weighted as it was there.
 

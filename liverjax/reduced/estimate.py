@@ -63,7 +63,7 @@ def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> R
     scene.
 
     Args:
-        model, scene, result: as of `simulate_reduced`.
+        model, scene, result: as in `simulate_reduced`.
     """
     own = prepared(scene)
     residuals, reactions, P = _out_of_balance(own, reduced_positions(model, scene, result))

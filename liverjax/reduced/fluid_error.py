@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import Number
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.darcy import unknown_pressures
 from liverjax.physics.porosity import volumetric_slope

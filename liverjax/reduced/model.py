@@ -16,8 +16,8 @@ import numpy as np
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.laws import Law
-from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import interpolated
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Physics
 from liverjax.physics.elasticity import Elasticity

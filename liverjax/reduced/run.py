@@ -123,7 +123,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
-    """Forces (n,) [N] of a given pressure at rest, as of `liverjax.simulation.equations.initial_state`."""
+    """Forces (n,) [N] of a given pressure at rest, as in `liverjax.simulation.equations.initial_state`."""
     sponge = porosity_at_points(model, scene)
     flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))
     p = pressure_coordinates(flow, flow.J)
@@ -234,7 +234,7 @@ def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
     It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` uses the full mesh.
 
     Args:
-        model, scene, result: as of `simulate_reduced`.
+        model, scene, result: as in `simulate_reduced`.
 
     Raises:
         InputError: a model without a correction: made from few rows, or none made its errors smaller.

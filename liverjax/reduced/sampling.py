@@ -141,7 +141,7 @@ def _balance(
     volume, and by storage and flow.
 
     Args:
-        whole, scene: as of `sampled`.
+        whole, scene: as in `sampled`.
         gradient: number of a step, from 0 -> deformation gradients (9, P) at its end.
         p: coordinates of the pressure (T, m) [Pa].
         times: numbers of K steps.

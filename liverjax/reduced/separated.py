@@ -157,7 +157,7 @@ def _terms(
     Args:
         known: displacements at the grid (N, 3 V), times the roots of the volumes.
         shape: of the grid.
-        tolerance, most: as of `separate`.
+        tolerance, most: as in `separate`.
     """
     # In coordinates of the runs' own space: as many numbers as there are runs.
     U, S, _ = np.linalg.svd(known, full_matrices=False)

@@ -292,7 +292,7 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
         # A parabola or a cubic through the last coordinates: that which would have foretold the step before better.
-        # Accelerations of Newmark's method ring: they foretell nothing.
+        # Accelerations of Newmark's method ring: they predict nothing.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)

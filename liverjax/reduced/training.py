@@ -44,7 +44,7 @@ def reduce_scene(
 
     Args:
         scene: `Scene`.
-        rows: dotted names -> one value a run, as of `simulate_batch`.
+        rows: dotted names -> one value a run, as in `simulate_batch`.
         tolerance: part of the displacements of these runs that the modes may leave out [1], root of mean squares.
         most_modes: the most modes.
         point_tolerance: part of the motions by the reduced forces that the sampled points may leave out [1]; default:

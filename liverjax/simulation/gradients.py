@@ -43,12 +43,12 @@ def value_and_gradient(
     store: str | int = "all",
     mode: str = "reverse",
 ) -> Gradient:
-    """Value of `loss` (Result -> number) and its gradient by the numbers `at` which it is taken.
+    """Value of `loss` (Result -> number), and its gradient with respect to the numbers that `at` names.
 
     Args:
         loss: a function that JAX can differentiate; give the same one again to use its compiled program again.
         scene: `Scene`.
-        at: dotted names as of `with_parameters` -> values, which replace the scene's; "start": positions (V, 3) [m] to
+        at: dotted names as in `with_parameters` -> values, which replace the scene's; "start": positions (V, 3) [m] to
             begin at, at rest.
         store: what reverse mode keeps: "all" steps, "sqrt" or a number of states (`checkpointing`, `memory`).
         mode: "reverse", at a cost that does not grow with the number of parameters; "forward", without memory for the

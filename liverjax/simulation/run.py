@@ -163,7 +163,7 @@ def simulate_part(
         state: what the steps before left; `initial_state(prepared(scene))` at the beginning.
         first: number of the first step, from 1; may be traced.
         count: how many steps. Those beyond the last of the scene are skipped; their rows are zeros.
-        report: as of `simulate`.
+        report: as in `simulate`.
 
     A part begins with a tangent of its own, so that going on from a state that was stored changes no bit.
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.mesh.adjacency import Clusters
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.solvers import block_matrix
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix

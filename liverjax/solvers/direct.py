@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.struct import Number
-from liverjax.mesh.basis import basis
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.attached import Attached, Between, GivesWay, Masses
 from liverjax.solvers.block_matrix import Block, BlockMatrix

@@ -176,7 +176,7 @@ def symmetric_solve(
 ) -> WithEarlier:
     """The solution of A x = b for symmetric A, as a linear map of b; then the earlier solves with this one.
 
-    Its derivatives are solves as well, in both modes. NaN as of `differentiable_solve`.
+    Its derivatives are solves as well, in both modes. NaN as in `differentiable_solve`.
 
     Args:
         matvec: (x, earlier) -> (A x, the same earlier).

@@ -1,8 +1,8 @@
 """Symmetric matrices of quadratic elements, kept as moduli at their points: multiplied without assembly.
 
-At every point an element is a linear one with corners of its own (`liverjax.mesh.basis`), so 45 numbers a point are its
-stiffness. A product takes motions to the corners, multiplies, and takes forces back. The vertices alone, as linear
-elements, have an assembled matrix: the second level of the preconditioner.
+At every point an element is a linear one with corners of its own (`liverjax.mesh.shape_functions`), so 45 numbers a
+point are its stiffness. A product takes motions to the corners, multiplies, and takes forces back. The vertices alone,
+as linear elements, have an assembled matrix: the second level of the preconditioner.
 """
 
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ import numpy as np
 from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import gathered, interpolated, summed
 from liverjax.mesh.promotion import on_middles
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers import block_matrix
 from liverjax.solvers.block_matrix import Block, BlockMatrix

@@ -79,7 +79,7 @@ def harmonic(
             default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or of its springpots; else 1.
             Where volumes have pressures of their own (volumetric "mixed", "nodal"), or a sponge has them, they do not
             relax.
-        about: positions (V, 3) [m] of an equilibrium that has rested for long, as of `simulate`; default: the
+        about: positions (V, 3) [m] of an equilibrium that has rested for long, as in `simulate`; default: the
             reference shape. The law's stress there stiffens the body. A fluid has flowed until its pressure is 0.
         motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
         mass: "consistent" (each element's integrals), or "lumped" as in runs in time.
@@ -117,7 +117,7 @@ def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "
     """The dynamic stiffness of `harmonic` by element, for programs that build their own equations of it.
 
     Args:
-        scene, about, mass: as of `harmonic`.
+        scene, about, mass: as in `harmonic`.
     """
     return _operator(_small(scene, mass), about, mass)
 

@@ -26,7 +26,7 @@ def harmonic_mesh_error(
     eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is left out.
 
     Args:
-        scene, factors, about, motion: as of `harmonic`.
+        scene, factors, about, motion: as in `harmonic`.
         found: its result.
 
     Raises:

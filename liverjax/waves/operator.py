@@ -19,8 +19,8 @@ from liverjax.core.struct import Number
 from liverjax.elements import mjed
 from liverjax.laws.base import Law, volumetric_part
 from liverjax.laws.terms import invariant_terms
-from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import nodal_volumes, products
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import viscosity
 from liverjax.physics.base import Free

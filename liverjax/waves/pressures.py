@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from liverjax.elements.gradients import volume_gradients
 from liverjax.laws.base import isochoric_part
 from liverjax.laws.terms.invariant_terms import Scalars
-from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import integrals, summed
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Step
 from liverjax.physics.darcy import LEAST_J, unknown_pressures

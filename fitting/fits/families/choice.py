@@ -41,7 +41,8 @@ def contains(general: Label, special: Label) -> bool:
 
 
 def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
-    """Place of the model to choose: the lowest criterion of those that no special case of theirs comes near."""
+    """Index of the model to choose: the lowest criterion, but no model that is not better than its special case by
+    `GENERAL`."""
     beaten = {
         j
         for j, general in enumerate(labels)

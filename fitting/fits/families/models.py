@@ -21,7 +21,7 @@ from fitting.readers.rheometer import Sweep
 from liverjax.core.struct import Content
 
 MODELS = ("prony", "fractional", "spectrum", "auto")
-#: Difference of the criterion that counts as strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90).
+#: Difference of the criterion that counts as very strong evidence (Kass and Raftery 1995, J. Am. Stat. Assoc. 90).
 STRONG = 10.0
 
 
@@ -177,7 +177,7 @@ def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> list[Fit]:
-    """The fits that a choice is made from; arguments as of `choose`."""
+    """The fits that a choice is made from; arguments as in `choose`."""
     tried: list[Fit] = []
     if model in ("fractional", "auto"):
         tried += fractional(sweep)
@@ -203,7 +203,7 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
         sweep: data.
         model: one of `MODELS`, but "prony".
         prony: the modes chosen, which "auto" compares with.
-        dense: as of `viscoelastic.closed_form`.
+        dense: as in `viscoelastic.closed_form`.
     """
     tried = every_model(sweep, model, prony, dense)
     chosen, able = best_of_models(tried, sweep)

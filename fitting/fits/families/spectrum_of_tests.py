@@ -194,7 +194,7 @@ def spectrum_in_time(test: TimeTest, near: Maxwell) -> TimeFit:
 
 
 def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -> Together:
-    """The spectrum of several tests, each with noise of its own; `near`, `noise` as of `spectrum_of`."""
+    """The spectrum of several tests, each with noise of its own; `near`, `noise` as in `spectrum_of`."""
     parts = [together.reported_numbers(t) for t in tests]
     for _ in range(2):
         told, grid, found = spectrum_of(tests, near, noise)

@@ -279,7 +279,7 @@ def choose_together(
     modes: int | str = "auto",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Together:
-    """The model of the lowest criterion for several tests; arguments as of `choose_in_time` and `together.fit`."""
+    """The model of the lowest criterion for several tests; arguments as in `choose_in_time` and `together.fit`."""
     prony = together.fit(tests, modes, progress)
     if model == "prony":
         return prony

@@ -20,7 +20,7 @@ from liverjax.core.struct import Indices, Number, param, struct
 from liverjax.laws import layers
 from liverjax.laws.base import Law
 from liverjax.mesh import locate
-from liverjax.mesh.basis import functions
+from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.physics.attached.centre_lines import CentreLines, centre_lines, read_surface
 from liverjax.physics.attached.elements import Elements

@@ -24,7 +24,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Indices, Number, Numbers, param, replace, static, struct
 from liverjax.laws.base import Law
 from liverjax.mesh import promotion, selection, surface
-from liverjax.mesh.basis import triangle_rule
+from liverjax.mesh.shape_functions import triangle_rule
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.physics.contact.shapes import SHAPES, Distance, distance

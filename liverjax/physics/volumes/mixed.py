@@ -26,8 +26,8 @@ from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law, Volumetric, isochoric_part, volumetric_part
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.mesh.basis import basis
 from liverjax.mesh.nodal import gathered, integrals, interpolated, summed
+from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End, Physics, Start, Step, VolumeStress
 from liverjax.solvers.block_matrix import BlockMatrix, off_diagonal
