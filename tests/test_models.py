@@ -282,8 +282,8 @@ def test_the_command_writes_the_model(model, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--model", "spectrum", "--modes", "3"], "--modes 3 is of --model prony: leave it out"),
-        (["--model", "auto", "--profile"], "--profile is of --model prony"),
+        (["--model", "spectrum", "--modes", "3"], "--modes 3 works with --model prony only: leave it out"),
+        (["--model", "auto", "--profile"], "--profile works with --model prony only"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(options, sentence, tmp_path, capsys):

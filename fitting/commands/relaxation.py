@@ -80,9 +80,9 @@ def run(options: argparse.Namespace) -> int:
             raise InputError(f"--{name} {value:g} cannot be a sample's {name} in metres: give e.g. --{name} 0.004")
     shared_options.check_samples(options.samples)
     if options.modes != "auto" and options.model != "prony":
-        raise InputError(f"--modes is of --model prony: leave it out for --model {options.model}")
+        raise InputError(f"--modes works with --model prony only: leave it out for --model {options.model}")
     if options.samples is not None and options.model == "spectrum":
-        raise InputError("--samples is of models of a few numbers; leave it out for --model spectrum")
+        raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
     out = options.out or Path(options.kind)
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":

@@ -252,12 +252,14 @@ def _check(options: argparse.Namespace) -> None:
     if not 4 <= options.steps <= 10000:
         raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
     if options.model in ("fractional", "spectrum") and options.modes != "auto":
-        raise InputError(f"--modes {options.modes} is of --model prony: leave it out for --model {options.model}")
+        raise InputError(
+            f"--modes {options.modes} works with --model prony only: leave it out for --model {options.model}"
+        )
     if options.profile and options.model != "prony":
-        raise InputError(f"--profile is of --model prony; leave it out for --model {options.model}")
+        raise InputError(f"--profile works with --model prony only; leave it out for --model {options.model}")
     shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
-        raise InputError("--samples is of models of a few numbers; leave it out for --model spectrum")
+        raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
     laws.find(options.law)
 
 
@@ -295,7 +297,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--precompression is of the fit of one sample: leave out {name}")
+            raise InputError(f"--precompression works for one sample only: leave out {name}")
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
             f"--precompression with --model {options.model} is computed in closed form, since the modes that a "
@@ -429,7 +431,10 @@ def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Post
     if not options.samples:
         return None
     if fit.kind.prior is not None:
-        print("note: --samples is of models of a few numbers; the spectrum has its standard errors", file=sys.stderr)
+        print(
+            "note: --samples works with models of a few numbers only; the spectrum has its standard errors",
+            file=sys.stderr,
+        )
         return None
     if fit.method == "torsion":
         return posterior.of_simulation(fit, sweep, _simulation(options), options.samples)
