@@ -10,6 +10,7 @@ from fitting.__main__ import main
 from fitting.fits.families import models
 from fitting.master import master_curve, shifts, temperature_laws, temperature_sweeps
 from fitting.readers.frequency_sweep import Sweep
+from liverjax.core.errors import InputError
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -41,6 +42,15 @@ def test_factors_of_exact_data_are_those_that_made_them():
     # A cubic spline with knots 0.4 decades apart follows the curve to about 1e-4.
     assert np.abs(found.log_a - TRUE).max() < 3e-3 and found.apart < 1e-3
     assert found.log_a[REFERENCE] == 0 == found.log_a_errors[REFERENCE] and not found.log_b.any()
+
+
+def test_sweeps_with_a_gap_between_them_are_refused():
+    """They were joined by the smoothness of the curve, 1.7 decades off with an error of 0.08."""
+    true = np.array([0.0, -4.0])
+    far = [moduli_of_polymer(10**a * OMEGA) for a in true]
+    parts = [Sweep(OMEGA, G.real, G.imag) for G in far]
+    with pytest.raises(InputError, match="0 and 60 °C do not overlap where they lie best"):
+        shifts.found(parts, 273.15 + np.array([0.0, 60.0]), 0)
 
 
 def test_standard_errors_of_factors_are_right():

@@ -250,6 +250,24 @@ def test_a_fluid_is_recovered_without_an_equilibrium_modulus():
     assert not any("equilibrium" in w for w in f.warnings)
 
 
+def test_one_mode_of_a_fluid_leaves_nothing_free():
+    """Its only ratio is 1 by definition; it had an infinite error, and the fluid was never chosen."""
+    omega = np.geomspace(0.1, 100, 31)
+    factor = 1 + 0.01 * np.random.default_rng(1).standard_normal((2, len(omega)))
+    G = 100 * 0.3j * omega / (1 + 0.3j * omega)
+    s = Sweep(omega, G.real * factor[0], G.imag * factor[1])
+    f = models.fluid(s, generalised_maxwell.spectrum(s))
+    assert f.modes == 1 and viscoelastic.identifiable(f, s)
+    assert f.uncertainty.standard_errors[1] == 0
+    assert np.all(np.abs(f.uncertainty.values - [100, 1, 0.3])[[0, 2]] < 3 * f.uncertainty.standard_errors[[0, 2]])
+
+
+def test_two_frequencies_are_too_few_for_four_numbers():
+    """Four numbers follow four data exactly, and had errors of 1e-12."""
+    found = models.fractional(fractional_sweep("fractional_zener", omega=np.array([0.6, 6.0])))
+    assert [f.kind.name for f in found] == ["springpot", "fractional_kelvin_voigt"]
+
+
 def automatic(s: Sweep) -> viscoelastic.Fit:
     dense = generalised_maxwell.spectrum(s)
     return models.choose(s, "auto", viscoelastic.choose_modes(s, dense)[0], dense)

@@ -114,11 +114,26 @@ def test_further_sweeps_lose_the_points_of_the_instrument_too(tmp_path):
     columns = np.column_stack([WIDE, spoiled, G[1]])
     head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
     np.savetxt(tmp_path / "s.csv", columns, delimiter=",", header=head, comments="")
-    options = argparse.Namespace(radius=None, height=None, max_frequency=None, density=None)
+    options = argparse.Namespace(radius=None, height=None, min_frequency=None, max_frequency=None, density=None)
     found = command.read_any(options, tmp_path / "s.csv")
     assert len(found.storage) < len(WIDE) and any("mark of the instrument" in n for n in found.notes)
     options.max_frequency = 1e3  # a band that the user names is kept
     assert len(command.read_any(options, tmp_path / "s.csv").storage) == len(WIDE)
+    options.max_frequency = float(WIDE[-6]) / (2 * np.pi)  # and holds for every sweep, but not for what is predicted
+    assert len(command.read_any(options, tmp_path / "s.csv").storage) == len(WIDE) - 5
+    assert command.read_any(options, tmp_path / "s.csv", whole=True).angular_frequency[-1] > 0.5 * WIDE[-6]
+    with pytest.raises(InputError, match=r"no\.csv does not exist: give the file of a test"):
+        command.read_any(options, tmp_path / "no.csv")
+
+
+def test_what_no_fit_follows_is_told():
+    """A test that the common fit misses by 63 % and a fit of its own by 44 % does not disagree with the others."""
+    share = together.Share("sweep", "b.csv", 38, 1.2, 1.0, 0.63, 0.44, 0.3, np.ones(3))
+    assert together.disagreements([share]) == []
+    assert together.missed([share]) == [
+        "the fit misses the data of b.csv by 63 %: try another --model, or look at them"
+    ]
+    assert together.missed([share._replace(misfit=0.04)]) == []
 
 
 def test_the_driven_column_is_the_one_that_is_held(tmp_path):

@@ -219,7 +219,7 @@ def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> lis
     from fitting.commands.together import read_any
     from fitting.reports import prediction
 
-    tests = [read_any(options, path) for path in options.predict]
+    tests = [read_any(options, path, whole=True) for path in options.predict]
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)

@@ -43,15 +43,18 @@ def run(options: argparse.Namespace) -> int:
     return 0 if found.converged else 1
 
 
-def read_any(options: argparse.Namespace, path: Path) -> "Measured":
+def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "Measured":
     """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep.
 
-    Points of a sweep that the instrument spoils are left out, as they are in the first sweep.
+    Another sweep is cut to the band that the user names, and points that the instrument spoils are left out, as in the
+    first sweep. A `whole` one, which is only predicted, is not cut.
     """
     from fitting.methods import kramers_kronig
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion
 
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give the file of a test")
     if path.suffix.lower() == ".toml":
         from fitting.rigs.described import read_described
 
@@ -65,6 +68,8 @@ def read_any(options: argparse.Namespace, path: Path) -> "Measured":
         if "no header names" not in str(no_sweep) and "no column for" not in str(no_sweep):
             raise
     else:
+        sweep = sweep if whole else rheometer.within(sweep, options.min_frequency, options.max_frequency)
         sweep = rheometer.without_inertia(sweep, options.radius, options.height)
-        return sweep if options.max_frequency else kramers_kronig.without_instrument(sweep)
+        named = options.max_frequency and not whole
+        return sweep if named else kramers_kronig.without_instrument(sweep)
     return time_tests.read_time_test(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))

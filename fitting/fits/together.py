@@ -31,6 +31,8 @@ from liverjax.core.struct import Content
 ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
 #: The misfit of a test in the common fit over that by itself, above which the tests do not agree.
 APART = 1.5
+#: A misfit that is told of.
+MISSED = 0.05
 
 Measured = Sweep | TimeTest | Dispersion
 
@@ -303,6 +305,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     ]
     out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
     out += disagreements(chosen.shares)
+    out += missed(chosen.shares)
     out += uncertainty.superfluous(band, chosen.uncertainty)
     low, high = band.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
@@ -323,6 +326,15 @@ def disagreements(shares: list[Share]) -> list[str]:
         f"{100 * s.misfit_alone:.2g} % by itself; look for another temperature, strain or sample"
         for s in shares
         if s.noise > APART * s.alone and s.misfit > 0.01
+    ]
+
+
+def missed(shares: list[Share]) -> list[str]:
+    """A sentence on each test that the common fit misses, and a fit of its own as well."""
+    return [
+        f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: try another --model, or look at them"
+        for s in shares
+        if s.misfit > MISSED and s.noise <= APART * s.alone
     ]
 
 

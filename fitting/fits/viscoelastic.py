@@ -276,9 +276,10 @@ def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int
     closer = min(tried, key=information_criterion)
     if information_criterion(closer) < information_criterion(chosen) - 10:
         a, b = (100 * np.mean(f.relative_errors(sweep)) for f in (closer, chosen))
+        reason = "the data leave some of their parameters free" if closer.converged else "their fit did not converge"
         out.append(
             f"{closer.modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but "
-            f"the data leave some of their parameters free; --modes {closer.modes} gives them all the same"
+            f"{reason}; --modes {closer.modes} gives them all the same"
         )
     for modes, reason in broken.items():
         out.append(

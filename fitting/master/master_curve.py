@@ -9,6 +9,7 @@ from fitting.master.shifts import Shifts
 from fitting.master.temperature_laws import TemperatureLaw
 from fitting.master.temperature_sweeps import AtTemperatures, joined
 from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
@@ -37,7 +38,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
     place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
     if reference is not None and not T.min() - 10 <= reference <= T.max() + 10:
         raise InputError(
-            f"--master {reference - 273.15:.4g}: the sweeps are from {T[0] - 273.15:.4g} to {T[-1] - 273.15:.4g} °C; "
+            f"--master {celsius(reference):.4g}: the sweeps are from {celsius(T[0]):.4g} to {celsius(T[-1]):.4g} °C; "
             "give a temperature among them"
         )
     if data.shift_factors is not None:
@@ -71,7 +72,7 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 def _sentences(found: Shifts) -> list[str]:
     """Notes on how the sweeps were shifted, and warnings where superposition does not hold."""
-    T = found.temperatures - 273.15
+    T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "
         f"{100 * found.apart:.2g} % from one smooth curve"
@@ -95,9 +96,9 @@ def shift_numbers(found: MasterCurve) -> Content:
     """The part `shift` of the details in fit.json."""
     s = found.shifts
     return {
-        "reference_temperature_C": float(s.temperatures[s.reference] - 273.15),
+        "reference_temperature_C": float(celsius(s.temperatures[s.reference])),
         "given": s.given,
-        "temperatures_C": (s.temperatures - 273.15).tolist(),
+        "temperatures_C": celsius(s.temperatures).tolist(),
         "log10_a": s.log_a.tolist(),
         "log10_a_standard_errors": s.log_a_errors.tolist(),
         "log10_b": s.log_b.tolist(),

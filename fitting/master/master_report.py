@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from fitting.master.master_curve import MasterCurve
+from fitting.readers.units import celsius
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 
 HEAD = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa"
@@ -15,7 +16,7 @@ def write_master_curve(out: Path, found: MasterCurve) -> None:
     """Write both tables and the picture."""
     out.mkdir(parents=True, exist_ok=True)
     s = found.shifts
-    rows = [s.temperatures - 273.15, 10**s.log_a, s.log_a_errors, 10**s.log_b, s.log_b_errors, s.misfit]
+    rows = [celsius(s.temperatures), 10**s.log_a, s.log_a_errors, 10**s.log_b, s.log_b_errors, s.misfit]
     head = "temperature_C,shift_factor,sd_of_log10_shift_factor,vertical_factor,sd_of_log10_vertical_factor,distance"
     np.savetxt(out / "shift_factors.csv", np.column_stack(rows), "%.8g", ",", header=head, comments="")
     whole = found.sweep
@@ -30,7 +31,7 @@ def shift_table(found: MasterCurve) -> str:
     lines = [
         f"{'temperature':>12s} {'log10 a_T':>18s}{'log10 b_T':>18s}" if moved else f"{'temperature':>12s} log10 a_T"
     ]
-    for k, T in enumerate(s.temperatures - 273.15):
+    for k, T in enumerate(celsius(s.temperatures)):
         vertical = f" {s.log_b[k]:9.4f} ± {s.log_b_errors[k]:<6.2g}" if moved else ""
         mark = "  reference" if k == s.reference else ""
         error = "  given" if s.given else f" ± {s.log_a_errors[k]:<7.2g}"
@@ -50,7 +51,7 @@ def shift_figure(found: MasterCurve) -> Any:
         f = part.angular_frequency / (2 * np.pi)
         left.plot(f, part.storage, "o", ms=3, color=colour, mfc="none")
         left.plot(f, part.loss, "s", ms=3, color=colour, alpha=0.6)
-    T = s.temperatures - 273.15
+    T = celsius(s.temperatures)
     left.plot([], [], "o", color=GREY, mfc="none", ms=4, label="G'")
     left.plot([], [], "s", color=GREY, ms=4, label=f"G'', blue {T[0]:.4g} °C to red {T[-1]:.4g} °C")
     shifted = f"frequency at {T[s.reference]:.4g} °C [Hz]"

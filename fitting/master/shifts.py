@@ -13,6 +13,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from fitting.readers.frequency_sweep import Sweep
+from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
 #: Decades between two knots of the spline, and the weight of its third differences where no data hold it.
@@ -67,10 +68,27 @@ def found(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, ver
         log_a, log_b = log_a + moved[0], log_b + moved[1]
         if np.abs(moved).max() < CONVERGED:
             break
+    _check_overlap(columns, log_a, temperatures)
     spread = np.zeros((2, len(sweeps)))
     spread[free] = _errors_of_shifts(A[:, kept], b, 2 * sum(len(c[0]) for c in columns))[: free.sum()]
     misfit = distances_from_curve(sweeps, log_a, log_b)
     return Shifts(temperatures, reference, log_a, spread[0], log_b, spread[1], misfit)
+
+
+def _check_overlap(columns: list, log_a: np.ndarray, temperatures: np.ndarray) -> None:
+    """Refuse sweeps between which the shifts leave a gap: only the smoothness of the curve would place them."""
+    ends = [(c[0][0] + a, c[0][-1] + a) for c, a in zip(columns, log_a, strict=True)]
+    order = sorted(range(len(ends)), key=lambda k: ends[k][0])
+    last = order[0]
+    for k in order[1:]:
+        if ends[k][0] > ends[last][1]:
+            T, other = sorted(celsius(temperatures[[last, k]]))
+            raise InputError(
+                f"the sweeps at {T:.4g} and {other:.4g} °C do not overlap where they lie best: the data do not say how "
+                "far apart they are; measure between these temperatures or at more frequencies, or give the factors "
+                "in a column shift_factor"
+            )
+        last = k if ends[k][1] > ends[last][1] else last
 
 
 def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.ndarray) -> np.ndarray:
@@ -142,7 +160,7 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
             s = _over(columns[before], columns[k])
             if s is None:
                 raise InputError(
-                    f"the sweeps at {temperatures[before] - 273.15:.4g} and {temperatures[k] - 273.15:.4g} °C do not "
+                    f"the sweeps at {celsius(temperatures[before]):.4g} and {celsius(temperatures[k]):.4g} °C do not "
                     "lie over each other at any shift of frequency: leave one end of the temperatures out, or give "
                     "the factors in a column shift_factor"
                 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from fitting.readers.frequency_sweep import Sweep, some
 from fitting.readers.rheometer import read_all_sweeps
+from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
 #: Temperatures that are nearer than this [K] are one: an instrument holds its set point within some tenths.
@@ -46,7 +47,7 @@ def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
     if len(groups) < 2:
         raise InputError(
             f"{paths[0]}: --master needs sweeps at two or more temperatures, these are all at "
-            f"{parts[0][0] - 273.15:.4g} °C: give a file with several tables, or several files"
+            f"{celsius(parts[0][0]):.4g} °C: give a file with several tables, or several files"
         )
     factors = np.array([float(np.exp(np.mean([np.log(p[1]) for p in g]))) for g in groups])
     means = np.array([float(np.mean([p[0] for p in g])) for g in groups])
@@ -82,7 +83,7 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
             )
         T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
     if np.any(T <= 0):
-        raise InputError(f"{path}: a temperature of {T.min() - 273.15:.4g} °C is below absolute zero: check its unit")
+        raise InputError(f"{path}: a temperature of {celsius(T.min()):.4g} °C is below absolute zero: check its unit")
     order = np.argsort(T, kind="stable")
     group = np.empty(len(T), int)
     group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])

@@ -92,7 +92,8 @@ def estimated(
 def _with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
     """The reported numbers (P,) and their derivative by u, where u is: in NumPy nothing is compiled."""
     if isinstance(u, np.ndarray):
-        return host.with_jacobian(natural_of, u)
+        with np.errstate(over="ignore", invalid="ignore"):  # a fit that ran away is told of by its errors
+            return host.with_jacobian(natural_of, u)
     return np.asarray(natural_of(u)), np.asarray(jax.jacfwd(natural_of)(u))
 
 

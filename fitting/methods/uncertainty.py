@@ -48,7 +48,10 @@ def estimate(
 
     modes = jax.eval_shape(maxwell, found.u).ratios.shape[0]
     vector = partial(parameter_vector, maxwell=maxwell)
-    return estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
+    own = estimated(parameter_names(modes), vector, found, count, deviations_given, effective)
+    if modes == 1 and maxwell is generalised_maxwell.natural_fluid:  # the only ratio of a fluid is 1
+        own = own._replace(standard_errors=np.where(np.arange(len(own.values)) == 1, 0.0, own.standard_errors))
+    return own
 
 
 def equilibrium_error(u: Estimate) -> float:

@@ -48,3 +48,8 @@ WAVE_UNITS = {
     "attenuation": {"1/m": 1.0, "Np/m": 1.0, "1/cm": 1e2, "Np/cm": 1e2, "1/mm": 1e3}
     | {"dB/m": np.log(10) / 20, "dB/cm": 5 * np.log(10)},
 }
+
+
+def celsius(kelvin: float | np.ndarray) -> np.ndarray:
+    """Temperatures in °C, without the roundoff of the difference."""
+    return np.round(np.asarray(kelvin) - 273.15, 9)

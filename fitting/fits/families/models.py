@@ -30,8 +30,12 @@ def fractional(sweep: Sweep) -> list[Fit]:
     reference, starts = springpots.reference_frequency(sweep), springpots.starting_points(sweep)
     scaled = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
+    # As many numbers as data follow anything: that has no error, and says nothing.
+    most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
+        if len(model.free) >= most:
+            continue
         switches = np.tile(model.switches, (len(starts), 1))
         found, compiling, running = viscoelastic.timed(best, starts, switches, *scaled)
         free = jnp.array(model.free)
