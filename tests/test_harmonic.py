@@ -295,6 +295,15 @@ def test_what_cannot_be_is_refused(changes, words):
         lj.harmonic(**{"scene": slab(2, 1), "frequencies_Hz": FREQUENCIES} | changes)
 
 
+def test_histories_are_refused():
+    """They were dropped without a word, or ended in a traceback."""
+    scene = slab(2, 1)
+    moved = replace(scene.displaced[0], times=jnp.array([0.0, 1.0]), history=jnp.array([1.0, 2.0]))
+    solve = replace(scene.solve, kind="harmonic", frequencies=jnp.array([10.0]))
+    with pytest.raises(lj.InputError, match=r"displaced\.0\.history is for runs in time"):
+        lj.check_scene(replace(scene, displaced=(moved, *scene.displaced[1:]), solve=solve))
+
+
 FILE = """
 [mesh]
 shape = "box"
@@ -336,6 +345,10 @@ def test_scene_files(tmp_path, capsys):
         about = lj.harmonic(lj.load_scene(scene), about=state["positions"][-1])
         assert np.array_equal(file["displacement"][()], about.displacement)
     assert np.abs(about.displacement - expected.displacement).max() > 1e-7
+    with h5py.File(tmp_path / "still" / "result.h5", "a") as file:
+        file.attrs["status"] = [1]
+    assert main(["simulate", str(scene), *out, "--about", str(tmp_path / "still" / "result.h5")]) == 2
+    assert "its last step is" in capsys.readouterr().err
 
 
 @pytest.mark.slow

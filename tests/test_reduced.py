@@ -486,6 +486,14 @@ def test_one_row_makes_a_model_without_correction(tmp_path, capsys):
     assert lj.load_reduced(tmp_path / "model.h5").correction is None
 
 
+def test_a_model_is_not_written_over_a_folder(tmp_path, capsys):
+    """That is known before the runs."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text("law.mu\n800\n")
+    arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path)]
+    assert main(["reduce", *arguments]) == 2 and "is a folder: name a file" in capsys.readouterr().err
+
+
 REFUSED = """
 reduced = "model.h5"
 reduced_tolerance = 1e-9

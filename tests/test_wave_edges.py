@@ -118,6 +118,33 @@ def test_small_labels_keep_their_volume():
     assert np.sum(fine > 0) / 8**3 == pytest.approx(np.sum(labels == 2), rel=0.03)
 
 
+@pytest.mark.parametrize("radius", [0.1, 1.1, 2.5])
+def test_a_small_label_leaves_the_edges_of_others_alone(radius):
+    """What lifts a small label to its volume was added everywhere: one voxel took all other edges of the body."""
+    grid = np.stack(np.meshgrid(*[np.arange(n) for n in (21, 13, 13)], indexing="ij"), axis=-1)
+    labels = np.where(grid[..., 0] < 8, 2, 1)
+    labels[np.linalg.norm(grid - [15, 6, 6], axis=-1) < radius] = 3
+    body = voxels.voxel_body(np.ones(labels.shape, bool), np.ones(3))
+    own = 1 + edge_places.places(labels, body, np.array([1, 2, 3])).argmax(axis=0)
+    far = np.linalg.norm(body.voxel - [15, 6, 6], axis=-1) > radius + 3
+    assert np.array_equal(own[far], labels[tuple(body.voxel.T)][far])
+
+
+def test_labels_whose_edges_cut_every_element():
+    """A box of 3 voxels in one of 5: no element lies in one region alone."""
+    field = beside_a_cylinder(0.005, (3e-4, -4e-4), 2e-3, 60.0, voxels_across=5)
+    labels = np.ones((5, 5, 5), int)
+    labels[1:4, 1:4, 1:4] = 2
+    own = organ_of(field)
+    s = edge_places.places(labels, own.body, np.array([1, 2]))
+    m = edges.region_matrices(own.matrices, own.body, DENSITY, s)
+    assert m.stiffness.shape[0] == 2 and np.all(np.isfinite(m.stiffness))
+
+
+def test_a_region_without_an_error_has_its_row_in_the_table():
+    assert [waves_report._error_cell(x) for x in (None, 12.345)] == ["unknown", "12"]
+
+
 def test_the_derivative_by_the_edges_is_the_difference(monkeypatch):
     """chi^2 with edges a fiftieth of a voxel farther out, up to the second order that its Hessian has."""
     monkeypatch.setattr(edge_places, "FARTHER", 0.02)

@@ -130,6 +130,8 @@ def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
             own["error_storage_Pa"],
             own["error_loss_Pa"],
         ]
+        if any(v is None for column in columns for v in column):  # a region that the data do not determine
+            continue
         rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
         rows += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
         files[name] = out / f"sweep_{name}.csv"
@@ -214,6 +216,10 @@ def _short(chi2: float) -> str:
     return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"
 
 
+def _error_cell(x: float | None) -> str:
+    return "unknown" if x is None else f"{x:.2g}"
+
+
 def table(content: Content) -> str:
     """Moduli of the whole and of the regions at every frequency, with the direct inversion beside them."""
     rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>9s}   direct [Pa]"]
@@ -222,7 +228,10 @@ def table(content: Content) -> str:
         for f, hertz in enumerate(content["frequencies_Hz"]):
             usual = [direct[part][f] for part in ("storage_Pa", "loss_Pa")]
             pair = "none" if usual[0] is None else f"{usual[0]:.4g} + {usual[1]:.3g}i"
-            cells = [f"{own[f'{part}_Pa'][f]:.5g} ± {own[f'error_{part}_Pa'][f]:.2g}" for part in ("storage", "loss")]
+            cells = [
+                f"{own[f'{part}_Pa'][f]:.5g} ± {_error_cell(own[f'error_{part}_Pa'][f])}"
+                for part in ("storage", "loss")
+            ]
             rows.append(
                 f"{name:12s}{hertz:8g}{cells[0]:>22s}{cells[1]:>22s}{own['phase_velocity_m_s'][f]:9.3g}"
                 f"{_short(own['chi2_per_component'][f]):>9s}   {pair}"

@@ -70,7 +70,9 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
     for k in range(len(known)):
         if k != largest:
             others = np.delete(s, k, axis=0).max(axis=0)
-            out[k] += _level(s[k] - others, whole == known[k], counts[k])
+            # Near the label alone: what a small one needs would win over all others at their edges.
+            apart = ndimage.distance_transform_edt(whole != known[k])
+            out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
             if farther:
                 slope = np.gradient(out[k])
                 out[k] = out[k] + farther * np.sqrt(sum(g**2 for g in slope))

@@ -229,7 +229,7 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
         inertia = density * p.mass[:, :, None, :, None] * np.eye(3)[:, None, :]
         mass += np.bincount(place, inertia[inside], len(known))
     pattern = scipy.sparse.csr_array((np.zeros(len(known)), known % U, ends), shape=(I, U))
-    corners = 1 + max(int(p.corners.max()) for p in parts)
+    corners = 1 + max((int(p.corners.max()) for p in parts if p.corners.size), default=0)
     B = _pressure_columns(parts, rows, (I, corners * R), corners)
     forces = balance.freely(B, balance.TYPICAL * stiffness.sum(axis=0))
     return RegionMatrices(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.files import writable
 from liverjax.core.struct import replace
 from liverjax.jobs.long_run import Ran
 from liverjax.jobs.sweep import read_sweep
@@ -50,6 +51,9 @@ def make(
         raise InputError(f"--modes {modes} must be above 0: give e.g. 40")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}; make it first")
+    if out.is_dir():
+        raise InputError(f"--out {out} is a folder: name a file for the model, e.g. {out / 'model.h5'}")
+    writable(out.parent, ())
     table = read_sweep(scene_file, rows_file)
     scene = replace(table.scene, solve=replace(table.scene.solve, reduced=""))
     rows = {name: table.rows[:, k] for k, name in enumerate(table.names)}

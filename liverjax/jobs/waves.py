@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.struct import replace
+from liverjax.jobs.output import read_by_step
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.run import simulate
@@ -70,13 +72,15 @@ def _last_positions(file: Path, scene: Scene) -> jax.Array:
 
     try:
         with h5py.File(file) as given:
-            x = np.asarray(given["positions"][-1])
+            x, code = np.asarray(given["positions"][-1]), int(np.ravel(read_by_step(given, "status"))[-1])
     except (OSError, KeyError, IndexError) as error:
         raise InputError(f"--about {file} holds no positions: give result.h5 of a run of this scene") from error
     if x.shape != scene.mesh.points.shape:
         raise InputError(
             f"--about {file} has {len(x)} nodes, the scene {scene.mesh.number_of_nodes}: give a run of this mesh"
         )
+    if code not in (status.CONVERGED, status.ONE_STEP):
+        raise InputError(f"--about {file}: its last step is {status.NAMES[code]}: give a run that ended in balance")
     return jnp.asarray(x)
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.physics.base import End, Free, Step
@@ -175,6 +176,8 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
     """
     from scipy.optimize import nnls
 
+    if not len(G):
+        raise InputError("the runs leave nothing to choose elements by: give two rows or more, with other numbers")
     # Rows of length 1: small vectors count as much as large ones.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])

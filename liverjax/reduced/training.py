@@ -119,7 +119,7 @@ def _pressure_fields(scene: Scene, P: np.ndarray, tolerance: float, most: int) -
 def _learnt_from(model: ReducedModel, scene: Scene, runs: _Runs) -> Correction | None:
     q, failed = _coordinates_of_rows(model, scene, runs.values)
     moved = np.linalg.norm(runs.u, axis=-1).max(axis=(1, 2))
-    good = ~failed & (moved > 0)
+    good = ~failed & (moved > 1e-9 * moved.max(initial=0.0))  # a body at rest has moved by roundoff
     missing = runs.u[good] - np.tensordot(q[good], np.asarray(model.modes), axes=1)
     volumes = np.asarray(nodal_volumes(scene.mesh))
     return learnt_correction(Learnt(q[good], missing, moved[good], volumes, scene.solve.dt))

@@ -71,6 +71,10 @@ def check_choices(scene: Scene) -> None:
         raise InputError("[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) go together: give both, or neither")
     if scene.springpots is not None and scene.solve.kind != "harmonic":
         raise InputError("[springpots] are for kind = 'harmonic': a run in time takes [viscosity], a Prony series")
+    for key in ("displaced", "traction"):
+        for k, part in enumerate(getattr(scene, key)):
+            if scene.solve.kind == "harmonic" and part.history is not None:
+                raise InputError(f"{key}.{k}.history is for runs in time: give harmonic motion its amplitudes alone")
     _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
