@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+from experiments.common import SKIPPED
 from experiments.pages.overview import ROWS
 from experiments.pages.write import record, write
 
@@ -19,15 +20,16 @@ def module(script: str) -> str:
 
 
 def run(script: str, quick: bool) -> bool:
-    """One script in a process of its own; whether it ended well."""
+    """One script in a process of its own; whether it ended well, or says that it needs what is not here."""
     begin = time.perf_counter()
     command = [sys.executable, "-m", module(script), *(["--quick"] if quick else [])]
     code = subprocess.run(command, cwd=HERE.parent).returncode
     seconds = time.perf_counter() - begin
-    print(f"{script}: {'done' if code == 0 else f'exit code {code}'} after {seconds:.0f} s", flush=True)
+    ended = {0: "done", SKIPPED: "skipped"}.get(code, f"exit code {code}")
+    print(f"{script}: {ended} after {seconds:.0f} s", flush=True)
     if code == 0:
         record(script, "quick" if quick else "full", seconds)
-    return code == 0
+    return code in (0, SKIPPED)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -23,6 +23,8 @@ from liverjax.core.versions import versions
 os.environ["LIVERJAX_CACHE"] = "off"
 #: Fewer cases and smaller ones, for a look at whether everything runs; published results stay as they are.
 QUICK = "--quick" in sys.argv[1:]
+#: Exit code of a script that needs what this machine lacks: its results and its time stay as they are.
+SKIPPED = 77
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "experiments" / "results" / ("quick" if QUICK else "")
 plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "axes.grid": True, "grid.alpha": 0.3, "savefig.dpi": 150})

@@ -17,7 +17,7 @@ if jax.__version__ in ("0.10.2", "0.11.0"):
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 if "JAX_DEFAULT_MATMUL_PRECISION" not in os.environ:
-    # A GPU multiplies float32 with 11 bits by default: forces of quadratic elements were 6 % off.
+    # A GPU multiplies float32 with 11 bits by default: quadratic elements were up to 6 % off.
     jax.config.update("jax_default_matmul_precision", "highest")
 if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) == 1:
     # On one core JAX has one thread. A direct solve on the host would occupy it, and wait for it to copy the matrix.

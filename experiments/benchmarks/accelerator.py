@@ -10,8 +10,9 @@ float64, so they have the precision and the order of the sums in them, and neith
 * A reduced model, one run and a thousand at once: of a pulled cube, or with ``--model FILE`` the phantom's that
   ``python -m experiments.benchmarks.reduced --keep FILE`` wrote.
 
-``python -m experiments accelerator`` (10 minutes) writes results/accelerator.json; with ``--platforms cpu`` it measures
-the processor alone. Programs are compiled side by side first; run times are medians without compilation.
+``python -m experiments accelerator`` (5 minutes) writes results/accelerator.json. Without a GPU it says so and ends;
+``--platforms cpu`` prints the rows of the processor alone. Programs are compiled side by side first; run times are
+medians without compilation.
 """
 
 import argparse
@@ -36,7 +37,7 @@ from experiments.benchmarks.precision import cast
 from experiments.benchmarks.reduced import loosely, pulled_phantom
 from experiments.benchmarks.solve_benchmark import cube
 from experiments.chapter.assembly_rivals import contracted
-from experiments.common import QUICK, either, save
+from experiments.common import QUICK, SKIPPED, either, save
 from experiments.liver import models, with_solve
 from liverjax.core import status
 from liverjax.core.struct import replace
@@ -250,8 +251,7 @@ def _timed(case: Case, program: Any, folder: Path) -> dict:
 
 def own_process(platform: str, part: str, folder: Path) -> subprocess.Popen:
     """A process that compiles, says so, waits for a line, and measures."""
-    # A reservation of most of the memory would leave the other processes none.
-    own = os.environ | {"JAX_PLATFORMS": platform, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    own = os.environ | {"JAX_PLATFORMS": platform}
     call = [sys.executable, "-m", "experiments.benchmarks.accelerator", "--folder", str(folder), "--parts", part]
     call += ["--quick"] if QUICK else []
     return subprocess.Popen(call, env=own, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -260,6 +260,8 @@ def own_process(platform: str, part: str, folder: Path) -> subprocess.Popen:
 def rows_of(process: subprocess.Popen) -> list[dict]:
     """Let it measure."""
     assert process.stdin is not None and process.stdout is not None
+    if process.poll() is not None:  # it ended before it had compiled, and has said why
+        return []
     process.stdin.write("go\n")
     process.stdin.flush()
     rows = []
@@ -282,7 +284,7 @@ def main() -> None:
     """All parts on all platforms, each in a process of its own: all compile side by side, then each measures alone."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS))
-    parser.add_argument("--platforms", nargs="*", default=["cpu", "cuda"], help="as JAX names them")
+    parser.add_argument("--platforms", nargs="*", help="as JAX names them; default: cpu and cuda")
     parser.add_argument("--model", type=Path, help="reduced model of the phantom")
     parser.add_argument("--folder", type=Path, help="for the processes of this script")
     parser.add_argument("--quick", action="store_true", help="small cases")
@@ -290,19 +292,26 @@ def main() -> None:
     if options.folder is not None:
         measured(options.parts[0], options.folder)
         return
+    # A reservation of most of the memory, by this process too, would leave the others none.
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    if options.platforms is None and jax.default_backend() == "cpu":
+        print("this machine has no GPU that JAX finds: nothing is measured")
+        sys.exit(SKIPPED)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if options.model is not None:
             shutil.copy(options.model, folder / "phantom.h5")
         elif "reduced" in options.parts:
             train(folder)
-        every = [own_process(platform, part, folder) for platform in options.platforms for part in options.parts]
+        platforms = options.platforms or ["cpu", "cuda"]
+        every = [own_process(platform, part, folder) for platform in platforms for part in options.parts]
         for process in every:
             wait_until_compiled(process)
         rows = []
         for process in every:
             rows += rows_of(process)
-            save("accelerator", {"devices": [d.device_kind for d in jax.devices()], "rows": rows})
+            if jax.default_backend() != "cpu":
+                save("accelerator", {"devices": [d.device_kind for d in jax.devices()], "rows": rows})
 
 
 if __name__ == "__main__":
