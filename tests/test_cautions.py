@@ -9,7 +9,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
-from liverjax.simulation.cautions import cautions_of_run
+from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves
 from liverjax.simulation.run import Result
 
 pytestmark = pytest.mark.quick_to_compile
@@ -66,6 +66,25 @@ def test_long_bodies_and_slivers():
     (found,) = cautions_of_run(scene(flat), run(flat, [np.eye(3)], [1.0]))
     assert found.startswith("1 of 1 elements are slivers, of quality below 0.01 (worst: element 0, ")
     assert f"{quality:.2g}; regular: 1)" in found
+
+
+def test_short_bodies_and_nodes_in_one_place():
+    short = lj.shapes.box((2e-4, 1e-4, 1e-4), (1, 1, 1))
+    assert cautions_of_run(scene(short), run(short, [np.eye(3)], [1.0])) == [
+        "the body is 0.0002 m long: check the mesh's unit, e.g. write unit = 'm'"
+    ]
+    x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
+    two = lj.tet_mesh(np.concatenate([x, x + [0.1, 0, 0]]), np.concatenate([tets, tets + len(x)]))
+    (found,) = cautions_of_run(scene(two), run(two, [np.eye(3)], [1.0]))
+    assert found.startswith("4 nodes stand where another node stands: the body is not joined there")
+
+
+def test_waves_without_a_mass_are_told():
+    bare = scene(BOX, kind="harmonic", frequencies=np.array([60.0]))
+    assert cautions_of_waves(bare) == [
+        "the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]"
+    ]
+    assert cautions_of_waves(replace(bare, body=lj.Body(density=1060.0))) == []
 
 
 SCENE = """

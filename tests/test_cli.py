@@ -75,8 +75,10 @@ def test_bfgs_option(tmp_path):
 
 def test_unconverged_fit_exits_1_and_keeps_its_best_point(tmp_path, monkeypatch, capsys):
     from fitting.fits import viscoelastic
+    from fitting.methods import least_squares
 
     few = viscoelastic.from_starts
+    monkeypatch.setattr(least_squares, "LONGER", 1)
     monkeypatch.setattr(viscoelastic, "from_starts", lambda *a: few(*a, max_iterations=1))
     assert main([str(PORCINE), "--method", "closed-form", "--modes", "2", "--out", str(tmp_path)]) == 1
     content = json.loads((tmp_path / "fit.json").read_text())
@@ -147,6 +149,13 @@ def test_output_folder_that_is_a_file(tmp_path, capsys):
     (tmp_path / "out" / "fit.h5").mkdir(parents=True)
     assert main([str(PORCINE), "--out", str(tmp_path / "out")]) == 2
     assert "fit.h5 in it is a folder" in capsys.readouterr().err
+
+
+def test_what_an_earlier_run_left_is_told(tmp_path, capsys):
+    given = [str(PORCINE), "--method", "closed-form", "--modes", "2", "--out", str(tmp_path)]
+    assert main([*given, "--cards"]) == 0 and "earlier run" not in capsys.readouterr().err
+    assert main(given) == 0
+    assert capsys.readouterr().err.endswith(f"note: cards in {tmp_path} is of an earlier run\n")
 
 
 @pytest.mark.core

@@ -374,6 +374,8 @@ def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
     [
         ("", [], "frequencies = [60.0] (Hz) go together"),
         ("frequencies = 60.0\n", [], "must be a list"),
+        ("frequencies = []\n", [], "frequencies = [] holds no frequency"),
+        ('frequencies = [60.0]\nreduced = "model.h5"\n', [], "reduced is for runs in time"),
         ("frequencies = [-60.0]\n", [], "frequencies"),
         ("frequencies = [60.0]\n", ["--png"], "--png is for runs in time"),
         ("frequencies = [60.0]\n", ["--about", "none.h5"], "holds no positions"),

@@ -128,6 +128,12 @@ def test_a_stopped_run_goes_on_to_the_same_numbers(scene, tmp_path, monkeypatch,
     assert not (stopped / "result.h5").exists()
     assert main([*command, str(stopped)]) == 2
     assert "go on with --resume" in capsys.readouterr().err
+    damaged = sorted(stopped.glob("result.h5.parts/part_*.h5"))[1]  # the machine lost power while it was written
+    damaged.write_bytes(damaged.read_bytes()[:-1000])
+    with monkeypatch.context() as patch:
+        _stop_after(patch, 1)
+        assert main([*command, str(stopped), "--resume"]) == 130
+    capsys.readouterr()
     assert main([*command, str(stopped), "--resume"]) == 0
     assert "8 steps found on disk" in capsys.readouterr().out
     expected, found = _numbers(whole / "result.h5"), _numbers(stopped / "result.h5")

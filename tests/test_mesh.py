@@ -223,6 +223,18 @@ def test_a_named_group_of_triangles_is_a_place(order, cells, tmp_path):
     assert set(_with_surface(tmp_path / "m.msh", order, cells, {}).node_sets) == set()
 
 
+@pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])
+def test_numbers_of_regions_may_be_of_any_type(kind, tmp_path):
+    """ParaView's filters write whole numbers as floats; numbers with fractions are no regions."""
+    mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
+    region = np.repeat([1, 2], 24).astype(kind)
+    data = {"region": [region], "density": [np.linspace(1, 2, 48)]}
+    meshio.Mesh(np.asarray(mesh.points), [meshio_cells(mesh)], cell_data=data).write(tmp_path / "m.vtu")
+    read = lj.read_mesh(tmp_path / "m.vtu")
+    assert set(read.element_sets) == {"region=1", "region=2"}
+    assert np.array_equal(read.element_sets["region=2"], np.arange(24, 48))
+
+
 def test_sets_of_triangles_in_other_files_and_names_that_collide(tmp_path):
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
     below = np.asarray(mesh.node_sets["z_min"])

@@ -347,6 +347,33 @@ def test_no_start_of_scipy_is_below_the_fluid():
     assert float(f.solution.cost) <= best * (1 + 1e-8)
 
 
+def curve_of_20_decades(relaxing):
+    """81 frequencies with 2 % noise; `relaxing` gives the part above the plateau from i omega."""
+    omega = 2 * np.pi * np.logspace(-10, 10, 81)
+    G, factor = 1e3 + relaxing(1j * omega), 1 + 0.02 * np.random.default_rng(1).standard_normal((2, 81))
+    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+
+
+def test_few_modes_converge_on_a_wide_curve():
+    """They miss it by half, so Gauss-Newton converges slowly: more than 200 iterations."""
+    s = curve_of_20_decades(lambda x: 1e6 * x**0.3 / (1 + x**0.3))
+    f = viscoelastic.closed_form(s, 3)
+    assert f.converged and f.details["iterations"] > 200 and viscoelastic.identifiable(f, s)
+
+
+@pytest.mark.slow
+def test_as_many_modes_are_found_as_a_wide_curve_has():
+    """A time per decade: fewer modes miss by 73, 62, 53, … %, and the criterion falls with each."""
+    times = np.logspace(-9, 9, 20)
+    s = curve_of_20_decades(lambda x: sum(5e3 * x * t / (1 + x * t) for t in times))
+    f, tried = viscoelastic.choose_modes(s, generalised_maxwell.refuse_impossible(s))
+    assert f.modes == 20 and f.converged and all(viscoelastic.identifiable(t, s) for t in tried[:20])
+    assert np.mean(f.relative_errors(s)) < 0.02
+    # Each time within four standard errors.
+    errors = f.uncertainty.standard_errors[21:] / times[::-1]
+    assert np.all(np.abs(np.log(f.model.relaxation_times / times[::-1])) < 4 * errors)
+
+
 @pytest.mark.slow
 def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
     """Synthetic: two broad fractional steps and a plateau, 2 % noise; 8 or 9 free modes stop at 30 % here."""

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import re
 import threading
 from types import SimpleNamespace
 
@@ -177,5 +178,11 @@ def test_the_command_pulls_without_a_page_and_refuses_in_a_sentence(tmp_path, ca
     assert main(["play", str(scene), "--steps", "5"]) == 0
     said = capsys.readouterr().out
     assert "27 nodes, 5 steps" in said and "a second" in said and "failed" not in said
+    # A node that the scene moves cannot be pulled.
+    driven = SCENE.replace("[solve]", "[[displaced]]\nset = 'z_max'\nby = [0, 0, 0.001]\n[solve]")
+    scene.write_text(driven)
+    assert main(["play", str(scene), "--steps", "1"]) == 0
+    node = int(re.search(r"node (\d+) moved", capsys.readouterr().out)[1])
+    assert np.isclose(lj.load_scene(scene).mesh.points[node, 2], 0.01)
     assert main(["play", str(scene), "--steps", "0"]) == 2 and "--steps 0" in capsys.readouterr().err
     assert main(["play", str(scene), "--port", "70000"]) == 2 and "--port 70000" in capsys.readouterr().err

@@ -52,6 +52,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
     )
+    command.set_defaults(optional_files=("field.vtu", "field.h5", "field.png"))
     return command
 
 

@@ -46,7 +46,10 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
     command.add_argument("--height", type=float, metavar="M", help="of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)
-    command.add_argument("--out", type=Path, metavar="DIR", help=f"folder of the results (default {kind})")
+    command.add_argument(
+        "--out", type=Path, default=Path(kind), metavar="DIR", help=f"folder of the results (default {kind})"
+    )
+    command.set_defaults(optional_files=("posterior.csv", "cards"))
     return command
 
 
@@ -83,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         raise InputError(f"--modes works with --model prony only: leave it out for --model {options.model}")
     if options.samples is not None and options.model == "spectrum":
         raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
-    out = options.out or Path(options.kind)
+    out = options.out
     sample = reader.Sample(options.radius, options.height)
     if options.file.suffix.lower() == ".toml":
         test = _in_its_rig(options)

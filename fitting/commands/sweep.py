@@ -74,6 +74,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("--vertical", action="store_true", help="with --master: moduli have shift factors too")
     _add_sample(command)
     _add_outputs(command)
+    master = ("shift_factors.csv", "master_curve.csv", "shift.png")
+    command.set_defaults(optional_files=("fit.h5", "posterior.csv", "cards", "report.pdf", *master))
     return command
 
 

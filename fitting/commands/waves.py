@@ -51,6 +51,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--resume", action="store_true", help="go on from the last step written to --out")
     command.add_argument("--out", type=Path, default=Path("waves"), metavar="DIR", help="folder (default waves)")
+    command.set_defaults(optional_files=FILES[2:4])
     return command
 
 
@@ -82,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
     print(waves_report.table(content))
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
-    files = [name for name in FILES[:-1] if (options.out / name).exists()]
+    files = FILES[:-1] if drawn is not None else FILES[:2]
     print(f"written: {options.out}/{', '.join(files)}")
     return 0 if np.all(found.whole.converged) and (found.parts is None or np.all(found.parts.converged)) else 1
 

@@ -44,6 +44,8 @@ class State(NamedTuple):
 
 #: Convergence: gain of the undamped step over the cost, and mean squared residual that counts as zero.
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
+#: How many times as long the best of many fits may go on alone.
+LONGER = 8
 
 
 def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
@@ -153,12 +155,23 @@ def levenberg_marquardt(
 def from_starts(residuals: Callable[..., Any], starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
     """The best of the minima that `levenberg_marquardt` finds from starts (S, P), in NumPy: nothing is compiled.
 
+    Where the best has not converged yet, it goes on alone: modes that miss wide curves converge slowly.
+
     Args:
         residuals: of (u, *data), as `host.with_jacobian` asks for.
         starts: where to begin.
         data: as in `residuals`.
-        max_iterations: of each fit.
+        max_iterations: of each fit; of the best, `LONGER` times as many.
     """
+    found = _best_minimum(residuals, starts, data, max_iterations)
+    if found.converged or found.iterations < max_iterations:
+        return found
+    further = _best_minimum(residuals, np.asarray(found.u)[None], data, (LONGER - 1) * max_iterations)
+    return further._replace(iterations=found.iterations + further.iterations)
+
+
+def _best_minimum(residuals: Callable[..., Any], starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
+    """The lowest point that is reached from starts (S, P), all iterated at once."""
     going: np.ndarray = np.arange(len(starts))
     s: Any = None
     with np.errstate(all="ignore"):  # a trial that overflows is a bad one

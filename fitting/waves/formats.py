@@ -1,17 +1,20 @@
-"""Files of waves on voxels: .npz, .npy, HDF5, CSV and NIfTI, each as named arrays.
+"""Files of waves on voxels: .npz, .npy, HDF5, MATLAB, CSV and NIfTI, each as named arrays.
 
 Names are displacement (complex; or real and imag, or phases: instants of a period), frequencies [Hz], spacing [m],
 origin [m], mask, labels and unit.
 """
 
-import csv
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fitting.readers.tables.text_tables import find_delimiter, split_cells, text_of, to_number
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
+
+if TYPE_CHECKING:
+    import h5py
 
 NAMES = (
     "displacement",
@@ -27,7 +30,7 @@ NAMES = (
     "unit",
 )
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
-HDF5 = (".h5", ".hdf5", ".mat")
+HDF5 = (".h5", ".hdf5")
 
 
 def arrays(path: Path) -> Content:
@@ -37,11 +40,12 @@ def arrays(path: Path) -> Content:
         InputError: no such file, or one that cannot be read.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file of waves: give .npz, .npy, .h5, .csv, .nii or .nii.gz")
+        raise InputError(f"{path}: no such file of waves: give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz")
     ending = "".join(path.suffixes[-2:]).lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
     readers = {
         ".npz": _numpy,
         ".npy": _numpy,
+        ".mat": _matlab,
         ".csv": _voxel_table,
         ".txt": _voxel_table,
         ".nii": _nifti,
@@ -49,7 +53,7 @@ def arrays(path: Path) -> Content:
     }
     readers |= dict.fromkeys(HDF5, _hdf5)
     if ending not in readers:
-        raise InputError(f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .csv, .nii or .nii.gz")
+        raise InputError(f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz")
     try:
         return readers[ending](path)
     except InputError:
@@ -61,16 +65,17 @@ def arrays(path: Path) -> Content:
         raise InputError(f"{path}: is damaged ({type(error).__name__}): write it again") from None
 
 
-def single(path: Path, name: str) -> np.ndarray:
-    """One array (nx, ny, nz): the array of this name, or the only one of the file."""
+def single(path: Path, name: str) -> tuple[np.ndarray, Any]:
+    """One array (nx, ny, nz): the array of this name, or the only one of the file; and the file's spacing, or None."""
     found = arrays(path)
     if name in found:
-        return np.asarray(found[name])
+        return np.asarray(found[name]), found.get("spacing")
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
     if len(own) != 1:
         raise InputError(f"{path}: holds no {name}: name the array {name}")
     a = np.asarray(own[0])
-    return a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
+    a = a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
+    return a, found.get("spacing")
 
 
 def _numpy(path: Path) -> Content:
@@ -81,23 +86,47 @@ def _numpy(path: Path) -> Content:
             found = {name: file[name] for name in file}
     except ValueError:  # NumPy speaks of pickled objects then, of text too
         raise InputError(f"{path}: holds no arrays of numbers: write it again with numpy.save or numpy.savez") from None
-    return found | ({"unit": str(found["unit"])} if "unit" in found else {})
+    return _with_plain_unit(found)
+
+
+def _matlab(path: Path) -> Content:
+    """A .mat file, in the shapes that MATLAB shows: version 7.3 is HDF5 with the axes the other way round."""
+    import h5py
+
+    if h5py.is_hdf5(path):
+        return _hdf5(path)
+    from scipy.io import loadmat
+
+    return _with_plain_unit({name: value for name, value in loadmat(path).items() if name in NAMES})
+
+
+def _with_plain_unit(found: Content) -> Content:
+    """The unit as text: programs store it as bytes, or as an array of one word."""
+    if found.get("unit") is None:
+        return found
+    word = np.ravel(found["unit"])[0] if np.size(found["unit"]) else ""
+    return found | {"unit": (word.decode() if isinstance(word, bytes) else str(word)).strip()}
 
 
 def _hdf5(path: Path) -> Content:
     import h5py
 
     with h5py.File(path) as file:
-        found: Content = {name: file[name][()] for name in NAMES if name in file}
+        found: Content = {name: _values(file[name]) for name in NAMES if name in file}
         # Attributes of the file, or of the waves.
         for own in (file, *(file[name] for name in WAVES if name in file)):
             found = {name: own.attrs[name] for name in NAMES if name in own.attrs} | found
-    for name, value in found.items():
-        a = np.asarray(value)
-        if a.dtype.names and set(a.dtype.names) >= {"real", "imag"}:  # complex numbers of MATLAB
-            found[name] = a["real"] + 1j * a["imag"]
-    unit = found.get("unit")
-    return found | ({} if unit is None else {"unit": unit.decode() if isinstance(unit, bytes) else str(unit)})
+    return _with_plain_unit(found)
+
+
+def _values(dataset: "h5py.Dataset") -> Any:
+    """The content of a dataset; of one that MATLAB wrote, as MATLAB shows it."""
+    kind, values = dataset.attrs.get("MATLAB_class"), dataset[()]
+    if kind == b"char":
+        return "".join(map(chr, np.ravel(values)))
+    if getattr(values, "dtype", None) is not None and set(values.dtype.names or ()) >= {"real", "imag"}:
+        values = values["real"] + 1j * values["imag"]
+    return values if kind is None else np.asarray(values).T
 
 
 #: Columns of a table, all of them but the frequency needed.
@@ -106,25 +135,26 @@ COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_i
 
 def _voxel_table(path: Path) -> Content:
     """x, y, z [m], real and imaginary parts, with or without frequency [Hz] and label, on a regular grid."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        numbered = [(k, row) for k, row in enumerate(csv.reader(file), 1)]
-    lines = [(k, row) for k, row in numbered if row and not row[0].lstrip().startswith("#")]
-    head = [cell.strip().lower() for cell in lines[0][1]] if lines else []
+    numbered = enumerate(text_of(path, "waves").splitlines(), 1)
+    lines = [(k, line) for k, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+    between = find_delimiter(lines[0][1]) if lines else ","
+    head = [cell.lower() for cell in split_cells(lines[0][1], between)] if lines else []
     missing = [name for name in COLUMNS if name not in head]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, of several, frequency")
     rows = np.full((len(lines) - 1, len(head)), np.nan)
-    for k, (number, row) in enumerate(lines[1:]):
-        try:
-            rows[k, : len(row)] = [float(cell) if cell.strip() else np.nan for cell in row[: len(head)]]
-        except ValueError:
-            raise InputError(
-                f"{path}: row {number}: {','.join(row)[:40]!r} has a cell that is no number: mend it"
-            ) from None
+    for k, (number, line) in enumerate(lines[1:]):
+        cells = [to_number(cell, between) for cell in split_cells(line, between)[: len(head)]]
+        if None in cells:
+            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is no number: mend it")
+        rows[k, : len(cells)] = cells
     column = dict(zip(head, rows.T, strict=True))
     at, spacing, origin, shape = _grid(path, np.stack([column[a] for a in "xyz"], axis=1))
     hertz, of = (None, np.zeros(len(rows), int))
     if "frequency" in column:
+        empty = np.flatnonzero(~np.isfinite(column["frequency"]))
+        if len(empty):
+            raise InputError(f"{path}: row {lines[1 + empty[0]][0]} has no frequency: give every row its own, in Hz")
         hertz, of = np.unique(column["frequency"], return_inverse=True)
     if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
         raise InputError(f"{path}: a voxel has two rows of one frequency: leave one of them")

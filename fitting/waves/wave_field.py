@@ -51,7 +51,8 @@ def read_waves(
     """
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
-    found |= {key: formats.single(Path(file), key) for key, file in more.items() if file is not None}
+    step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
+    found |= {key: _beside(Path(file), key, step) for key, file in more.items() if file is not None}
     jumps: list[str] = []
     if found.get("wrapped") is not None:
         found["phases"], jumps = unwrapped(name, _instants(name, "wrapped", found["wrapped"]))
@@ -59,12 +60,8 @@ def read_waves(
     U, notes = _motion(name, found)
     notes += jumps
     U = np.where(np.isfinite(U), U, np.nan) * _factor(name, unit or found.get("unit") or "m")
-    still = np.all((U == 0) | np.isnan(U), axis=(0, 4))  # how many programs write what they did not measure
-    if np.any(still & np.any(U == 0, axis=(0, 4))):
-        U[:, still] = np.nan
-        notes.append(f"{still.sum()} voxels that do not move at all are taken as not measured")
+    notes += _leave_out_rest(U)
     hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
-    step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
     origin = np.zeros(3) if found.get("origin") is None else _plain(name, "origin", found["origin"])
     if origin.shape != (3,) or not np.all(np.isfinite(origin)):
         raise InputError(f"{name}: origin {origin.tolist()} must be three coordinates in metres: mend it")
@@ -78,6 +75,33 @@ def read_waves(
     order = np.argsort(hertz)
     field = WaveField(hertz[order], U[order], step, origin, inside, regions, np.zeros(len(U)), name, tuple(notes))
     return field._replace(noise=noise_of(field))
+
+
+def _beside(file: Path, key: str, spacing: np.ndarray) -> np.ndarray:
+    """The mask or labels of a file of its own, whose voxels have to be those of the waves."""
+    values, own = formats.single(file, key)
+    if own is not None:
+        size = _lengths(str(file), "spacing", own, "its spacing")
+        if not np.allclose(size, spacing, rtol=0.01):
+            raise InputError(
+                f"{file}: its voxels are {size.tolist()} m and those of the waves {spacing.tolist()} m: give {key} on "
+                "the voxels of the waves"
+            )
+    return values
+
+
+def _leave_out_rest(U: np.ndarray) -> list[str]:
+    """Make voxels NaN, in place, that do not move: many programs write so what they did not measure. Notes on it."""
+    notes, nothing = [], (U == 0) | np.isnan(U)
+    still = np.all(nothing, axis=(0, 4))
+    if np.any(still & np.any(U == 0, axis=(0, 4))):
+        U[:, still] = np.nan
+        notes.append(f"{still.sum()} voxels that do not move at all are taken as not measured")
+    # A wave may have one direction only, so a component is not taken away.
+    resting = np.all(nothing, axis=(0, 1, 2, 3)) & np.any(U == 0, axis=(0, 1, 2, 3))
+    for axis in np.array(list("xyz"))[resting]:
+        notes.append(f"component {axis} is zero everywhere: write NaN where it was not measured")
+    return notes
 
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:

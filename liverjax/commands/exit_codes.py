@@ -3,8 +3,10 @@
 import argparse
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 from liverjax.core import programs
 from liverjax.core.errors import InputError
@@ -13,7 +15,8 @@ from liverjax.core.errors import InputError
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
     """Run a command; return its exit code, 2 for unusable input and 130 for Ctrl-C.
 
-    Compiled programs are kept on disk for the next command, see `liverjax.core.programs`.
+    Compiled programs are kept on disk for the next command, see `liverjax.core.programs`. Where the command names
+    `optional_files`, those of an earlier run that this one has not written again are told.
 
     Args:
         run: runs the command with its options and returns 0 or 1.
@@ -22,9 +25,12 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
     """
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+        begin = time.time()
         try:
             with programs.kept_on_disk():
-                return run(options)
+                code = run(options)
+            _tell_of_earlier_files(options, begin)
+            return code
         except InputError as error:
             print(f"error: {error}", file=sys.stderr)
             return 2
@@ -34,3 +40,16 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
         except BrokenPipeError:  # the reader of a pipe has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
+
+
+def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
+    """A note on what stands in the folder of results and is not of this run, which began at `begin`."""
+    names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
+    if names:
+        verb = "is" if len(names) == 1 else "are"
+        print(f"note: {', '.join(names)} in {options.out} {verb} of an earlier run", file=sys.stderr)
+
+
+def _older(path: Path, begin: float) -> bool:
+    files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path] * path.is_file()
+    return bool(files) and max(file.stat().st_mtime for file in files) < begin

@@ -45,6 +45,8 @@ def _refuse_options(options: argparse.Namespace) -> None:
 
 
 def _tell(scene: "Scene", ran: "Waves") -> None:
+    from liverjax.simulation.cautions import cautions_of_waves
+
     u = np.linalg.norm(np.asarray(ran.found.displacement), axis=-1)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {len(u)} frequencies in "
@@ -53,6 +55,8 @@ def _tell(scene: "Scene", ran: "Waves") -> None:
     for k, frequency in enumerate(np.asarray(ran.found.frequencies_Hz)):
         line = f"{frequency:g} Hz: at most {1e3 * u[k].max():.4g} mm, residual {float(ran.found.residual[k]):.1e}"
         if ran.mesh_error is not None:
-            off = np.linalg.norm(np.asarray(ran.mesh_error[k])) / np.linalg.norm(u[k])
-            line += f", the mesh leaves out about {off:.2g} of the motion"
+            off, moved = np.linalg.norm(np.asarray(ran.mesh_error[k])), np.linalg.norm(u[k])
+            line += f", the mesh leaves out about {off / moved:.2g} of the motion" if moved else ", nothing moves"
         print(line)
+    for sentence in cautions_of_waves(scene):
+        print(f"caution: {sentence}")

@@ -67,7 +67,10 @@ def _without_page(playing: "Playing", steps: int) -> int:
     scene = playing.scene
     held = [np.asarray(f.nodes) for f in scene.fixed] + [np.asarray(d.nodes) for d in scene.displaced]
     centre = X[np.concatenate(held)].mean(axis=0) if held else X.mean(axis=0)
-    node = int(playing.nodes[np.argmax(np.linalg.norm(X[playing.nodes] - centre, axis=1))])
+    nodes = np.setdiff1d(playing.nodes, np.concatenate(held)) if held else playing.nodes
+    if not len(nodes):
+        raise InputError("[[fixed]] and [[displaced]] hold the whole surface: leave a node that can be pulled")
+    node = int(nodes[np.argmax(np.linalg.norm(X[nodes] - centre, axis=1))])
     away = X[node] - centre
     to = X[node] + 0.1 * playing.size * away / max(float(np.linalg.norm(away)), 1e-300)
     failed, taken = 0, []

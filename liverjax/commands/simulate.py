@@ -31,7 +31,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "--about", type=Path, metavar="RESULT.h5", help="of a harmonic scene: the run whose last state moves"
     )
     add_out(command)
-    command.set_defaults(run=run)
+    command.set_defaults(run=run, optional_files=("reactions.csv", "result.png", "vtu"))
 
 
 def run(options: argparse.Namespace) -> int:

@@ -82,12 +82,12 @@ def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[
     firsts = range(1, scene.solve.steps + 1, count)
     files = [None if folder is None else resumable_parts.part(folder, k) for k in range(len(firsts))]
     state, results, computed, run_time = initial_state(scene), [], 0, 0.0
-    finished = [file is not None and file.exists() for file in files]
+    finished = [file is not None and resumable_parts.finished(file) for file in files]
     begin = time.perf_counter()
     program: Any = None if all(finished) else _compiled_part(scene, state, count)
     compile_time = time.perf_counter() - begin
-    for first, file in zip(firsts, files, strict=True):
-        if file is not None and file.exists():
+    for first, file, there in zip(firsts, files, finished, strict=True):
+        if file is not None and there:
             result, state = _read(file, state)
         else:
             begin = time.perf_counter()

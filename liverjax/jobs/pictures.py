@@ -73,6 +73,10 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
 
     try:
         with h5py.File(file) as data:
+            if "sweep" in data.attrs:
+                raise InputError(f"{file} holds the runs of a sweep: give the result.h5 of one run")
+            if "frequencies_Hz" in data:
+                raise InputError(f"{file} holds harmonic motion: write it for ParaView by simulate --vtu")
             tets, before, after = data["tetrahedra"][()][:, :4], data["reference"][()], data["positions"]
             steps, fields = len(after), list(data.get("fields/vertices", ()))
             known = ["displacement", *(["pressure"] if "pressure" in data else []), *fields]

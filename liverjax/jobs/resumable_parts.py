@@ -44,6 +44,18 @@ def write(file: Path, content: dict[str, np.ndarray]) -> None:
         os.fsync(out.fileno())
 
 
+def finished(file: Path) -> bool:
+    """Whether the part is there; one that cannot be read is removed, so that it is computed again."""
+    if not file.exists():
+        return False
+    try:
+        with h5py.File(file):
+            return True
+    except OSError:
+        file.unlink()
+        return False
+
+
 def make_folder(folder: Path) -> None:
     """Make the folder and try it.
 

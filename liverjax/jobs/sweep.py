@@ -191,7 +191,7 @@ def run(
         program, computed = _program(sweep.outputs, sweep.probes), 0
         for k in list(_chunks(sweep))[process[0] :: process[1]]:
             file = resumable_parts.part(folder, k)
-            if not file.exists():
+            if not resumable_parts.finished(file):
                 _write_part(file, sweep, k, program)
                 computed += len(_of(sweep, k))
             report(len(_of(sweep, k)))

@@ -226,8 +226,9 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
     names = {(int(tag[0]), "gmsh:physical"): name for name, tag in data.field_data.items() if tag[-1] == dimension}
     for name, parts in data.cell_data.items():
         values = np.concatenate([np.asarray(p) for p, kind in zip(parts, kinds, strict=True) if kind in cells])
-        if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
+        if values.ndim != 1 or not _are_whole(values):
             continue
+        values = values.astype(int)
         if name.startswith("set:"):
             sets[name.removeprefix("set:")] = np.flatnonzero(values)
             continue
@@ -236,6 +237,13 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
             if dimension == 3 or (int(group), name) in names:
                 sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
     return sets
+
+
+def _are_whole(values: np.ndarray) -> bool:
+    """Whether all are whole numbers, of any type: ParaView's filters write those of regions as floats."""
+    if np.issubdtype(values.dtype, np.floating):
+        return bool(np.all(np.isfinite(values)) and np.all(values == np.rint(values)))
+    return np.issubdtype(values.dtype, np.integer)
 
 
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:

@@ -61,6 +61,8 @@ def load_reduced(file: str | Path) -> ReducedModel:
     """
     import h5py
 
+    if not Path(file).is_file():
+        raise InputError(f"{file}: there is no such reduced model: make one with python -m liverjax reduce")
     try:
         with h5py.File(file, "r") as stored:
             arrays = {name: stored[name][()] for name in _UNITS}

@@ -69,6 +69,10 @@ def check_choices(scene: Scene) -> None:
             raise InputError(f"[solve] {key} = {value!r} is not known: use {' or '.join(allowed)}")
     if (scene.solve.kind == "harmonic") != (scene.solve.frequencies is not None):
         raise InputError("[solve] kind = 'harmonic' and frequencies = [60.0] (Hz) go together: give both, or neither")
+    if scene.solve.frequencies is not None and not np.size(scene.solve.frequencies):
+        raise InputError("[solve] frequencies = [] holds no frequency: give e.g. frequencies = [60.0] (Hz)")
+    if scene.solve.reduced and scene.solve.kind == "harmonic":
+        raise InputError("[solve] reduced is for runs in time, kind is 'harmonic': leave it out")
     if scene.springpots is not None and scene.solve.kind != "harmonic":
         raise InputError("[springpots] are for kind = 'harmonic': a run in time takes [viscosity], a Prony series")
     for key in ("displaced", "traction"):

@@ -15,6 +15,10 @@ from liverjax.simulation.run import Result
 
 #: No organ is longer [m]: numbers in millimetres read as centimetres make a liver of 2 m.
 LONGEST = 1.0
+#: No organ and no sample is shorter [m]: numbers in metres read as millimetres make a liver of 0.2 mm.
+SHORTEST = 1e-3
+#: Vertices nearer to each other than this part of the body's size stand in one place.
+SAME_PLACE = 1e-9
 #: An element with a hundredth of the volume of the regular one of the same edges: errors of its gradients grow as much.
 SLIVER = 0.01
 #: A soft tissue is about four fifths fluid: below this J not even its solid has room. The reciprocal likewise.
@@ -29,6 +33,14 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         result: what its run returned.
     """
     return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_volumes(scene, result)]
+
+
+def cautions_of_waves(scene: Scene) -> list[str]:
+    """Sentences about the mesh, the volumes and the masses of a scene of harmonic motion."""
+    said = [*_of_mesh(scene.mesh), *_of_locking(scene)]
+    if scene.body is None:
+        said.append("the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]")
+    return said
 
 
 #: A mesh error below this part of the largest displacement is not worth another mesh.
@@ -61,6 +73,14 @@ def _of_mesh(mesh: TetMesh) -> list[str]:
     said = []
     if size > LONGEST:
         said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'mm'")
+    if size < SHORTEST:
+        said.append(f"the body is {size:.3g} m long: check the mesh's unit, e.g. write unit = 'm'")
+    places = np.unique(np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * size)), axis=0)
+    if len(places) < mesh.number_of_vertices:
+        said.append(
+            f"{mesh.number_of_vertices - len(places)} nodes stand where another node stands: the body is not joined "
+            "there; merge them if it should be"
+        )
     slivers = np.flatnonzero(quality < SLIVER)
     if len(slivers):
         worst = int(np.argmin(quality))
