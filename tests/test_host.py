@@ -1,12 +1,16 @@
 """The closed form in NumPy: the formulas, derivatives and minima that JAX has."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from conftest import COMPILED, ROOT
 
 from fitting.__main__ import main
-from fitting.methods import generalised_maxwell, host, uncertainty
+from fitting.fits import time_tests
+from fitting.methods import generalised_maxwell, host, time_response_on_host, uncertainty
 from fitting.methods.least_squares import from_starts, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import read_sweep
 
@@ -33,7 +37,7 @@ def test_the_fit_on_the_host_is_the_compiled_one():
     data = (s.angular_frequency, s.storage, s.loss, np.concatenate(s.deviations))
     starts = generalised_maxwell.starts(s, 2, generalised_maxwell.spectrum(s), count=3)
     lost = np.concatenate([starts, [np.full(5, 1e3)]])  # exp(1e3) is infinite
-    found = from_starts(generalised_maxwell.residuals, lost, *data)
+    found = from_starts(partial(host.with_jacobian, generalised_maxwell.residuals), lost, *data)
     each = jax.vmap(lambda u: levenberg_marquardt(generalised_maxwell.residuals, u, *data))(jnp.asarray(starts))
     best = int(np.argmin(each.cost))
     assert bool(found.converged) and abs(int(found.iterations) - int(each.iterations[best])) <= 1
@@ -47,3 +51,36 @@ def test_the_closed_form_compiles_nothing(tmp_path):
     assert len(COMPILED) == before
     jax.jit(lambda x: x + 1)(1.0)
     assert len(COMPILED) > before  # it does count
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+@pytest.mark.parametrize("name", ["prony", "prony_fluid"])
+def test_the_answers_of_a_test_in_time_have_the_derivatives_of_jax(kind, name):
+    """By hand against forward mode, to roundoff; steps of 1e-7 to 1e4 relaxation times, so that all branches run."""
+    rng = np.random.default_rng(0)
+    times = np.concatenate([[0.0], np.logspace(-6, 3, 70)])
+    driven, rows = 0.02 + 0.1 * np.minimum(times / 0.5, 1), np.arange(3, 71, 2)
+    data = (times, driven, rows, rng.standard_normal(len(rows)), rng.uniform(0.5, 2, len(rows)))
+    maxwell = generalised_maxwell.natural if name == "prony" else generalised_maxwell.natural_fluid
+    n = 3
+    u = np.concatenate([0.5 * rng.standard_normal(n + (name == "prony")), [3.0, np.log(3.0), np.log(4.0)]])
+    function = time_tests._residuals(kind, name)
+    expected, slope = with_jacobian(function)(jnp.asarray(u), *map(jnp.asarray, data))
+    found, J = time_response_on_host.residuals_with_jacobian(kind, maxwell, np.stack([u, u + 0.1]), *data)
+    # Roundoff of a rate is that of the largest one, and acts over the whole test.
+    roundoff = 1e-15 if kind == "relaxation" else 2e-16 * times[-1] / maxwell(u).relaxation_times[-1]
+    assert np.abs(found[0] - expected).max() < 10 * roundoff * np.abs(expected).max()
+    assert np.abs(J[0] - slope).max() < 10 * roundoff * np.abs(slope).max()
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_a_test_in_time_compiles_nothing(tmp_path, kind):
+    """Four fits of modes: compiling each would take ten times as long as all the rest."""
+    t = np.geomspace(0.01, 30, 60)
+    answer = 1 + np.exp(-t / 0.2) + np.exp(-t / 5) if kind == "relaxation" else 3 - np.exp(-t / 0.2) - np.exp(-t / 5)
+    columns = "time_s,strain,stress_Pa" if kind == "relaxation" else "time_s,stress_Pa,strain"
+    table = np.column_stack([t, np.full(60, 0.05), answer * (1 + 0.01 * np.random.default_rng(0).standard_normal(60))])
+    np.savetxt(tmp_path / "test.csv", table, "%.10g", ",", header=columns, comments="")
+    before = len(COMPILED)
+    assert main([kind, str(tmp_path / "test.csv"), "--ramp", "0", "--out", str(tmp_path / "out")]) == 0
+    assert len(COMPILED) == before

@@ -144,6 +144,17 @@ def test_a_fluid_is_told_from_a_solid(tmp_path):
             assert np.all(off < 4 * np.array(content["standard_errors"][key]))
 
 
+def test_a_closer_fit_that_is_not_chosen_is_told(tmp_path, monkeypatch):
+    t = np.geomspace(0.02, 60, 60)
+    G = relaxation(SOLID, t) * (1 + 0.01 * np.random.default_rng(0).standard_normal(60))
+    test = read_time_test(write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, G), "relaxation")
+    assert not any("more closely" in words for words in fits.fit(test).warnings)
+    monkeypatch.setattr(fits, "identifiable", lambda fit, test: fit.modes == 1)
+    chosen = fits.fit(test)
+    (words,) = (words for words in chosen.warnings if "more closely" in words)
+    assert chosen.modes == 1 and "instead of 8.6 % on average), but the data leave some of their parameters" in words
+
+
 def test_a_ramp_that_no_column_has_is_an_option(tmp_path):
     t = np.concatenate([np.geomspace(0.1, 40, 60)])
     fine = np.unique(np.concatenate([np.linspace(0, 1, 400), t]))

@@ -1,7 +1,8 @@
 """Prony modes from a relaxation or creep test as it was driven, in closed form."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
+from time import perf_counter
 from typing import NamedTuple
 
 import jax
@@ -9,10 +10,11 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, Kind
-from fitting.methods import generalised_maxwell, kramers_kronig, time_response, uncertainty
+from fitting.methods import generalised_maxwell, kramers_kronig, time_response, time_response_on_host, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.methods.host import Array, arrays_of
+from fitting.methods.least_squares import Solution, from_starts
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
@@ -127,25 +129,29 @@ def identifiable(fit: TimeFit, test: TimeTest) -> bool:
 
 
 def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
-    function, data = residuals_in_time(test, kind)
-    scales = data[-1]
-    best = viscoelastic.best_of(levenberg_marquardt, function)
-    found, compiling, running = viscoelastic.timed(best, _starts(test, modes, kind), *data)
+    begin, data, scales = perf_counter(), data_in_time(test), _scales(test, rows)
+    evaluate = partial(time_response_on_host.residuals_with_jacobian, test.kind, kind.maxwell)
+    found = from_starts(evaluate, _starts(test, modes, kind), *data)
+    running = perf_counter() - begin
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
     spread = uncertainty.estimate(found, False, kind.maxwell)
     fitted = np.asarray(found.residuals) * scales + test.answer[rows]
     at = (test.time[rows], test.answer[rows], fitted, scales)
-    return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, compiling, {})
+    return TimeFit(kind, model, found, spread, bool(found.converged), *at, (), running, 0.0, {})
 
 
 def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Array], tuple]:
     """Residuals (m,) at u and the data, for Prony modes of a solid or a fluid."""
+    return _residuals(test.kind, kind.name), data_in_time(test)
+
+
+def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
+    """Times (n,), what is driven (n,), rows (m,) among them, answers (m,) and their scales (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
     places = np.cumsum(kept)[rows] - 1
-    data = (test.time[kept], test.driven[kept], places, test.answer[rows], _scales(test, rows))
-    return _residuals(test.kind, kind.name), data
+    return test.time[kept], test.driven[kept], places, test.answer[rows], _scales(test, rows)
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
@@ -162,8 +168,10 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
     return every[rows]
 
 
-def response_in_time(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array) -> jax.Array:
+def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Array:
     """Predicted measurements: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
+
+    In JAX; of a sweep and of dispersion in NumPy as well (`fitting.methods.host`).
 
     Args:
         kind: "sweep", "dispersion", "relaxation" or "creep".
@@ -172,12 +180,13 @@ def response_in_time(kind: str, model: Maxwell, at: jax.Array, *drive: jax.Array
         drive: of a test in time: what is driven (n,), and the rows (m,) that are answered; of dispersion: the density,
             and the numbers (m,) that were measured, of velocities [m/s] followed by attenuations [1/m].
     """
+    xp = arrays_of(model.ratios)
     if kind == "sweep":
-        return jax.numpy.concatenate(generalised_maxwell.moduli(model, at))
+        return xp.concatenate(generalised_maxwell.moduli(model, at), axis=-1)
     if kind == "dispersion":
         density, measured = drive
         waves = shear_waves.velocity_and_attenuation(*generalised_maxwell.moduli(model, at), at, density)
-        return jax.numpy.concatenate(waves)[measured]
+        return xp.concatenate(waves, axis=-1)[..., measured]
     driven, rows = drive
     return (time_response.stress_response if kind == "relaxation" else time_response.strain_response)(
         model, at, driven
@@ -223,6 +232,10 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     mean = float(chosen.relative_errors.mean())
     if mean > 0.05:
         out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or look at the data")
+    closer = min(tried, key=criterion)
+    if lowest < criterion(chosen) - 10 and closer.modes != chosen.modes:
+        errors = [float(f.relative_errors.mean()) for f in (closer, chosen)]
+        out.append(viscoelastic.closer_but_not_chosen(closer.modes, errors, closer.converged))
     out += uncertainty.superfluous(test, chosen.uncertainty)
     low, high = test.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):

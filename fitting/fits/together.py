@@ -7,19 +7,17 @@ Every test has noise of its own. Its size is found with the fit, from the residu
 
 import time
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import time_tests, viscoelastic
 from fitting.fits.viscoelastic import FLUID, Kind
-from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods import generalised_maxwell, host, time_response_on_host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, spread
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.methods.least_squares import Solution, from_starts
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
@@ -88,7 +86,7 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
     if isinstance(test, Dispersion):
         measured = test.measured
         return (test.angular_frequency, test.density, np.arange(len(measured))), measured, measured
-    _, (at, driven, rows, answer, scales) = time_tests.residuals_in_time(test, Kind())
+    at, driven, rows, answer, scales = time_tests.data_in_time(test)
     return (at, driven, rows), answer, scales
 
 
@@ -103,18 +101,19 @@ def least_noise(test: Measured) -> float:
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
-@lru_cache(maxsize=32)
-def _all_residuals(kinds: tuple[str, ...], fluid: bool) -> Callable[..., jax.Array]:
-    """(u, data of every test) -> residuals of all tests, one below the other."""
-    natural = generalised_maxwell.natural_fluid if fluid else generalised_maxwell.natural
+def _evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (…, m) of all tests, one after the other, and their Jacobian (…, m, P) at u (…, P), in NumPy."""
 
-    def residuals(u, data):
-        model, rows = natural(u), []
-        for kind, (at, measured, scales) in zip(kinds, data, strict=True):
-            rows.append((time_tests.response_in_time(kind, model, *at) - measured) / scales)
-        return jnp.concatenate(rows)
+    def one(name: str, at: tuple, measured: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if name in ("relaxation", "creep"):
+            return time_response_on_host.residuals_with_jacobian(name, kind.maxwell, u, *at, measured, scales)
+        return host.with_jacobian(
+            lambda u: (time_tests.response_in_time(name, kind.maxwell(u), *at) - measured) / scales, u
+        )
 
-    return residuals
+    found = [one(name, *own) for name, own in zip(kinds, data, strict=True)]
+    residuals, jacobians = zip(*found, strict=True)
+    return np.concatenate(residuals, axis=-1), np.concatenate(jacobians, axis=-2)
 
 
 def name_of(test: Measured) -> str:
@@ -190,24 +189,22 @@ def criterion_of_all(fit: Together) -> float:
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
     """Fit and weights in turn, for one number of modes."""
     parts = [reported_numbers(t) for t in tests]
-    function = _all_residuals(tuple(map(name_of, tests)), kind.name == FLUID.name)
-    best = viscoelastic.best_of(levenberg_marquardt, function)
-    starts = _starts_of_all(tests, band, modes, kind)
-    noise, compiling, running = np.full(len(tests), 0.03), 0.0, 0.0
+    begin, evaluate = time.perf_counter(), partial(_evaluated, list(map(name_of, tests)), kind)
+    starts, noise = _starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
     for _ in range(ROUNDS):
         used = noise
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
-        found, compiled, ran = viscoelastic.timed(best, starts, data)
-        compiling, running = compiling + compiled, running + ran
+        found = from_starts(evaluate, starts, data)
         noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
-        starts = np.tile(np.asarray(found.u), (STARTS, 1))  # near already; the program is that of all starts
+        starts = np.asarray(found.u)[None]  # near already
+    running = time.perf_counter() - begin
     modes_found = kind.maxwell(found.u)
     shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
     found = over_own_noise(found, shares, used / noise)
     spreads = uncertainty.estimate(found, True, kind.maxwell)
     model = Maxwell(*(np.asarray(v) for v in modes_found))
     converged = bool(found.converged)
-    return Together(tests, kind, model, found, spreads, converged, shares, fitted, [], (), running, compiling)
+    return Together(tests, kind, model, found, spreads, converged, shares, fitted, [], (), running, 0.0)
 
 
 def misfits(
@@ -241,7 +238,7 @@ def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> S
     """
     factor = np.repeat(ratio, [s.points for s in shares])
     prior = np.full(len(found.residuals) - len(factor), np.exp(np.mean(np.log(ratio))))
-    rows = jnp.asarray(np.concatenate([factor, prior]))
+    rows = np.concatenate([factor, prior])
     return found._replace(residuals=rows * found.residuals, jacobian=rows[:, None] * found.jacobian)
 
 
@@ -341,19 +338,18 @@ def missed(shares: list[Share]) -> list[str]:
 def _shares(fit: Together) -> list[Share]:
     """The contribution of each test: errors without it, and the misfit of a fit to this test alone with as many modes.
 
-    A test is taken out by infinite deviations, so that the same compiled program serves.
+    Infinite deviations take a test out.
     """
     parts = [reported_numbers(t) for t in fit.tests]
-    function = _all_residuals(tuple(map(name_of, fit.tests)), fit.kind.name == FLUID.name)
-    best = viscoelastic.best_of(levenberg_marquardt, function)
+    evaluate = partial(_evaluated, list(map(name_of, fit.tests)), fit.kind)
     u = np.asarray(fit.solution.u)
     band = ResolvedBand(resolved_by(fit.tests))
     starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])
-    vector = np.asarray(jax.jacfwd(lambda u: uncertainty.parameter_vector(u, fit.kind.maxwell))(jnp.asarray(u)))
+    vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
 
     def alone(k: int) -> np.ndarray:
         data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
-        return np.asarray(viscoelastic.timed(best, starts, data)[0].residuals)
+        return np.asarray(from_starts(evaluate, starts, data).residuals)
 
     return shares_by_rows(fit, np.asarray(fit.solution.jacobian), vector, fit.uncertainty.values, alone)
 

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.methods import generalised_maxwell, uncertainty
+from fitting.methods import generalised_maxwell, host, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
@@ -124,7 +124,7 @@ def modes_from(sweep: Sweep, starts: np.ndarray, kind: Kind = Kind(), optimizer:
     data = (sweep.angular_frequency, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
-        found, compiling = from_starts(residuals_of(kind), starts, *data), 0.0
+        found, compiling = from_starts(partial(host.with_jacobian, residuals_of(kind)), starts, *data), 0.0
         running = time.perf_counter() - begin
     else:
         found, compiling, running = timed(best_of(bfgs, residuals_of(kind)), starts, *data)
@@ -275,17 +275,23 @@ def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int
     out = []
     closer = min(tried, key=information_criterion)
     if information_criterion(closer) < information_criterion(chosen) - 10:
-        a, b = (100 * np.mean(f.relative_errors(sweep)) for f in (closer, chosen))
-        reason = "the data leave some of their parameters free" if closer.converged else "their fit did not converge"
-        out.append(
-            f"{closer.modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but "
-            f"{reason}; --modes {closer.modes} gives them all the same"
-        )
+        errors = [float(np.mean(f.relative_errors(sweep))) for f in (closer, chosen)]
+        out.append(closer_but_not_chosen(closer.modes, errors, closer.converged))
     for modes, reason in broken.items():
         out.append(
             f"{modes} mode{'s' if modes > 1 else ''} could not be fitted ({reason}) and took no part in the choice"
         )
     return out
+
+
+def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> str:
+    """A sentence on a number of modes with a lower criterion; `errors` are mean ones, of it and of the chosen fit."""
+    reason = "the data leave some of their parameters free" if converged else "their fit did not converge"
+    a, b = (100 * e for e in errors)
+    return (
+        f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}; "
+        f"--modes {modes} gives them all the same"
+    )
 
 
 #: Words of the warnings that come first, the most important of all at the beginning.

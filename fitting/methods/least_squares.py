@@ -152,31 +152,35 @@ def levenberg_marquardt(
     return solution(jax.lax.while_loop(go_on, step, begin(start, n_residuals)))
 
 
-def from_starts(residuals: Callable[..., Any], starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
+#: Residuals (…, m) and their Jacobian (…, m, P) at u (…, P) and data, in NumPy.
+Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
+
+
+def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
     """The best of the minima that `levenberg_marquardt` finds from starts (S, P), in NumPy: nothing is compiled.
 
     Where the best has not converged yet, it goes on alone: modes that miss wide curves converge slowly.
 
     Args:
-        residuals: of (u, *data), as `host.with_jacobian` asks for.
+        evaluate: of (u, *data), for example `host.with_jacobian` of a function of both.
         starts: where to begin.
-        data: as in `residuals`.
+        data: as in `evaluate`.
         max_iterations: of each fit; of the best, `LONGER` times as many.
     """
-    found = _best_minimum(residuals, starts, data, max_iterations)
+    found = _best_minimum(evaluate, starts, data, max_iterations)
     if found.converged or found.iterations < max_iterations:
         return found
-    further = _best_minimum(residuals, np.asarray(found.u)[None], data, (LONGER - 1) * max_iterations)
+    further = _best_minimum(evaluate, np.asarray(found.u)[None], data, (LONGER - 1) * max_iterations)
     return further._replace(iterations=found.iterations + further.iterations)
 
 
-def _best_minimum(residuals: Callable[..., Any], starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
+def _best_minimum(evaluate: Evaluate, starts: np.ndarray, data: tuple, max_iterations: int) -> Solution:
     """The lowest point that is reached from starts (S, P), all iterated at once."""
     going: np.ndarray = np.arange(len(starts))
     s: Any = None
     with np.errstate(all="ignore"):  # a trial that overflows is a bad one
         while s is None or len(going):
-            r, J = host.with_jacobian(residuals, starts if s is None else s.trial[going], *data)
+            r, J = evaluate(starts if s is None else s.trial[going], *data)
             if s is None:  # copies, for `begin` gives some fields the same array
                 s = State(*(field.copy() for field in begin(starts, r.shape[-1])))
             new = accept(State(*(field[going] for field in s)), r, J)

@@ -14,14 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.host import Array, arrays_of
 
 
-def _phi(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _phi(x: Array) -> tuple[Array, Array]:
     """(1 - e^-x) / x and (x - 1 + e^-x) / x^2, also at 0."""
+    xp = arrays_of(x)
     small = x < 1e-3
-    safe = jnp.where(small, 1.0, x)
-    one = jnp.where(small, 1 - x / 2 + x**2 / 6 - x**3 / 24, -jnp.expm1(-safe) / safe)
-    two = jnp.where(small, 0.5 - x / 6 + x**2 / 24 - x**3 / 120, (safe + jnp.expm1(-safe)) / safe**2)
+    safe = xp.where(small, 1.0, x)
+    one = xp.where(small, 1 - x / 2 + x**2 / 6 - x**3 / 24, -xp.expm1(-safe) / safe)
+    two = xp.where(small, 0.5 - x / 6 + x**2 / 24 - x**3 / 120, (safe + xp.expm1(-safe)) / safe**2)
     return one, two
 
 
@@ -42,11 +44,12 @@ def stress_response(model: Maxwell, time: jax.Array, strain: jax.Array) -> jax.A
     return model.shear_modulus * (rest * strain + h @ model.ratios)
 
 
-def retardation(model: Maxwell) -> tuple[jax.Array, jax.Array]:
+def retardation(model: Maxwell) -> tuple[Array, Array]:
     """Rates (N,) [1/s] and weights (N,) [1/s] of J(t) G0 = 1 + sum w_k (1 - exp(-r_k t)) / r_k."""
-    b = jnp.sqrt(model.ratios / model.relaxation_times)
-    minus, q = jnp.linalg.eigh(jnp.outer(b, b) - jnp.diag(1 / model.relaxation_times))
-    return jnp.maximum(-minus, 0.0), (q.T @ b) ** 2
+    xp = arrays_of(*model)
+    b = xp.sqrt(model.ratios / model.relaxation_times)
+    minus, q = xp.linalg.eigh(xp.outer(b, b) - xp.diag(1 / model.relaxation_times))
+    return xp.maximum(-minus, 0.0), (q.T @ b) ** 2
 
 
 def strain_response(model: Maxwell, time: jax.Array, stress: jax.Array) -> jax.Array:
@@ -73,6 +76,6 @@ def relaxation_modulus(model: Maxwell, time: np.ndarray) -> np.ndarray:
 
 def creep_compliance(model: Maxwell, time: np.ndarray) -> np.ndarray:
     """J(t) (n,) [1/Pa] after a step of stress."""
-    rates, weights = (np.asarray(v) for v in retardation(model))
-    one, _ = _phi(jnp.asarray(np.asarray(time)[:, None] * rates))
-    return (1 + np.asarray(time) * (np.asarray(one) @ weights)) / np.asarray(model.shear_modulus)
+    rates, weights = retardation(Maxwell(*map(np.asarray, model)))
+    one, _ = _phi(np.asarray(time)[:, None] * rates)
+    return (1 + np.asarray(time) * (one @ weights)) / np.asarray(model.shear_modulus)

@@ -53,7 +53,9 @@ def arrays(path: Path) -> Content:
     }
     readers |= dict.fromkeys(HDF5, _hdf5)
     if ending not in readers:
-        raise InputError(f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz")
+        raise InputError(
+            f"{path}: the ending {ending!r} is not known: give .npz, .npy, .h5, .mat, .csv, .nii or .nii.gz"
+        )
     try:
         return readers[ending](path)
     except InputError:

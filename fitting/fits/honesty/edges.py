@@ -1,10 +1,12 @@
 """The influence of the ends of the band: the fit is repeated without the first and without the last half decade."""
 
+from functools import partial
+
 import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
-from fitting.methods import generalised_maxwell, kramers_kronig, relaxation_spectrum, springpots
+from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts, levenberg_marquardt
 from fitting.readers.rheometer import Sweep, some
@@ -117,7 +119,8 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     starts = np.stack([generalised_maxwell.fluid_of(u) for u in starts]) if fluid else starts
     starts[-1] = np.asarray(fit.solution.u)
     data = (part.angular_frequency, part.storage, part.loss, np.concatenate(part.deviations))
-    modes = fit.kind.maxwell(from_starts(viscoelastic.residuals_of(fit.kind), starts, *data).u)
+    evaluate = partial(host.with_jacobian, viscoelastic.residuals_of(fit.kind))
+    modes = fit.kind.maxwell(from_starts(evaluate, starts, *data).u)
     numbers = np.concatenate([[modes.shear_modulus], modes.ratios, modes.relaxation_times])
     new = dict(zip(fit.uncertainty.names, numbers.tolist(), strict=True))
     new["equilibrium_modulus"] = float(modes.equilibrium_modulus)
