@@ -200,3 +200,28 @@ def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
     assert command.main(["amplitude", "fung_demiray", str(path), "--max-strain", "-1"]) == 2
     assert command.main(["amplitude", "fung_demiray", str(path), "--model", str(path), "--out", str(tmp_path)]) == 2
     assert "is no fit.json" in capsys.readouterr().err
+
+
+def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
+    law, memories, shares = tanned
+    path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
+    text, whole = path.read_text(), strain_sweep.read_strain_sweep(path)
+    path.write_text(text.replace("strain_%", "strain"))
+    with pytest.raises(InputError, match="write it in %"):
+        strain_sweep.read_strain_sweep(path)
+    lines = text.splitlines()
+    parts = [lines[0].replace("strain_%", "strain")]
+    parts += [",".join([a, repr(float(b) / 100), *more]) for a, b, *more in (line.split(",") for line in lines[1:])]
+    path.write_text("\n".join(parts))
+    found = strain_sweep.read_strain_sweep(path)
+    np.testing.assert_allclose(found.strain, whole.strain, rtol=1e-12)
+    assert "states no unit: parts of 1" in found.notes[0]
+    path.write_text(f"sample A\n{text}\nsample B\n" + "\n".join(lines[:-1]))
+    first, second = (strain_sweep.read_strain_sweep(path, table) for table in (None, "2"))
+    assert "holds 2 tables" in first.notes[0] and len(first.strain) == len(whole.strain) == len(second.strain) + 1
+    with pytest.raises(InputError, match="--table sample is in the names of 2 tables"):
+        strain_sweep.read_strain_sweep(path, "sample")
+    a, _, *more = lines[3].split(",")
+    path.write_text("\n".join([*lines[:3], ",".join([a, "", *more]), *lines[4:]]))
+    gap = strain_sweep.read_strain_sweep(path)
+    assert len(gap.strain) == len(whole.strain) - 1 and any("1 points without" in note for note in gap.notes)

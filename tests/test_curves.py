@@ -265,6 +265,32 @@ def test_a_parameter_without_data_is_told():
     assert any("leave c2 free" in w for w in stress_stretch.fit(candidate, small).warnings)
 
 
+def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
+    up = np.linspace(1.0, 1.4, 41)
+    stress = 1e3 * (up - up**-2)
+    rows = [(s, p) for s, p in zip(up, stress, strict=True)]
+    back = [(s, 0.7 * p) for s, p in rows[-2::-1]]
+
+    def read(rows, between=",", point="."):
+        lines = [between.join(["test", "stretch", "nominal_stress_Pa"])]
+        lines += [between.join(["uniaxial", *(f"{v:.6f}".replace(".", point) for v in row)]) for row in rows]
+        (tmp_path / "c.csv").write_text("\n".join(lines) + "\n")
+        return curves.read_curves([tmp_path / "c.csv"])
+
+    (plain,), notes = read(rows)
+    assert not notes and not stress_stretch.loaded_at_rest([plain])
+    assert "turn back once" in read(rows + back)[1][0] and "turn back 3 times" in read((rows + back) * 2)[1][0]
+    assert not read(rows + [(2 - s, 1e3 * (2 - s - (2 - s) ** -2.0)) for s, _ in rows])[1]  # tension, then compression
+    (german,), notes = read(rows, ";", ",")
+    assert not notes and np.array_equal(german.stress, plain.stress)
+    (loaded,), _ = read([(s, p + 0.15 * stress.max()) for s, p in rows])
+    (words,) = stress_stretch.loaded_at_rest([loaded])
+    assert "where the sample is not deformed" in words and "subtract the preload" in words
+    read([(s, p + 0.15 * stress.max()) for s, p in rows])
+    assert main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)]) == 0
+    assert "subtract the preload" in capsys.readouterr().err
+
+
 @pytest.mark.core
 def test_command_writes_table_json_and_picture(tmp_path, capsys):
     out = tmp_path / "out"

@@ -370,6 +370,38 @@ def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("[[support]]\nwhere = {x_max = 0.0}\nnormal = 1e3\nhistory = [[0, 0], [1, 1]]\n", "support.0.history is for"),
+        (
+            "[[obstacle]]\nshape = 'plane'\nposition = [0.05, 0, 0]\naxis = [-1, 0, 0]\nby = [-0.03, 0, 0]\n",
+            "obstacle.0.by is for runs in time",
+        ),
+        ("", "body.history is for runs in time"),
+    ],
+)
+def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words):
+    scene, text = tmp_path / "scene.toml", FILE + "frequencies = [60.0]\n"
+    heavy = "density = 1000.0\nhistory = [[0, 0, 0, -9.81], [1, 0, 0, -9.81]]"
+    scene.write_text(text + part if part else text.replace("density = 1000.0", heavy))
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "out")]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_an_obstacle_stands_where_it_begins():
+    """Scenes of Python may have histories for their runs in time: harmonic motion takes none of them."""
+    scene = slab(2, 1)
+    top = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
+    high = float(scene.mesh.points[:, 2].max())
+    far = lj.Obstacle(triangles=top, position=(0.0, 0.0, 2 * high), axis=(0.0, 0.0, -1.0))
+    alone = lj.harmonic(replace(scene, physics=(far,)), FREQUENCIES)
+    moved = replace(
+        far, by=jnp.array([0.0, 0.0, -1.5 * high]), times=jnp.array([0.0, 1.0]), history=jnp.array([0.0, 1.0])
+    )
+    assert np.array_equal(lj.harmonic(replace(scene, physics=(moved,)), FREQUENCIES).displacement, alone.displacement)
+
+
+@pytest.mark.parametrize(
     ("line", "more", "words"),
     [
         ("", [], "frequencies = [60.0] (Hz) go together"),

@@ -10,7 +10,7 @@ from conftest import COMPILED, ROOT
 
 from fitting.__main__ import main
 from fitting.fits import time_tests
-from fitting.methods import generalised_maxwell, host, time_response_on_host, uncertainty
+from fitting.methods import generalised_maxwell, host, time_response, uncertainty
 from fitting.methods.least_squares import from_starts, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import read_sweep
 
@@ -66,7 +66,7 @@ def test_the_answers_of_a_test_in_time_have_the_derivatives_of_jax(kind, name):
     u = np.concatenate([0.5 * rng.standard_normal(n + (name == "prony")), [3.0, np.log(3.0), np.log(4.0)]])
     function = time_tests._residuals(kind, name)
     expected, slope = with_jacobian(function)(jnp.asarray(u), *map(jnp.asarray, data))
-    found, J = time_response_on_host.residuals_with_jacobian(kind, maxwell, np.stack([u, u + 0.1]), *data)
+    found, J = time_response.residuals_with_jacobian(kind, maxwell, np.stack([u, u + 0.1]), *data)
     # Roundoff of a rate is that of the largest one, and acts over the whole test.
     roundoff = 1e-15 if kind == "relaxation" else 2e-16 * times[-1] / maxwell(u).relaxation_times[-1]
     assert np.abs(found[0] - expected).max() < 10 * roundoff * np.abs(expected).max()

@@ -74,6 +74,7 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
         ("a,b\n1,2\n", [], "no header names depth and force"),
         ("depth_m,force_N\n0,0\n1e-4,x\n", [], "line 3: 'x' is not a finite number"),
         ("depth_m,force_N\n0,0\n1e-4,1\n", [], "2 points go in"),
+        ("depth_m,force_N\n" + "".join(f"-{k}e-5,-{k}e-3\n" for k in range(8)), [], "so change its sign"),
         ("depth_m,force_N\n0,0\n", ["--thickness", "-1"], "must be above 0"),
         ("depth_m,force_N\n0,0\n", ["--poisson", "0.7"], "must be from 0 to 0.5"),
         ("depth_m,force_N\n0,0\n", ["--radius", "0"], "must be above 0"),
@@ -90,3 +91,42 @@ def test_bad_curves_and_options_are_one_sentence(tmp_path, capsys, text, more, w
 def test_no_such_file():
     with pytest.raises(InputError, match="no such file"):
         read_indentation("nothing.csv")
+
+
+def held_at_the_end(kind):
+    """A loading, and then what instruments do: hold the depth (force relaxes) or the force (it creeps), or cycles."""
+    rng, late = np.random.default_rng(2), np.linspace(0, 1, 160)
+    if kind == "cycles":
+        depth = np.concatenate([DEPTH, DEPTH[-2::-1], 1.01 * DEPTH[1:]])
+        return depth, hertz(depth - START) * np.where(np.arange(len(depth)) < len(DEPTH), 1.0, 0.8)
+    if kind == "depth":
+        depth = np.concatenate([DEPTH, DEPTH[-1] + 1e-6 * rng.standard_normal(160)])
+        return depth, np.concatenate([hertz(DEPTH - START), hertz(DEPTH[-1] - START) * (0.6 + 0.4 * np.exp(-5 * late))])
+    depth = np.concatenate([DEPTH, DEPTH[-1] * (1 + 0.3 * (1 - np.exp(-4 * late)))])
+    return depth, np.concatenate([hertz(DEPTH - START), np.full(160, hertz(DEPTH[-1] - START))])
+
+
+@pytest.mark.parametrize("kind", ["depth", "force", "cycles"])
+def test_only_the_first_loading_is_fitted(tmp_path, kind):
+    depth, force = held_at_the_end(kind)
+    force = force + 2e-6 * np.random.default_rng(1).standard_normal(len(force))
+    np.savetxt(tmp_path / "c.csv", np.column_stack([depth, force]), "%.9g", ",", header="depth_m,force_N", comments="")
+    curve = read_indentation(tmp_path / "c.csv")
+    assert abs(len(curve.depth) - len(DEPTH)) <= 2 and curve.notes
+    assert ("several loadings" in curve.notes[0]) == (kind == "cycles")
+    found = fit_contact(curve.depth, curve.force, Layer(Indenter("sphere", 1e3 * H, 0.5, R)).force)
+    assert np.isclose(found.modulus, E, rtol=0.01) and np.isclose(found.contact_point, START, atol=3e-6)
+
+
+def test_an_offset_of_the_sensor_is_told_and_decimals_follow_the_table(tmp_path, capsys):
+    force = hertz(DEPTH - START) + 1e-6 * np.random.default_rng(1).standard_normal(len(DEPTH))
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "10", "--out", str(tmp_path)]
+    for offset in (0.0, 0.08 * force.max()):
+        rows = "".join(f"{1e9 * d:,.0f};{1e3 * (f + offset):.6f}\n" for d, f in zip(DEPTH, force, strict=True))
+        text = "depth_nm;force_mN\n" + rows.replace(".", "x").replace(",", ".").replace("x", ",")  # 1.000,5
+        (tmp_path / "c.csv").write_text(text)
+        assert main(command) == 0
+        assert ("subtract this offset" in capsys.readouterr().err) == bool(offset)
+        if not offset:
+            content = json.loads((tmp_path / "fit.json").read_text())
+            assert np.isclose(content["young_modulus"], E, rtol=0.01) and not content["warnings"]

@@ -138,3 +138,18 @@ def test_perfusion_swells_a_soft_sponge():
 def test_bad_inlets_are_refused(inlet, words):
     with pytest.raises(InputError, match=words):
         scene_from(content([inlet]))
+
+
+def test_inlets_that_would_do_nothing_are_refused():
+    """A node has one pressure; through a surface with given pressures what enters leaves at once. Edges are shared."""
+    low, top = {"where": LOW, "pressure": 1.0}, {"where": TOP, "flux": 1e-3}
+    side = {"where": {"y_max": 0.0}, "pressure": 2.0}
+    scene_from(content([low, top, side]))
+    scene_from(content([low, side, top], drained=[{"z_max": 0.0}]))
+    for inlets, drained, words in (
+        ([low, dict(low, pressure=-3.0)], [], "porosity.inlet.1 gives a pressure where"),
+        ([low], [LOW], "porosity.inlet.0 gives a pressure where"),
+        ([low, top], [TOP], "porosity.inlet.1 is a flux through a surface"),
+    ):
+        with pytest.raises(InputError, match=words):
+            scene_from(content(inlets, **({"drained": drained} if drained else {})))

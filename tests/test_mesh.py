@@ -11,6 +11,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.mesh.files import meshio_cells
+from liverjax.mesh.refinement import refined
 from liverjax.simulation.automatic import qualities
 from liverjax.tensors.matrices import deformation_gradient, pack
 
@@ -221,6 +222,32 @@ def test_a_named_group_of_triangles_is_a_place(order, cells, tmp_path):
     assert sorted(np.asarray(mesh.node_sets["bottom"]).tolist()) == below.tolist()
     assert len(mesh.element_sets["liver"]) == 48 and "bottom" not in mesh.element_sets
     assert set(_with_surface(tmp_path / "m.msh", order, cells, {}).node_sets) == set()
+
+
+@pytest.mark.parametrize("order, cells", [(1, "triangle"), (2, "triangle6")])
+def test_a_load_on_a_group_of_triangles_leaves_others_between_its_nodes_alone(order, cells, tmp_path):
+    """One cell thick: all nodes of the rim are in the group of the two faces, its triangles are not."""
+    mesh = lj.shapes.box((0.2, 0.2, 0.01), (4, 4, 1))
+    z = np.asarray(mesh.points)[:, 2]
+    outer = lj.boundary.boundary_triangles(mesh)
+    faces = outer[np.ptp(z[outer], axis=1) < 1e-6]
+    if order == 2:
+        mesh = lj.quadratic(mesh)
+        edges = {tuple(e): mesh.number_of_vertices + k for k, e in enumerate(np.asarray(mesh.pattern.edges).T.tolist())}
+        pairs = np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]], axis=2).tolist()
+        faces = np.hstack([faces, [[edges[tuple(e)] for e in three] for three in pairs]])
+    blocks, count = [(cells, faces), meshio_cells(mesh)], mesh.number_of_elements
+    groups = {key: [np.full(len(faces), 7), np.full(count, 3)] for key in ("gmsh:physical", "gmsh:geometrical")}
+    names = {"faces": np.array([7, 2])}
+    meshio.Mesh(np.asarray(mesh.points), blocks, cell_data=groups, field_data=names).write(tmp_path / "m.msh", "gmsh22")
+    read = lj.read_mesh(tmp_path / "m.msh")
+    assert set(range(read.number_of_vertices)) <= set(np.asarray(read.node_sets["faces"]).tolist())
+    for own in (read, refined(read)):
+        triangles = lj.boundary.surface_of(own, own.node_sets["faces"], "faces")
+        assert len(triangles) == 64 * (1 if own is read else 4)
+        load = lj.Traction(triangles=jnp.asarray(triangles), value=jnp.array([0.0, 0.0, 0.1]))
+        force = np.asarray(lj.boundary.nodal_tractions(own, (load,)))
+        assert np.allclose(force.sum(axis=0), [0, 0, 2 * 0.2**2 * 0.1], rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])

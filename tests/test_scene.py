@@ -177,6 +177,9 @@ REFUSED = {
     "kind": (lambda c: c["solve"].update(kind="quasistatic"), "use static or dynamic"),
     "loose body": (lambda c: (c.pop("fixed"), c.pop("displaced")), "nothing holds the body"),
     "no triangle": (lambda c: c["traction"][0].update(where={"y_max": 0.0, "x_max": 0.0}), "no boundary triangle"),
+    "steps without end": (lambda c: c["solve"].update(steps=10**24), "solve.steps must be at most 2147483647"),
+    "hundreds of digits": (lambda c: c["law"][0].update(mu=10**400), "hundreds of digits"),
+    "text in a history": (lambda c: c["displaced"][0].update(history=[["0", "0", "0", "0"]]), "is no table of numbers"),
     "history is missing": (lambda c: c["displaced"][0].update(history="none.csv"), "cannot be read"),
 }
 

@@ -259,6 +259,7 @@ pre_tension = 0.05
         ("obstacle.0.axis.2", -2.0, "of length 1"),
         ("obstacle.0.position.2", 0.05, "begins 0.05 m inside the body"),
         ("vessel.0.wall", 0.005, "thicker than the radius"),
+        ("obstacle.0.radius", 0.02, "changes nothing: a plane has none"),
         # A fibre is at least 5 cm long and has no length at rest at 20 N/m times that.
         ("ligament.0.pre_tension", 50.0, "more than it could have, 1 N"),
     ],
@@ -268,6 +269,39 @@ def test_rows_are_checked_as_the_scene_is(files, column, value, words):
     good = lj.load_scene(files / "scene.toml")
     (files / "rows.csv").write_text(f"{column}\n{float(lj.scenes.scene.numbers_at(good, column))}\n{value}\n")
     with pytest.raises(lj.InputError, match=f"row 2: {column[:10]}.*{words}"):
+        sweep.read_sweep(files / "scene.toml", files / "rows.csv")
+
+
+#: Supports, a motion and a history that a row may change.
+OTHER_PARTS = """
+[[support]]
+where = {x_max = 0.0}
+normal = 1e3
+[[support]]
+where = {y_max = 0.0}
+sliding = true
+[[displaced]]
+where = {y_max = 0.0, x_min = 0.1, z_max = 0.05}
+by = [0.001, 0.0, 0.0]
+[[traction]]
+where = {z_max = 0.0}
+value = [0.0, 0.0, 1.0]
+history = [[0, 0], [0.1, 1]]
+"""
+
+
+@pytest.mark.parametrize(
+    "column, good, bad, words",
+    [
+        ("support.0.stiffness", 0.0, 50.0, "changes nothing: springs on a surface have normal"),
+        ("displaced.0.by.1", 0.0, 0.01, "displaced.0 moves node .* off the plane of support.1"),
+        ("traction.0.times.1", 0.1, -0.1, "increasing times"),
+    ],
+)
+def test_rows_are_refused_that_a_scene_file_may_not_have(files, column, good, bad, words):
+    (files / "scene.toml").write_text(SCENE.replace("steps = 2", "steps = 2\ndt = 0.1") + OTHER_PARTS)
+    (files / "rows.csv").write_text(f"{column}\n{good}\n{bad}\n")
+    with pytest.raises(lj.InputError, match=f"row 2: .*{words}"):
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 

@@ -307,3 +307,43 @@ def test_empty_cells_and_thousands_of_records(text, tmp_path):
     found = read_time_test(tmp_path / "a.csv", "relaxation")
     assert found.answer[found.used].tolist() == [1200.5, 1100.25, 987.5, 950]
     assert any("1 of 5 rows are left out: a cell in them is empty" in n for n in found.notes)
+
+
+HELD = np.concatenate([np.zeros(200), np.linspace(0, 1, 11)[1:], np.ones(3000)])
+
+
+def recorded(noise_of_strain=0.0, seed=0):
+    """4 s of rest, a ramp of 0.2 s and 60 s of hold at 50 Hz; 0.3 % of noise in the stress, and noise in the strain."""
+    t, rng = 0.02 * np.arange(len(HELD)), np.random.default_rng(seed)
+    strain = 0.05 * HELD
+    stress = driven(SOLID, t, strain, "relaxation") * (1 + 0.003 * rng.standard_normal(len(t)))
+    return t, strain + noise_of_strain * 0.05 * rng.standard_normal(len(t)), stress
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path, noise):
+    """An instrument's clock runs before the step, and its sensor has noise: neither is motion of the sample."""
+    t, strain, stress = recorded(noise)
+    test = read_time_test(write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, strain, stress), "relaxation")
+    assert abs(test.begun - 3.98) < 0.1 and test.resolved[0] < 0.2
+    assert any("rows before it are not fitted" in note for note in test.notes)
+    assert any("its mean is taken" in note for note in test.notes) == bool(noise)
+    f = fits.fit(test)
+    assert f.modes == 2 and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=0.06 if noise else 0.03)
+
+
+def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):
+    t = np.geomspace(0.02, 40, 60)
+    file = write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, 0 * t + 0.01, 0.01 * relaxation(SOLID, t))
+    whole = read_time_test(file, "relaxation", ramp=0.0)
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines[:20], "segment 2: hold,,", *lines[20:]]))
+    marked = read_time_test(file, "relaxation", ramp=0.0)
+    assert np.array_equal(marked.answer, whole.answer, equal_nan=True)
+    assert marked.notes == ("line 21, 'segment 2: hold,,', holds no numbers and is left out",)
+    file.write_text("\n".join([*lines, "", "sample B", *lines]))
+    two = read_time_test(file, "relaxation", ramp=0.0)
+    assert np.array_equal(two.answer, whole.answer, equal_nan=True) and "2 tables of a test" in two.notes[0]
+    file.write_text("\n".join(["time,strain,stress", "fortnights,%,Pa", *lines[1:]]))
+    with pytest.raises(InputError, match="unit 'fortnights' of time is not known"):
+        read_time_test(file, "relaxation", ramp=0.0)

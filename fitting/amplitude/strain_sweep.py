@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.tables.complex_moduli import column_in_si, storage_and_loss, to_shear
-from fitting.readers.tables.sweep_tables import tables_of
+from fitting.readers.tables.sweep_tables import choose_table, tables_of
 from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
-FEWEST_POINTS, LARGEST_STRAIN = 4, 10.0
+FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
 
 
 class StrainSweep(NamedTuple):
@@ -36,12 +36,10 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         InputError: no table with a strain, several frequencies, too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path).splitlines()) if "strain" in t.raw]
-    if table is not None:
-        found = [t for t in found if table.lower() in t.name.lower()]
     if not found:
-        raise InputError(f"{path}: no table{f' {table!r}' if table else ''} has a column strain in % or 1: add it")
-    chosen = max(found, key=lambda t: np.ptp(np.log(np.maximum(t.raw["strain"], 1e-12))))
-    notes: list[str] = []
+        raise InputError(f"{path}: no table has a column strain in % or 1: add it")
+    place, notes = choose_table(str(path), found, table, "strains", lambda t: len(np.unique(t.raw["strain"])))
+    chosen = found[place]
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
     rows = np.asarray(chosen.rows)
     in_si = {q: (c, column_in_si(str(path), c, rows[:, j], notes)) for q, (c, j) in columns.items()}
@@ -66,8 +64,14 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         raise InputError(
             f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a sweep of the strain alone"
         )
-    if strain[kept].max() > LARGEST_STRAIN:
-        raise InputError(f"{path}: a strain of {strain[kept].max():g} is none: write it in %, or as a part of 1")
+    if not chosen.strain_unit:
+        notes.append("the column of strain states no unit: parts of 1 are taken")
+    largest = LARGEST_STRAIN if chosen.strain_unit else LARGEST_WITHOUT_UNIT
+    if strain[kept].max() > largest:
+        raise InputError(
+            f"{path}: a strain of {strain[kept].max():g} is none: write it in % (strain_%), or as a part of 1 "
+            "(strain_1)"
+        )
     order = np.argsort(strain[kept], kind="stable")
     return StrainSweep(
         strain[kept][order],

@@ -65,10 +65,10 @@ def run(options: argparse.Namespace) -> int:
         options.data, options.frequencies, options.mask, options.labels, options.unit, options.spacing
     )
     field = wave_field.with_noise(field, options.noise)
-    for note in field.notes:
-        print(f"note: {note}", file=sys.stderr)
     writable(options.out, FILES)
     organ = _organ(options, field)
+    for note in field.notes:
+        print(f"note: {note}", file=sys.stderr)
     bar, told = cost_bar("steps")
     with bar, _forces_that_balance(options.data):
         found = elastography.regions_of(organ, told)

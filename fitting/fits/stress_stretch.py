@@ -360,6 +360,29 @@ def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[st
     return ends
 
 
+#: Stress at rest that is told of, over the root mean square of a curve.
+_PRELOAD = 0.05
+
+
+def loaded_at_rest(curves: list[Curve]) -> list[str]:
+    """A warning for each curve whose stress is not 0 where its sample is not deformed."""
+    told = []
+    for curve in curves:
+        shear = curve.driven is not curve.F[:, 0, 0] and np.ptp(curve.F[:, 0, 1]) > 0
+        driven = curve.driven - (0.0 if shear else 1.0)
+        near = np.argsort(np.abs(driven), kind="stable")[:3]
+        if curve.test == "general" or np.abs(driven[near]).max() > 0.2 * np.ptp(driven):
+            continue
+        # The straight line through the three points next to rest, at rest.
+        offset = np.polyfit(driven[near], curve.stress[near], 1)[1] if np.ptp(driven[near]) > 0 else 0.0
+        if abs(offset) > _PRELOAD * curve.scale and np.abs(driven[near]).min() < 0.02 * np.ptp(driven):
+            told.append(
+                f"{curve.label}: the stress is {offset:.3g} Pa where the sample is not deformed, and every law has 0 "
+                "there: subtract the preload, or count the stretch from the unloaded length"
+            )
+    return told
+
+
 def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
     """A warning for each curve that no law follows."""
     told = []

@@ -10,7 +10,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, Kind
-from fitting.methods import generalised_maxwell, kramers_kronig, time_response, time_response_on_host, uncertainty
+from fitting.methods import generalised_maxwell, kramers_kronig, time_response, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
@@ -71,7 +71,7 @@ def thinned(test: TimeTest) -> np.ndarray:
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
-    log_time = np.log(test.time[rows])
+    log_time = np.log(test.time[rows] - test.begun)
     wanted = np.linspace(log_time[0], log_time[-1], MOST)
     near = np.clip(np.searchsorted(log_time, wanted), 1, len(rows) - 1)
     near -= wanted - log_time[near - 1] < log_time[near] - wanted
@@ -130,7 +130,7 @@ def identifiable(fit: TimeFit, test: TimeTest) -> bool:
 
 def _one_model(test: TimeTest, rows: np.ndarray, modes: int, kind: Kind) -> TimeFit:
     begin, data, scales = perf_counter(), data_in_time(test), _scales(test, rows)
-    evaluate = partial(time_response_on_host.residuals_with_jacobian, test.kind, kind.maxwell)
+    evaluate = partial(time_response.residuals_with_jacobian, test.kind, kind.maxwell)
     found = from_starts(evaluate, _starts(test, modes, kind), *data)
     running = perf_counter() - begin
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(found.u)))
@@ -198,7 +198,7 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
-    return ratio if test.kind == "relaxation" else 1 / ratio, test.time[rows]
+    return ratio if test.kind == "relaxation" else 1 / ratio, test.time[rows] - test.begun
 
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

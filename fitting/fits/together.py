@@ -14,7 +14,7 @@ import numpy as np
 
 from fitting.fits import time_tests, viscoelastic
 from fitting.fits.viscoelastic import FLUID, Kind
-from fitting.methods import generalised_maxwell, host, time_response_on_host, uncertainty
+from fitting.methods import generalised_maxwell, host, time_response, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, from_starts
@@ -101,12 +101,12 @@ def least_noise(test: Measured) -> float:
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
-def _evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
+def _tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (…, m) of all tests, one after the other, and their Jacobian (…, m, P) at u (…, P), in NumPy."""
 
     def one(name: str, at: tuple, measured: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if name in ("relaxation", "creep"):
-            return time_response_on_host.residuals_with_jacobian(name, kind.maxwell, u, *at, measured, scales)
+            return time_response.residuals_with_jacobian(name, kind.maxwell, u, *at, measured, scales)
         return host.with_jacobian(
             lambda u: (time_tests.response_in_time(name, kind.maxwell(u), *at) - measured) / scales, u
         )
@@ -189,7 +189,7 @@ def criterion_of_all(fit: Together) -> float:
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
     """Fit and weights in turn, for one number of modes."""
     parts = [reported_numbers(t) for t in tests]
-    begin, evaluate = time.perf_counter(), partial(_evaluated, list(map(name_of, tests)), kind)
+    begin, evaluate = time.perf_counter(), partial(_tests_evaluated, list(map(name_of, tests)), kind)
     starts, noise = _starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
     for _ in range(ROUNDS):
         used = noise
@@ -341,7 +341,7 @@ def _shares(fit: Together) -> list[Share]:
     Infinite deviations take a test out.
     """
     parts = [reported_numbers(t) for t in fit.tests]
-    evaluate = partial(_evaluated, list(map(name_of, fit.tests)), fit.kind)
+    evaluate = partial(_tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
     u = np.asarray(fit.solution.u)
     band = ResolvedBand(resolved_by(fit.tests))
     starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])

@@ -1,6 +1,7 @@
 """Stress-stretch curves of an incompressible sample: tension, compression, shear, equibiaxial and pure-shear data."""
 
 import csv
+import itertools
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers import workbook
+from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, to_number
 from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
@@ -23,6 +25,7 @@ class Curve(NamedTuple):
     F: np.ndarray  # (n, 3, 3), det F = 1, face 3 free
     component: tuple[int, int]  # of the nominal stress that was measured
     stress: np.ndarray  # (n,) [Pa]
+    returns: int = 0  # how often the file's rows go back over what they have been through
 
     @property
     def driven(self) -> np.ndarray:
@@ -58,6 +61,11 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         curves += found
         if not named:
             notes.append(f"{file.name}: its stress column names no unit, read as {unit} (--unit Pa, kPa or MPa)")
+    for curve in (c for c in curves if c.returns):
+        times = "once" if curve.returns == 1 else f"{curve.returns} times"
+        notes.append(
+            f"{curve.label}: its rows turn back {times}: loading, unloading or cycles are fitted as one curve; keep one"
+        )
     seen: dict[str, int] = {}
     for k, curve in enumerate(curves):
         seen[curve.label] = seen.get(curve.label, 0) + 1
@@ -80,7 +88,12 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) < 2:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
-    rows = [{k.strip(): (v or "").strip() for k, v in r.items() if k} for r in csv.DictReader(lines)]
+    between = find_delimiter(lines[0])
+    between = between if between in ";\t" else ","
+    rows = [{k.strip(): (v or "").strip() for k, v in r.items() if k} for r in csv.DictReader(lines, delimiter=between)]
+    if between != ",":  # decimals may have commas then
+        sign = decimal_sign(cell for row in rows for cell in row.values())
+        rows = [{k: _with_point(v, between, sign) for k, v in row.items()} for row in rows]
     rows = [row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
     if not rows:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
@@ -90,6 +103,12 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
             "or test, stretch, shear, nominal_stress_kPa"
         )
     return rows
+
+
+def _with_point(cell: str, between: str, sign: str | None) -> str:
+    """A number as Python writes it; any other text as it is."""
+    value = to_number(cell, between, sign) if cell else None
+    return cell if value is None else repr(value)
 
 
 def _column(file: Path, rows: list[dict], name: str, default: float | None = None) -> np.ndarray:
@@ -196,5 +215,32 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     # Rounded digits of F: the volume is made 1 by the free side.
     F = F.copy()
     F[:, 2, 2] /= J
-    order = np.argsort(Curve(label, test, F, component, stress).driven, kind="stable")
-    return Curve(label, test, F[order], component, stress[order])
+    driven = Curve(label, test, F, component, stress).driven
+    order = np.argsort(driven, kind="stable")
+    return Curve(label, test, F[order], component, stress[order], _returns(driven))
+
+
+#: Part of its range by which a curve goes back where it turns.
+_TURN = 0.05
+
+
+def _returns(driven: np.ndarray) -> int:
+    """How often rows (n,) turn and go over a range again in which they had rows before."""
+    turns, low, high, least = [0], 0, 0, _TURN * np.ptp(driven)
+    rises: bool | None = None
+    for k, value in enumerate(driven):
+        high = k if value > driven[high] else high
+        low = k if value < driven[low] else low
+        if rises is not False and driven[high] - value > least:
+            turns += [high] if rises else []
+            rises, low = False, k
+        elif rises is not True and value - driven[low] > least:
+            turns += [low] if rises is False else []
+            rises, high = True, k
+    parts = [driven[a + (a > 0) : b + 1] for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
+    return sum(
+        1
+        for before, after in itertools.pairwise(parts)
+        if min(len(before), len(after)) >= 3
+        and min(before.max(), after.max()) - max(before.min(), after.min()) > 2 * least
+    )

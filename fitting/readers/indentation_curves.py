@@ -6,13 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.tables.text_tables import find_delimiter, split_cells, text_of, to_number
+from fitting.readers.noise_of_series import noise_of_series
+from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, split_cells, text_of, to_number
 from fitting.readers.units import INDENTATION_UNITS
 from liverjax.core.errors import InputError
 
 #: First words of the two columns.
 _WORDS = {"depth": ("depth", "displacement", "indentation"), "force": ("force", "load")}
 _FEWEST = 6
+#: The part of the depth by which an indenter goes back where a loading ends, and the part of the points that is held.
+_BACK, _HELD = 0.1, 0.15
 
 
 class IndentationCurve(NamedTuple):
@@ -25,7 +28,8 @@ class IndentationCurve(NamedTuple):
 
 
 def read_indentation(path: str | Path) -> IndentationCurve:
-    """Read the loading part of a curve: up to the deepest point.
+    """Read the loading part of a curve: up to the deepest point, or to where depth or force is held before; of several
+    loadings the first.
 
     Args:
         path: text with a header that names depth (or displacement, indentation) and force (or load), with units m, mm,
@@ -45,11 +49,36 @@ def read_indentation(path: str | Path) -> IndentationCurve:
         if place is not None
     }
     depth, force = columns["depth"], columns["force"]
-    last = int(np.argmax(depth)) + 1
-    notes = () if last == len(depth) else (f"{len(depth) - last} points after the deepest one are left out",)
+    last, notes = _end_of_loading(depth, force)
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
-        raise InputError(f"{path}: {last} points go in; a fit needs {_FEWEST} or more, at different depths")
-    return IndentationCurve(depth[:last], force[:last], str(path), notes)
+        falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
+        remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
+        raise InputError(f"{path}: {last} points go in; a fit needs {_FEWEST} or more, at different depths: {remedy}")
+    return IndentationCurve(depth[:last], force[:last], str(path), tuple(notes))
+
+
+def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
+    """Number of points of the first loading, without what is held at its end; then notes."""
+    number, notes = len(depth), []
+    back = np.maximum.accumulate(depth) - depth > _BACK * np.ptp(depth)
+    end = int(np.argmax(back)) if back.any() else number
+    last = int(np.argmax(depth[:end])) + 1
+    if np.any(depth[end:] > depth[last - 1] - 2 * _BACK * np.ptp(depth)):
+        notes.append("the file has several loadings: the first is fitted")
+    reached = [int(np.argmax(v[:last] >= np.max(v[:last]) - _margin(v[:last]))) + 1 for v in (depth, force)]
+    if last - min(reached) > max(5, _HELD * last):
+        notes.append(
+            f"{last - min(reached)} points are left out where depth or force is held at the end of the loading"
+        )
+        last = min(reached)
+    elif last < number:
+        notes.append(f"{number - last} points after the deepest one are left out")
+    return last, notes
+
+
+def _margin(values: np.ndarray) -> float:
+    """How near to its largest value a held quantity comes at once: by its scatter, and a little more."""
+    return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 
 def _depth_and_force(line: str) -> dict[str, tuple[int, float] | None]:
@@ -69,11 +98,11 @@ def _place_and_factor(cells: list[str], quantity: str) -> tuple[int, float] | No
 
 def _in_si_units(path: str, lines: list[str], first: int, delimiter: str, place: int, factor: float) -> np.ndarray:
     values = []
-    for number, line in enumerate(lines, first):
-        if not line.strip(f"{delimiter} \t") or line.lstrip().startswith("#"):
-            continue
-        cells = split_cells(line, delimiter)
-        value = to_number(cells[place], delimiter) if place < len(cells) else None
+    numbered = [(k, line) for k, line in enumerate(lines, first) if line.strip(f"{delimiter} \t")]
+    rows = [(k, split_cells(line, delimiter)) for k, line in numbered if not line.lstrip().startswith("#")]
+    sign = decimal_sign(cell for _, cells in rows for cell in cells)
+    for number, cells in rows:
+        value = to_number(cells[place], delimiter, sign) if place < len(cells) else None
         if value is None or not np.isfinite(value):
             shown = repr(cells[place]) if place < len(cells) else "missing"
             raise InputError(f"{path}: line {number}: {shown} is not a finite number; correct or remove the line")

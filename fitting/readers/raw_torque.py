@@ -44,7 +44,16 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
         cells: headings.
         units: of a line of their own, or nothing.
     """
-    found: dict[str, tuple[int, int, float]] = {}
+    return {q: (place, RAW_TORQUE_UNITS[q][unit]) for q, (place, unit) in _places_and_units(cells, units).items()}
+
+
+def unit_of(quantity: str, cells: list[str], units: list[str]) -> str:
+    """The unit of a quantity as headings or the line of units state it; empty where they do not."""
+    return _places_and_units(cells, units).get(quantity, (0, ""))[1]
+
+
+def _places_and_units(cells: list[str], units: list[str]) -> dict[str, tuple[int, str]]:
+    found: dict[str, tuple[int, int, str]] = {}
     for k, cell in enumerate(cells):
         name = cell.strip().strip('"')
         plain = name.lower().replace("_", " ")
@@ -55,8 +64,8 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
         rest = re.sub(r"^[\s_\[(]+|[\s\])]+$", "", name[len(word) :])
         unit = _plain_unit(rest or (units[k] if k < len(units) else ""))
         if unit in RAW_TORQUE_UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
-            found[quantity] = (rank, k, RAW_TORQUE_UNITS[quantity][unit])
-    return {quantity: (k, factor) for quantity, (_, k, factor) in found.items()}
+            found[quantity] = (rank, k, unit)
+    return {quantity: (k, unit) for quantity, (_, k, unit) in found.items()}
 
 
 def _plain_unit(unit: str) -> str:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.tables.text_tables import EMPTY, decimal_sign, means_nothing, split_line, text_of, to_number
 from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
@@ -51,6 +52,8 @@ OWN_TIME = "step time"
 #: A load below this part of the largest one, at the first row, counts as rest: it moves no answer by more.
 AT_REST = 0.01
 
+#: Scatter of the load that is too small to matter, as a part of the largest one.
+QUIET = 1e-3
 #: Relative error at which a floor of the noise begins to count; of a test in cycles, part of the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
@@ -71,9 +74,7 @@ class TimeTest(NamedTuple):
         """Scales of the residuals: the size of each answer, but not less than a floor for answers that are lost in
         noise."""
         answer = self.answer[self.used]
-        smooth = np.abs(np.diff(answer, 3))  # three differences of independent noise have 20 times its variance
-        noise = float(np.median(smooth)) / 0.6745 / np.sqrt(20) if len(smooth) else 0.0
-        floor = max(noise / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
+        floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
         return np.hypot(answer, floor)
 
     @property
@@ -88,9 +89,18 @@ class TimeTest(NamedTuple):
         return bool(np.max(after - np.minimum.accumulate(after)) > half)
 
     @property
+    def begun(self) -> float:
+        """Time [s] of the last row at rest: instruments often record a while before they load."""
+        driven = np.abs(self.driven)
+        first = int(np.argmax(driven > AT_REST * driven.max()))
+        while first > 0 and driven[first] - driven[first - 1] > 1e-6 * driven.max():  # back to where it rises from
+            first -= 1
+        return float(self.time[first])
+
+    @property
     def resolved(self) -> tuple[float, float]:
         """Shortest and longest relaxation time [s] that the test sees: from the first answer used to the last."""
-        time = self.time[self.used]
+        time = self.time[self.used] - self.begun
         return float(time[0]), float(time[-1])
 
 
@@ -134,6 +144,8 @@ def read_time_test(
         notes += told
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
         time, driven, answer, told = from_rest(time, driven, answer, at_once=ramp == 0)
+        driven, scatters = _held_by_its_mean(time, driven, "strain" if kind == "relaxation" else "stress")
+        told += scatters
         return of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
 
@@ -196,6 +208,25 @@ def from_rest(
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
 
 
+def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
+    """A driven quantity that scatters while it is held, at its mean there; then notes.
+
+    Each reading counts as a step that was made, so the scatter of a sensor would be taken for motion.
+    """
+    size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
+    if not noise > QUIET * size:
+        return driven, []
+    level = np.median(driven[np.abs(driven) > size / 2])
+    near = np.abs(driven - level) <= 5 * noise
+    first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
+    if np.mean(near[first:]) < 0.99:
+        return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
+    held, rest = driven.copy(), int(np.argmax(np.abs(driven) > 5 * noise))
+    held[first:] = np.mean(driven[first:])
+    held[:rest] = np.mean(driven[:rest]) if rest else 0.0
+    return held, [f"{told}: from {time[first]:.3g} s on, where it is held, its mean is taken"]
+
+
 def kind_of(path: str | os.PathLike) -> str:
     """ "relaxation" or "creep". A modulus or a compliance decides; else the column that stays constant is the driven
     one."""
@@ -218,14 +249,27 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
         delimiter, cells = split_line(line.lstrip("# "))
         found = _heading(cells)
         if "time" in found and any(set(f) <= set(found) for f in FORMS):
-            rows, units = _rows_in_time(path, lines, k + 1, delimiter, found)
+            rows, units, left_out = _rows_in_time(path, lines, k + 1, delimiter, found)
             columns, notes = _in_si(path, found, np.array(rows), units)
-            return columns, [*_told_of_times(cells), *notes]
+            return columns, [*_told_of_times(cells), *notes, *left_out, *_told_of_tables(lines[k + 1 :])]
     first = next((line.strip() for line in lines if line.strip()), "")[:80]
     raise InputError(
         f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, strain and stress_Pa, "
         f"angle_rad and torque_N.m, or displacement_m and force_N (the first line is {first!r}); add that header"
     )
+
+
+def _told_of_tables(below: list[str]) -> list[str]:
+    """A note where further tables of tests are below the first one."""
+    more = sum(map(_begins_a_table, below))
+    if not more:
+        return []
+    return [f"the file holds {more + 1} tables of a test: the first is read; give each a file of its own"]
+
+
+def _begins_a_table(line: str) -> bool:
+    found = _heading(split_line(line.lstrip("# "))[1])
+    return "time" in found and any(set(f) <= set(found) for f in FORMS)
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
@@ -266,8 +310,8 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
-    """Numbers below the header, and the units that a line of their own gives. An empty cell is NaN."""
-    kept, numbers, units = [], [], {}
+    """Numbers below the header, the units that a line of their own gives, and notes. An empty cell is NaN."""
+    kept, numbers, units, notes = [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
         line = lines[k]
@@ -279,10 +323,12 @@ def _rows_in_time(path, lines, k, delimiter, found):
             numbers.append(k)
             continue
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
-        if not kept and named:
-            units = named
+        if not kept and named:  # units that are not known stay, and are refused
+            units = {q: cells[p].strip('[]() "') for q, p in needed.items() if p < len(cells) and cells[p].strip()}
         elif kept and any(c.strip().lower() not in EMPTY for c in own) and not line.lstrip().startswith("#"):
-            break
+            if not _rows_follow(lines[k:], delimiter, list(needed.values())):
+                break
+            notes.append(f"line {k}, {line.strip()[:40]!r}, holds no numbers and is left out")
     sign = decimal_sign(cell for own in kept for cell in own)
     rows = [[to_number(cell, delimiter, sign) for cell in own] for own in kept]
     for number, row in zip(numbers, rows, strict=True):
@@ -291,7 +337,18 @@ def _rows_in_time(path, lines, k, delimiter, found):
             raise InputError(f"{path}: line {number}: {shown!r} has a cell that is no number; mend or remove it")
     if len(rows) < 4:
         raise InputError(f"{path}: {len(rows)} rows of numbers are below the header; give four or more")
-    return rows, units
+    return rows, units, notes
+
+
+def _rows_follow(below: list[str], delimiter: str, places: list[int]) -> bool:
+    """Whether numbers of the same table follow."""
+    for line in below:
+        if _begins_a_table(line):
+            return False
+        cells = split_line(line, delimiter)[1]
+        if not means_nothing([cells[p] if p < len(cells) else "" for p in places]) and line.strip():
+            return True
+    return False
 
 
 def _in_si(path, found, rows, units):
@@ -342,7 +399,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(f"{test.source}: the {word} is zero throughout; a {test.kind} test needs one")
     sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
     driven, answer = sign * test.driven, sign * test.answer
-    used = test.used & np.isfinite(answer) & (test.time >= start)
+    used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
     if used.sum() < 4:
         raise InputError(
             f"{test.source}: {used.sum()} usable answers are left; give four or more (--min-time too late?)"
@@ -351,4 +408,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(
             f"{test.source}: most answers have the sign against the {test.kind} test's input; mend the signs"
         )
-    return test._replace(driven=driven, answer=answer, used=used)
+    notes, before = test.notes, int(np.sum(test.time <= test.begun))
+    if before > 2:
+        notes = (*notes, f"the load begins at {test.begun:.3g} s: {before} rows before it are not fitted")
+    return test._replace(driven=driven, answer=answer, used=used, notes=notes)

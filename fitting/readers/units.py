@@ -26,7 +26,8 @@ RAW_TORQUE_UNITS = {
 _PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}
 #: Of tests in time; the first is taken where none is given.
 TIME_TEST_UNITS = {
-    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3},
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3}
+    | {"sec": 1.0, "seconds": 1.0, "minutes": 60.0, "hr": 3600.0, "hours": 3600.0},
     "modulus": {"Pa": 1.0} | MODULUS_UNITS,
     "compliance": {"1/Pa": 1.0} | _PER_PA,
     "strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from fitting.fits.stress_stretch import LawFit, unfollowed
+from fitting.fits.stress_stretch import LawFit, loaded_at_rest, unfollowed
 from fitting.readers.curves import Curve
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import COLOURS, GREY, pyplot, save
@@ -65,6 +65,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
             {"label": c.label, "test": c.test, "points": len(c.stress), "rms_stress_Pa": c.scale} for c in curves
         ],
         "not_followed": unfollowed(curves, fits),
+        "loaded_at_rest": loaded_at_rest(curves),
         "laws": [summary(f) for f in ordered],
         "versions": versions(),
     }

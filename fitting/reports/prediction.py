@@ -11,6 +11,7 @@ from fitting.fits import time_tests
 from fitting.fits.together import Measured, name_of, reported_numbers, sizes_of
 from fitting.fits.viscoelastic import Fit
 from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.time_tests import TimeTest
 
 
@@ -43,7 +44,7 @@ class Prediction(NamedTuple):
         """Share of the measured numbers in the band that lie within two standard errors; these contain the scatter of
         the numbers."""
         off = (self.predicted - self.measured)[self.inside]
-        own = self.scales[self.inside] * _scatter(off / self.scales[self.inside])
+        own = self.scales[self.inside] * noise_of_series(off / self.scales[self.inside])
         return float(
             np.mean(np.abs(off) < scipy.stats.norm.ppf(0.975) * np.hypot(self.standard_errors[self.inside], own))
         )
@@ -69,7 +70,7 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
         errors = np.linalg.norm(slopes @ fit.uncertainty.root, axis=1)
     low, high = resolved
     if isinstance(test, TimeTest):
-        place = np.asarray(at[0])[np.asarray(at[2])]
+        place = np.asarray(at[0])[np.asarray(at[2])] - test.begun
     else:
         omega = np.asarray(at[0])
         place = np.tile(1 / omega, len(measured) // len(omega))
@@ -77,11 +78,6 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     errors = np.where(errors < 1e30, errors, np.inf)
     predicted = np.asarray(answers(jnp.asarray(vector)))
     return Prediction(name_of(test), test.source, predicted, measured, errors, scales, sizes_of(test), inside)
-
-
-def _scatter(residuals: np.ndarray) -> float:
-    """Standard deviation of the noise: third differences of independent noise have 20 times its variance."""
-    return float(np.median(np.abs(np.diff(residuals, 3)))) / 0.6745 / np.sqrt(20) if len(residuals) > 3 else 0.0
 
 
 def sentence(found: Prediction) -> str:

@@ -67,7 +67,7 @@ def arrays(path: Path) -> Content:
         raise InputError(f"{path}: is damaged ({type(error).__name__}): write it again") from None
 
 
-def single(path: Path, name: str) -> tuple[np.ndarray, Any]:
+def single(path: Path, name: str) -> tuple[np.ndarray, object]:
     """One array (nx, ny, nz): the array of this name, or the only one of the file; and the file's spacing, or None."""
     found = arrays(path)
     if name in found:
@@ -121,7 +121,7 @@ def _hdf5(path: Path) -> Content:
     return _with_plain_unit(found)
 
 
-def _values(dataset: "h5py.Dataset") -> Any:
+def _values(dataset: "h5py.Dataset") -> object:
     """The content of a dataset; of one that MATLAB wrote, as MATLAB shows it."""
     kind, values = dataset.attrs.get("MATLAB_class"), dataset[()]
     if kind == b"char":

@@ -52,7 +52,7 @@ def read_waves(
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
     step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
-    found |= {key: _beside(Path(file), key, step) for key, file in more.items() if file is not None}
+    found |= {key: _on_the_same_voxels(Path(file), key, step) for key, file in more.items() if file is not None}
     jumps: list[str] = []
     if found.get("wrapped") is not None:
         found["phases"], jumps = unwrapped(name, _instants(name, "wrapped", found["wrapped"]))
@@ -77,7 +77,7 @@ def read_waves(
     return field._replace(noise=noise_of(field))
 
 
-def _beside(file: Path, key: str, spacing: np.ndarray) -> np.ndarray:
+def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray) -> np.ndarray:
     """The mask or labels of a file of its own, whose voxels have to be those of the waves."""
     values, own = formats.single(file, key)
     if own is not None:

@@ -34,6 +34,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Draw the curves of laws, or the field of a run."""
     results = [Path(name) for name in options.law if name.endswith(".h5")]
+    for name in options.law:
+        if name.endswith(".toml"):
+            raise InputError(f"{name} is a scene: run it by liverjax simulate, and draw its result.h5")
     if results:
         if len(options.law) > 1:
             raise InputError(f"{results[0]} is a result: draw it alone")

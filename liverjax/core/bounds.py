@@ -15,6 +15,8 @@ from liverjax.core.errors import InputError
 _DICTIONARIES = ("law", "viscosity", "porosity")
 #: A list of more numbers is not written out in a sentence: the first bad one is named by its place.
 _FEW = 8
+#: Of whole numbers, as those of a program are stored.
+_LARGEST = 2**31 - 1
 
 
 def check(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
@@ -66,7 +68,11 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
         if lower is not None and not (whole and value >= lower):
             raise InputError(f"{where} = {value!r} must be a whole number above {lower - 1}: give {lower} or more")
+        if isinstance(value, (int, np.integer)) and value > _LARGEST:
+            raise InputError(f"{where} must be at most {_LARGEST}: give a smaller number")
         return
+    if type(value) is int and not finite(value):
+        raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller one")
     if type(value) is float or type(value) is int:  # most are: quick, since every run asks
         leaves, numbers = [value], None
         least = most = value
@@ -111,7 +117,7 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
         if any(isinstance(leaf, (str, bytes, bool, dict)) for leaf in leaves):
             raise TypeError
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in leaves]) if leaves else np.empty(0)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         unit = metadata.get("unit", "1")
         raise InputError(f"{where} = {value!r} is not a number: give a value{_in(unit)}") from None
 
@@ -142,11 +148,19 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
         raise InputError(f"{where} has shape {np.shape(value)}: give {words}")
 
 
+def finite(value: float) -> bool:
+    """Whether a number, which may be a whole one of any length, is finite as a float."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
 def check_one(where: str, value: object) -> None:
     """Refuse a value of a scene file that is not one finite number.
 
     Raises:
         InputError: one sentence that begins with `where`.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not finite(value):
         raise InputError(f"{where} = {value!r} is not a number: give one")

@@ -35,7 +35,9 @@ def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> t
         where = f"{name} history"
         try:
             data = np.array(value, float)
-        except (TypeError, ValueError):
+            if any(isinstance(cell, str | bool) for row in value for cell in row):  # type: ignore[attr-defined]
+                data = np.empty(0)
+        except (TypeError, ValueError, OverflowError):
             data = np.empty(0)
         if data.ndim != 2 or data.shape[1] - 1 not in forms:
             raise InputError(f"{where} is no table of numbers: write {wanted}, or name a CSV file")

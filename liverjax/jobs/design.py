@@ -25,6 +25,8 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
             raise InputError(f"{text!r} is no range: write name=low:high, e.g. law.mu=500:1000") from None
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"{text!r} does not rise: write name=low:high, e.g. law.mu=500:1000")
+        if not name.strip():
+            raise InputError(f"{text!r} names no number: write name=low:high, e.g. law.mu=500:1000")
         if name in ranges:
             raise InputError(f"{name} has two ranges: leave one out")
         ranges[name] = (low, high)

@@ -71,6 +71,8 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
     """
     import h5py
 
+    if not file.is_file():
+        raise InputError(f"{file}: there is no such file: give the result.h5 of liverjax simulate")
     try:
         with h5py.File(file) as data:
             if "sweep" in data.attrs:

@@ -27,7 +27,14 @@ from liverjax.core.versions import versions
 from liverjax.jobs import resumable_parts
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
-from liverjax.scenes.scene_checks import check_hold, check_numbers, check_physics, holding
+from liverjax.scenes.scene_checks import (
+    check_choices,
+    check_hold,
+    check_motion_in_planes,
+    check_numbers,
+    check_physics,
+    holding,
+)
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import simulate_batch
 
@@ -89,8 +96,10 @@ def read_sweep(
         values = dict(zip(names, row, strict=True))
         try:
             own = with_parameters(scene, values)
+            check_choices(own)
             check_numbers(own)
             check_physics(own, parts)
+            check_motion_in_planes(own)
             check_hold(own, held)
         except InputError as error:
             raise InputError(f"{parameters}: row {k + 1}: {error}") from None
@@ -136,6 +145,8 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if lines and ";" in lines[0] and "," not in lines[0]:
+        raise InputError(f"{file} has semicolons between its cells: write commas, and points in numbers")
     table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
     if len(table) < 2:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row a run")

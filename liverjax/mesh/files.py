@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from liverjax.core.struct import replace
 from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import quadratic
 from liverjax.mesh.tetrahedra import UNITS, TetMesh, check_mesh, tet_mesh
+
+if TYPE_CHECKING:
+    import meshio
 
 #: Cells of files that become elements.
 CELLS = {1: "tetra", 2: "tetra10"}
@@ -68,11 +71,15 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
             f"mesh file {path}: tetrahedra name node {tets.max()}, but there are {len(points)} nodes; renumber them"
         )
     sets = _node_sets(data, tets, f"mesh file {path}"), _element_sets(data, cell)
+    groups = _named_triangles(data)
     if order == 1:
         mesh = tet_mesh(points, tets, *sets)
         check_mesh(mesh, f"mesh file {path}")
     else:
         mesh = _with_middles(points, tets, *sets, f"mesh file {path}")
+        groups = {name: np.searchsorted(np.unique(tets[:, :4]), corners) for name, corners in groups.items()}
+    if groups:
+        mesh = replace(mesh, triangle_sets={name: node_numbers(corners) for name, corners in groups.items()})
     size = float(np.ptp(points, axis=0).max())
     if size > _LARGE and unit == "m":
         warnings.warn(
@@ -184,17 +191,32 @@ _TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
 
 def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
     """Nodes of the triangles that the file groups under a name; of 3 nodes beside quadratic elements with middles."""
-    blocks = [block for block in data.cells if block.type in _TRIANGLES]
-    first, sets = np.cumsum([0, *(len(block.data) for block in blocks)]), {}
-    for name, numbers in (_cell_groups(data, _TRIANGLES, 2) if blocks else {}).items():
-        nodes = []
-        for block, low, high in zip(blocks, first[:-1], first[1:], strict=True):
-            triangles = block.data[numbers[(numbers >= low) & (numbers < high)] - low]
-            nodes.append(triangles.ravel())
-            if block.type == "triangle" and tets.shape[1] == 10:
-                nodes.append(_middles(tets, triangles))
+    sets = {}
+    for name, parts in _triangle_groups(data).items():
+        nodes = [part.ravel() for part in parts]
+        if tets.shape[1] == 10:
+            nodes += [_middles(tets, part) for part in parts if part.shape[1] == 3]
         sets[name] = np.unique(np.concatenate(nodes)).astype(np.int32)
     return sets
+
+
+def _named_triangles(data: "meshio.Mesh") -> dict[str, np.ndarray]:
+    """Vertices (m, 3) of the triangles that the file groups under a name."""
+    groups = _triangle_groups(data)
+    return {name: np.concatenate([part[:, :3] for part in parts]).astype(np.int32) for name, parts in groups.items()}
+
+
+def _triangle_groups(data: "meshio.Mesh") -> dict[str, list[np.ndarray]]:
+    """Triangles of each named group, block by block, with 3 or 6 nodes."""
+    blocks = [block for block in data.cells if block.type in _TRIANGLES]
+    first = np.cumsum([0, *(len(block.data) for block in blocks)])
+    return {
+        name: [
+            block.data[numbers[(numbers >= low) & (numbers < high)] - low]
+            for block, low, high in zip(blocks, first[:-1], first[1:], strict=True)
+        ]
+        for name, numbers in (_cell_groups(data, _TRIANGLES, 2) if blocks else {}).items()
+    }
 
 
 def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
 """A finer mesh: every tetrahedron cut into eight of half its size, or those near some nodes cut in two."""
 
+import jax
 import numpy as np
 
-from liverjax.core.struct import Indices
-from liverjax.mesh.adjacency import PAIRS
+from liverjax.core.struct import Indices, replace
+from liverjax.mesh.adjacency import PAIRS, node_numbers
 from liverjax.mesh.promotion import of_faces, quadratic
 from liverjax.mesh.selection import boundary_triangles
 from liverjax.mesh.shape_functions import FACES
@@ -33,7 +34,19 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
         new = middle[of_faces(mesh, own)[len(own) :] - V]
         sets[name] = np.concatenate([own, new[new >= 0]])
     made = tet_mesh(np.vstack([points, 0.5 * (points[low] + points[high])[halved]]), tets, sets)
+    if mesh.triangle_sets:
+        ends = np.hstack([np.tile(np.arange(V), (2, 1)), np.stack([low, high])[:, halved]])
+        surface = boundary_triangles(made)
+        groups = {name: _parts_of(np.asarray(old), surface, ends) for name, old in mesh.triangle_sets.items()}
+        made = replace(made, triangle_sets=groups)
     return quadratic(made) if mesh.order > 1 else made
+
+
+def _parts_of(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> jax.Array:
+    """Triangles of the new surface that lie in old ones (m, 3); `ends` (2, V) are the old vertices of each new one."""
+    old = {tuple(corners) for corners in np.sort(triangles, axis=1).tolist()}
+    of_each = np.moveaxis(ends[:, surface], 0, 1).reshape(len(surface), -1).tolist()
+    return node_numbers(surface[[tuple(sorted(set(own))) in old for own in of_each]])
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:

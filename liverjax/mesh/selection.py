@@ -62,6 +62,21 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
     return outer if nodes is None else outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]
 
 
+def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> np.ndarray:
+    """Outer triangles (m, 3) of a place: those between its nodes, or of a set of triangles these triangles alone.
+
+    Args:
+        mesh: `TetMesh`.
+        nodes: of the place, as `select` gives them; None: the whole surface.
+        set: the name by which the place was chosen, if any.
+    """
+    triangles, groups = boundary_triangles(mesh, nodes), mesh.triangle_sets or {}
+    if set is None or set not in groups:
+        return triangles
+    group = {tuple(corners) for corners in np.sort(np.asarray(groups[set]), axis=1).tolist()}
+    return triangles[[tuple(corners) in group for corners in np.sort(triangles, axis=1).tolist()]]
+
+
 def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
     """Refuse what is no list of node numbers (n,) below a count; host side.
 

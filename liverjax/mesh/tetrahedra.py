@@ -38,6 +38,9 @@ class TetMesh:
     node_sets: dict[str, Any] = param("1", "named arrays of node numbers")
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
     pattern: Pattern = param("1", "which vertices share an element")
+    triangle_sets: dict[str, jax.Array] | None = param(
+        "1", "named arrays of vertices (m, 3) of triangles; None: no file had any", default=None
+    )
     faces: Any = param("1", "number of each of an element's faces (4, E), of order 3", default=None)
     clusters: Any = param("1", "`Clusters` of all nodes of an order above 1, where cells are thin", default=None)
     order: int = static(default=1, about="of the shape functions: 1 linear, 2 quadratic", lower=1)

@@ -1,7 +1,7 @@
 """All that holds, moves and loads a body, under one name: `lj.boundary`."""
 
 from liverjax.mesh.nodal import nodal_volumes
-from liverjax.mesh.selection import AXES, boundary_triangles, select
+from liverjax.mesh.selection import AXES, boundary_triangles, select, surface_of
 from liverjax.physics.loads import Traction, follower_forces, follows, nodal_tractions
 from liverjax.physics.prescribed import Displaced, Fixed, free_degrees, prescribed
 
@@ -18,4 +18,5 @@ __all__ = [
     "nodal_volumes",
     "prescribed",
     "select",
+    "surface_of",
 ]

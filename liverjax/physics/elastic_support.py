@@ -60,7 +60,7 @@ class ElasticSupport(Physics):
             given["times"], given["history"] = history.read_history(table["history"], name)
         if "stiffness" in given:
             return cls(nodes=jnp.asarray(nodes, jnp.int32), **given)
-        triangles = selection.boundary_triangles(mesh, nodes)
+        triangles = selection.surface_of(mesh, nodes, table.get("set"))
         if not len(triangles):
             raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
         return cls(triangles=jnp.asarray(triangles, jnp.int32), **given)
@@ -73,10 +73,12 @@ class ElasticSupport(Physics):
         if self.nodes is not None:
             selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
             bounds.check_shape(f"{name}.stiffness", self.stiffness, (), np.shape(self.nodes))
+            _refuse_idle(self, ("normal", "tangential"), name, "springs on nodes have stiffness in N/m")
         else:
             selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
             for key in ("normal", "tangential"):
                 bounds.check_shape(f"{name}.{key}", getattr(self, key), (), (len(self.triangles),))
+            _refuse_idle(self, ("stiffness",), name, "springs on a surface have normal and tangential in Pa/m")
         if self.history is not None and np.ndim(self.history) == 1:
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
@@ -104,6 +106,13 @@ class ElasticSupport(Physics):
         size, axes = np.linalg.eigh(K)
         node, axis = np.nonzero(size > 1e-9 * max(size.max(), 1e-300))
         return node, axes[node, :, axis]
+
+
+def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, instead: str) -> None:
+    """Refuse stiffnesses of the other kind of springs, which would change nothing."""
+    for key in keys:
+        if np.any(np.asarray(getattr(support, key)) != 0):
+            raise InputError(f"{name}.{key} = {getattr(support, key)} changes nothing: {instead}")
 
 
 def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:

@@ -20,6 +20,8 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
 from liverjax.tensors.principal_fields import principal_fields
 
+#: Displacements below this part of the body's size are none.
+_ROUNDOFF = 1e-13
 #: A porous scene has at most one mode of pressure for so many modes of motion.
 PRESSURES = 2
 
@@ -93,6 +95,8 @@ def _full_runs(scene: Scene, values: dict[str, np.ndarray]) -> _Runs:
     u = np.asarray(result.positions)[good]
     u -= np.asarray(scene.mesh.points)
     u *= np.asarray(mask)
+    if np.abs(u).max() <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
+        raise InputError("no row moves the body: give rows whose loads or motions are not 0")
     P = None if result.pressure is None else np.asarray(result.pressure)[good, :, : scene.mesh.number_of_vertices]
     return _Runs(_some(values, good), u, P)
 

@@ -75,10 +75,8 @@ def check_choices(scene: Scene) -> None:
         raise InputError("[solve] reduced is for runs in time, kind is 'harmonic': leave it out")
     if scene.springpots is not None and scene.solve.kind != "harmonic":
         raise InputError("[springpots] are for kind = 'harmonic': a run in time takes [viscosity], a Prony series")
-    for key in ("displaced", "traction"):
-        for k, part in enumerate(getattr(scene, key)):
-            if scene.solve.kind == "harmonic" and part.history is not None:
-                raise InputError(f"{key}.{k}.history is for runs in time: give harmonic motion its amplitudes alone")
+    if scene.solve.kind == "harmonic":
+        _refuse_what_moves_in_time(scene)
     _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
         raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
@@ -96,6 +94,23 @@ def check_choices(scene: Scene) -> None:
         _body(scene.body, scene.mesh.number_of_nodes)
     for k, motion in enumerate(scene.displaced):
         _check_motion(motion, f"displaced.{k}")
+
+
+def _refuse_what_moves_in_time(scene: Scene) -> None:
+    """Refuse histories in harmonic motion, and obstacles that move."""
+    inlets = () if scene.porosity is None else scene.porosity.inlet
+    parts: dict[str, object] = {"body": scene.body}
+    for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
+        parts |= {f"{key}.{k}": part for k, part in enumerate(several)}
+    physics = dict(_named_physics(scene))
+    for name, part in (parts | physics).items():
+        if getattr(part, "history", None) is not None:
+            raise InputError(f"{name}.history is for runs in time: give harmonic motion its amplitudes alone")
+    for name, part in physics.items():
+        if getattr(part, "by", None) is not None:
+            raise InputError(
+                f"{name}.by is for runs in time: give the obstacle its place in harmonic motion as position"
+            )
 
 
 def _check_kinds(scene: Scene) -> None:
@@ -255,7 +270,7 @@ def check_scene(scene: Scene) -> None:
     if solve.kind == "dynamic" and scene.body is None:
         raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
     _no_contradiction(scene)
-    _no_motion_off_planes(scene)
+    check_motion_in_planes(scene)
     if not free_places(scene.mesh, scene.fixed, ()).any():
         warnings.warn(
             "fixed holds every node along every axis, so nothing can move: a place like where = {z_min = 0} takes all "
@@ -300,6 +315,27 @@ def _places(scene: Scene) -> None:
             check_nodes(inlet.nodes, mesh.number_of_nodes, f"porosity.inlet.{k}.nodes")
         else:
             check_triangles(mesh, inlet.triangles, f"porosity.inlet.{k}.triangles")
+    _inlets_that_act(scene.porosity)
+
+
+def _inlets_that_act(sponge: porosity.Porosity) -> None:
+    """Refuse inlets within a place whose pressure is given already; places may share an edge."""
+    given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
+    pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
+    for k, inlet in pressures:
+        own = set(np.asarray(inlet.nodes).tolist())
+        if any(own <= place for place in given):
+            raise InputError(
+                f"porosity.inlet.{k} gives a pressure where it is drained or given already: make their places differ"
+            )
+        given.append(own)
+    for k, inlet in enumerate(sponge.inlet):
+        corners = set() if inlet.triangles is None else set(np.ravel(inlet.triangles).tolist())
+        if inlet.nodes is None and any(corners <= place for place in given):
+            raise InputError(
+                f"porosity.inlet.{k} is a flux through a surface whose pressures are given or drained, where nothing "
+                "enters: make their places differ"
+            )
 
 
 def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:
@@ -339,8 +375,12 @@ def _no_contradiction(scene: Scene) -> None:
                         )
 
 
-def _no_motion_off_planes(scene: Scene) -> None:
-    """Refuse a prescribed motion that leads nodes off the plane in which they slide."""
+def check_motion_in_planes(scene: Scene) -> None:
+    """Refuse a prescribed motion that leads nodes off the plane in which they slide; host side.
+
+    Raises:
+        InputError: one sentence that begins with the name of the motion.
+    """
     for name, physics in _named_physics(scene):
         if not isinstance(physics, SlidingSupport):
             continue

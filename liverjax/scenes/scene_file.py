@@ -345,7 +345,7 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
     nodes, times = _nodes(mesh, name, table), _history(name, table, (1,))
     if "pressure" in table:
         return Inlet(nodes=nodes, pressure=_number(f"{name} pressure", table["pressure"]), **times)
-    triangles = boundary.boundary_triangles(mesh, nodes)
+    triangles = boundary.surface_of(mesh, nodes, table.get("set"))
     if not len(triangles):
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
     flux = _number(f"{name} flux", table["flux"])
@@ -420,7 +420,7 @@ def _traction(mesh: TetMesh, k: int, table: dict) -> Traction:
     vectors = bool(given) and given["history"].ndim == 2
     if ("value" in table) + ("pressure" in table) + vectors != 1:
         raise InputError(f"{name} needs either value = [x, y, z] or pressure = 4.0 (follower), in Pa: give one of them")
-    triangles: Indices = boundary.boundary_triangles(mesh, _nodes(mesh, name, table))
+    triangles: Indices = boundary.surface_of(mesh, _nodes(mesh, name, table), table.get("set"))
     if len(triangles) == 0:
         raise InputError(f"{name} where meets nodes but no boundary triangle: widen it to a whole face")
     triangles = node_numbers(triangles)

@@ -17,6 +17,8 @@ from liverjax.simulation.run import Result
 LONGEST = 1.0
 #: No organ and no sample is shorter [m]: numbers in metres read as millimetres make a liver of 0.2 mm.
 SHORTEST = 1e-3
+#: A displacement below this part of the body's size is none.
+_ROUNDOFF = 1e-13
 #: Vertices nearer to each other than this part of the body's size stand in one place.
 SAME_PLACE = 1e-9
 #: An element with a hundredth of the volume of the regular one of the same edges: errors of its gradients grow as much.
@@ -53,6 +55,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
+    if size <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
+        return "mesh error: the body does not move, so there is none"
     part = 100 * error / max(size, 1e-300)
     said = (
         f"mesh error (estimate, last step): nodes are up to {error:.2g} m off, {part:.2g} % of the largest "

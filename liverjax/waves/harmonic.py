@@ -12,7 +12,9 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Number, Numbers, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
+from liverjax.physics.base import Physics
 from liverjax.physics.contact.friction import RoughObstacle
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.physics.porosity import Porosity
@@ -203,6 +205,13 @@ def _drains(porosity: Porosity) -> bool:
     return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
 
 
+def _at_rest(physics: Physics) -> Physics:
+    """The same physics without a history: a support as stiff as it is named, an obstacle where it begins."""
+    given = ("times", "history", "by") if isinstance(physics, Obstacle) else ("times", "history")
+    changed = {name: None for name in given if getattr(physics, name, None) is not None}
+    return replace(physics, **changed) if changed else physics
+
+
 def _small(scene: Scene, mass: str) -> Scene:
     """The scene without time and weight, for small motion. Physics that have no small motion are refused."""
     if mass not in MASSES:
@@ -224,7 +233,8 @@ def _small(scene: Scene, mass: str) -> Scene:
     if sponge is not None:
         inlets = tuple(replace(inlet, times=None, history=None) for inlet in sponge.inlet)
         sponge = replace(sponge, inlet=inlets)
-    scene = replace(scene, traction=traction, body=body, solve=solve, porosity=sponge)
+    physics = tuple(_at_rest(own) for own in scene.physics)
+    scene = replace(scene, traction=traction, body=body, solve=solve, porosity=sponge, physics=physics)
     if scene.springpots is not None:
         for law in laws_of(scene.law, scene.region):
             check_springpots(scene.springpots, law, scene.viscosity)

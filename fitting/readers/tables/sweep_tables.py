@@ -1,6 +1,7 @@
 """Tables of frequency sweeps in the lines of a file: where each begins, and its rows of numbers."""
 
 import re
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ class Table(NamedTuple):
     rows: list[list[float]]  # in the order of the columns
     numbers: list[int]  # of the lines in the file
     raw: dict[str, np.ndarray]  # what the instrument measured, one value a row
+    strain_unit: str = ""  # of a column of strain, as the file states it
 
     @property
     def frequencies(self) -> int:
@@ -38,17 +40,24 @@ class Table(NamedTuple):
         return len({row[place] for row in self.rows})
 
 
-def choose_table(path: str, tables: list[Table], wanted: str | None) -> tuple[int, list[str]]:
-    """Place of the table to read, and a note where there are several."""
+def choose_table(
+    path: str,
+    tables: list[Table],
+    wanted: str | None,
+    what: str = "frequencies",
+    size: Callable[[Table], int] = lambda table: table.frequencies,
+) -> tuple[int, list[str]]:
+    """Place of the table to read, and a note where there are several: the one with most frequencies, or what `size`
+    counts."""
     names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
     if wanted is not None:
         k = _named(path, tables, names, wanted)
         return k, [f"table {names[k]} of {len(tables)} is used"] if len(tables) > 1 else []
-    counts = [t.frequencies for t in tables]
+    counts = [size(t) for t in tables]
     k = counts.index(max(counts))
     if len(tables) == 1:
         return k, []
-    why = f"{'the first' if counts.count(counts[k]) > 1 else 'the one'} with most frequencies, {counts[k]}"
+    why = f"{'the first' if counts.count(counts[k]) > 1 else 'the one'} with most {what}, {counts[k]}"
     listed = f"the file holds {len(tables)} tables: {', '.join(names)}"
     return k, [f"{listed}; table {names[k]} is used, {why}; choose another with --table NUMBER or NAME"]
 
@@ -115,13 +124,15 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
             own = [split_cells(lines[n - 1], delimiter) for n in numbers]
             sign = decimal_sign(row[c.place] for row in own for c in columns if c.place < len(row))
             raw = _raw(cells, units, own, delimiter, sign)
-            tables.append(Table(name, columns, rows, numbers, raw))
+            unit = raw_torque.unit_of("strain", cells, units[-1] if units else [])
+            tables.append(Table(name, columns, rows, numbers, raw, unit))
         free = k
     return tables, headers
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, strain and temperature in SI of the rows of a table; a column with a gap is left out.
+    """Raw torque, angle, phase, strain and temperature in SI of the rows of a table; a column with a gap is left out,
+    but for the strain.
 
     `sign` is the table's decimal sign.
     """
@@ -129,7 +140,8 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
-        if all(v is not None and np.isfinite(v) for v in values):
+        # Points without a strain are left out by who needs it; of what else the instrument measured all are needed.
+        if all(v is not None and (np.isfinite(v) or quantity == "strain") for v in values):
             found[quantity] = factor * np.array(values, float) + offset
     return found
 

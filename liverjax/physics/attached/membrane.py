@@ -45,7 +45,7 @@ class Membrane(Physics):
         whole = "where" not in table and "set" not in table
         place = f"{name} where"
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), place)
-        triangles = selection.boundary_triangles(mesh, nodes)
+        triangles = selection.surface_of(mesh, nodes, table.get("set"))
         if not len(triangles):
             raise InputError(f"{place} meets nodes but no boundary triangle: widen it to a whole face")
         law = layers.read_layer(table["law"], name)

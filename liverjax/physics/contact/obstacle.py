@@ -77,13 +77,13 @@ class Obstacle(Physics):
         for key in ("position", *SHAPES[shape]):
             if key not in table:
                 raise InputError(f"{name} is a {shape} without {key}: give it")
-        own = (*SHAPES[shape], "radius") if shape == "cone" else SHAPES[shape]
+        own = _numbers_of_shape(shape)
         for key in ("axis", "radius", "half_angle"):
             if key in table and key not in own:
                 raise InputError(f"{name} is a {shape}, which has no {key}: leave it out")
         whole = "where" not in table and "set" not in table
         nodes = None if whole else selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
-        triangles = selection.boundary_triangles(mesh, nodes)
+        triangles = selection.surface_of(mesh, nodes, table.get("set"))
         given: Content = {key: table[key] for key in ("radius", "half_angle", "stiffness") if key in table}
         given |= {k: three_numbers(table[k], f"{name} {k}") for k in ("position", "axis", "by") if k in table}
         if "axis" in given:
@@ -103,6 +103,9 @@ class Obstacle(Physics):
         for key in ("position", "axis", "by"):
             bounds.check_shape(f"{name}.{key}", getattr(self, key), (3,))
         bounds.check_shape(f"{name}.stiffness", self.stiffness, (), (len(self.triangles),))
+        for key, idle in (("radius", 0.0), ("half_angle", 45.0)):
+            if key not in _numbers_of_shape(self.shape) and np.any(np.asarray(getattr(self, key)) != idle):
+                raise InputError(f"{name}.{key} = {getattr(self, key)} changes nothing: a {self.shape} has none")
         if "radius" in SHAPES[self.shape] and not np.all(np.asarray(self.radius) > 0):
             raise InputError(f"{name} radius = {self.radius} of a {self.shape} must be above 0: give it in m")
         if self.shape == "cone" and not np.all(np.asarray(self.half_angle) < 90):
@@ -311,3 +314,8 @@ def three_numbers(value: object, name: str) -> jax.Array:
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
         raise InputError(f"{name} = {value!r} must be three numbers: write [x, y, z]")
     return jnp.asarray(vector)
+
+
+def _numbers_of_shape(shape: str) -> tuple[str, ...]:
+    """The numbers that a shape needs or may have."""
+    return (*SHAPES[shape], "radius") if shape == "cone" else SHAPES[shape]
