@@ -368,8 +368,7 @@ def loaded_at_rest(curves: list[Curve]) -> list[str]:
     """A warning for each curve whose stress is not 0 where its sample is not deformed."""
     told = []
     for curve in curves:
-        shear = curve.driven is not curve.F[:, 0, 0] and np.ptp(curve.F[:, 0, 1]) > 0
-        driven = curve.driven - (0.0 if shear else 1.0)
+        driven = curve.driven - (0.0 if np.ptp(curve.F[:, 0, 1]) > 0 else 1.0)
         near = np.argsort(np.abs(driven), kind="stable")[:3]
         if curve.test == "general" or np.abs(driven[near]).max() > 0.2 * np.ptp(driven):
             continue

@@ -144,8 +144,6 @@ def read_time_test(
         notes += told
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
         time, driven, answer, told = from_rest(time, driven, answer, at_once=ramp == 0)
-        driven, scatters = _held_by_its_mean(time, driven, "strain" if kind == "relaxation" else "stress")
-        told += scatters
         return of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
 
@@ -185,7 +183,8 @@ def of_columns(
     Raises:
         InputError: nothing driven, few answers, signs that do not go together.
     """
-    return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], tuple(source[1])), start)
+    driven, told = _held_by_its_mean(time, driven, "strain" if kind == "relaxation" else "stress")
+    return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
 def from_rest(
@@ -219,7 +218,10 @@ def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[
     level = np.median(driven[np.abs(driven) > size / 2])
     near = np.abs(driven - level) <= 5 * noise
     first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
-    if np.mean(near[first:]) < 0.99:
+    share = np.mean(near[first:])
+    if share < 0.5:  # cycles, which differences of a few rows do not tell from noise
+        return driven, []
+    if share < 0.99:
         return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
     held, rest = driven.copy(), int(np.argmax(np.abs(driven) > 5 * noise))
     held[first:] = np.mean(driven[first:])
