@@ -303,6 +303,9 @@ def test_rows_are_refused_that_a_scene_file_may_not_have(files, column, good, ba
     (files / "rows.csv").write_text(f"{column}\n{good}\n{bad}\n")
     with pytest.raises(lj.InputError, match=f"row 2: .*{words}"):
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
+    (files / "rows.csv").write_text("suport.0.normal\n1.0\n")
+    with pytest.raises(lj.InputError, match="did you mean support"):
+        sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 
 def test_rows_that_nothing_holds_are_refused(files):
@@ -343,6 +346,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu\n", "has no rows"),
         ("law.mu,law.mu\n1,2\n", "names law.mu twice"),
         ("law.mu\n1,2\n", "row 1 has 2 values for 1 names"),
+        ("law.mu;law.bulk\n700;2000\n", "semicolons between its cells"),
         ("law.mu\n1\nx\n", "row 2, law.mu = 'x' is no finite number"),
         ("law.mu\nnan\n", "row 1, law.mu = 'nan' is no finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),

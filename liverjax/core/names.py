@@ -98,6 +98,7 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, li
             places = getattr(thing, unnamed)(word)
             if rest and rest[0].isdigit() and int(rest[0]) < len(places):
                 return [field.name, places[int(rest[0])]], rest[1:]
+            known += dict.fromkeys(part.section for part in getattr(thing, field.name))
         elif unnamed and (word.isdigit() or not isinstance(getattr(thing, field.name), tuple)):
             return [field.name], path
     raise InputError(f"{refusal}: {hint(word, known) if known else f'{word!r} leads nowhere'}")
