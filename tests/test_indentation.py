@@ -118,7 +118,7 @@ def test_only_the_first_loading_is_fitted(tmp_path, kind):
     assert np.isclose(found.modulus, E, rtol=0.01) and np.isclose(found.contact_point, START, atol=3e-6)
 
 
-def test_an_offset_of_the_sensor_is_told_and_decimals_follow_the_table(tmp_path, capsys):
+def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_path, capsys):
     force = hertz(DEPTH - START) + 1e-6 * np.random.default_rng(1).standard_normal(len(DEPTH))
     command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "10", "--out", str(tmp_path)]
     for offset in (0.0, 0.08 * force.max()):
@@ -126,7 +126,12 @@ def test_an_offset_of_the_sensor_is_told_and_decimals_follow_the_table(tmp_path,
         text = "depth_nm;force_mN\n" + rows.replace(".", "x").replace(",", ".").replace("x", ",")  # 1.000,5
         (tmp_path / "c.csv").write_text(text)
         assert main(command) == 0
-        assert ("subtract this offset" in capsys.readouterr().err) == bool(offset)
-        if not offset:
-            content = json.loads((tmp_path / "fit.json").read_text())
-            assert np.isclose(content["young_modulus"], E, rtol=0.01) and not content["warnings"]
+        assert ("this offset of the sensor is taken off" in capsys.readouterr().err) == bool(offset)
+        content = json.loads((tmp_path / "fit.json").read_text())
+        assert np.isclose(content["young_modulus"], E, rtol=0.01) and not content["warnings"]
+        assert np.isclose(content["contact_point"], START, atol=3e-6)
+    # A curve that begins in contact has no offset.
+    np.savetxt(
+        tmp_path / "c.csv", np.column_stack([DEPTH, force])[40:], "%.9g", ",", header="depth_m,force_N", comments=""
+    )
+    assert np.allclose(read_indentation(tmp_path / "c.csv").force, force[40:], rtol=1e-7)

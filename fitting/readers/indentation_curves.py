@@ -16,6 +16,8 @@ _WORDS = {"depth": ("depth", "displacement", "indentation"), "force": ("force", 
 _FEWEST = 6
 #: The part of the depth by which an indenter goes back where a loading ends, and the part of the points that is held.
 _BACK, _HELD = 0.1, 0.15
+#: A rise of the force, over the largest, that must be seen to tell an offset.
+_FLAT = 0.01
 
 
 class IndentationCurve(NamedTuple):
@@ -54,7 +56,11 @@ def read_indentation(path: str | Path) -> IndentationCurve:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
         remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
         raise InputError(f"{path}: {last} points go in; a fit needs {_FEWEST} or more, at different depths: {remedy}")
-    return IndentationCurve(depth[:last], force[:last], str(path), tuple(notes))
+    depth, force = depth[:last], force[:last]
+    offset = _offset(force)
+    if offset:
+        notes.append(f"the force is {offset:.3g} N before it rises: this offset of the sensor is taken off")
+    return IndentationCurve(depth, force - offset, str(path), tuple(notes))
 
 
 def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
@@ -74,6 +80,18 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
     elif last < number:
         notes.append(f"{number - last} points after the deepest one are left out")
     return last, notes
+
+
+def _offset(force: np.ndarray) -> float:
+    """Mean force [N] of the first points, if the next ones have the same: the indenter does not touch there yet.
+
+    0 where the noise hides a rise of a hundredth of the largest force, or a force that the noise explains.
+    """
+    few = max(3, len(force) // 20)
+    first, after = float(np.mean(force[:few])), float(np.mean(force[few : 2 * few]))
+    level = 3 * noise_of_series(force) / np.sqrt(few / 2)
+    flat = abs(after - first) < max(level, 1e-3 * np.max(force)) and level < _FLAT * np.max(force)
+    return first if flat and abs(first) > max(level, 1e-3 * np.max(force)) else 0.0
 
 
 def _margin(values: np.ndarray) -> float:

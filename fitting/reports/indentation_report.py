@@ -9,7 +9,6 @@ import numpy as np
 from fitting.methods.contact_point import ContactFit
 from fitting.methods.kramers_kronig import runs_probability
 from fitting.readers.indentation_curves import IndentationCurve
-from fitting.readers.noise_of_series import noise_of_series
 from fitting.reports.sweep_report import numbers
 from fitting.rigs.thin_layer import Indenter, half_space
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 
 #: Contact over the radius of a sphere, and depth over the thickness, beyond which small strains are in doubt.
 _WIDE, _DEEP = 0.4, 0.2
-#: A force at the first points above this part of the largest one may be an offset of the sensor.
-_OFFSET = 0.03
 
 
 def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> Content:
@@ -84,20 +81,9 @@ def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit
             f"structured misfit: residuals change sign {runs - 1} times over {len(fit.residuals)} points (by chance: "
             f"{chance:.1g}); standard errors are too small then"
         )
-    offset = _offset(curve)
-    if abs(offset) > _OFFSET * np.max(curve.force):
-        told.append(f"the force is {offset:.3g} N before it rises: subtract this offset of the sensor")
     if curve.force.min() < -5 * fit.noise:
         told.append("forces are negative, which adhesion does; it is left out here")
     return told
-
-
-def _offset(curve: IndentationCurve) -> float:
-    """Mean force [N] of the first points, if the next ones have the same: the indenter does not touch there yet."""
-    few = max(3, len(curve.force) // 20)
-    first, after = curve.force[:few], curve.force[few : 2 * few]
-    level = noise_of_series(curve.force) / np.sqrt(few / 2)
-    return float(np.mean(first)) if abs(np.mean(after) - np.mean(first)) < 3 * level < abs(np.mean(first)) else 0.0
 
 
 def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
