@@ -389,16 +389,24 @@ def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words)
 
 
 def test_an_obstacle_stands_where_it_begins():
-    """Scenes of Python may have histories for their runs in time: harmonic motion takes none of them."""
+    """Scenes of Python may have histories for their runs in time: harmonic motion takes where they begin."""
     scene = slab(2, 1)
-    top = jnp.asarray(lj.boundary.boundary_triangles(scene.mesh, scene.mesh.node_sets["z_max"]))
-    high = float(scene.mesh.points[:, 2].max())
-    far = lj.Obstacle(triangles=top, position=(0.0, 0.0, 2 * high), axis=(0.0, 0.0, -1.0))
-    alone = lj.harmonic(replace(scene, physics=(far,)), FREQUENCIES)
-    moved = replace(
-        far, by=jnp.array([0.0, 0.0, -1.5 * high]), times=jnp.array([0.0, 1.0]), history=jnp.array([0.0, 1.0])
+    side = lj.boundary.boundary_triangles(
+        scene.mesh, np.flatnonzero(scene.mesh.points[:, 0] > 0.999 * scene.mesh.points[:, 0].max())
     )
-    assert np.array_equal(lj.harmonic(replace(scene, physics=(moved,)), FREQUENCIES).displacement, alone.displacement)
+    length = float(scene.mesh.points[:, 0].max())
+    far = lj.Obstacle(triangles=jnp.asarray(side), position=(2 * length, 0.0, 0.0), axis=(-1.0, 0.0, 0.0))
+    way, times = jnp.array([-1.2 * length, 0.0, 0.0]), jnp.array([0.0, 1.0])
+
+    def moved(obstacle: lj.Obstacle) -> np.ndarray:
+        return np.asarray(lj.harmonic(replace(scene, physics=(obstacle,)), FREQUENCIES).displacement)
+
+    alone, touching = moved(far), moved(replace(far, position=(0.8 * length, 0.0, 0.0)))
+    assert np.abs(alone - touching).max() > 1e-3 * np.abs(alone).max()
+    assert np.array_equal(moved(replace(far, by=way)), alone)
+    assert np.array_equal(moved(replace(far, by=way, times=times, history=jnp.array([0.0, 1.0]))), alone)
+    begins_inside = replace(far, times=times, history=jnp.stack([way, 0 * way]))
+    assert np.allclose(moved(begins_inside), touching, rtol=1e-12, atol=1e-12 * np.abs(alone).max())
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,8 @@ def _memory_of_modes(
     intervals = (-1, *(1,) * rates.ndim)
     dt, step, ramp = (a.reshape(intervals) for a in (dt, step, ramp))
     x = dt * rates
-    decay, (one, two, of_one, of_two) = np.exp(-x), _exponential_means(x)
+    decay, (one, two) = np.exp(-x), _phi(x)
+    of_one, of_two = _slopes_of_phi(x, one, two)
     added, of_added = one * step + two * ramp, dt * (of_one * step + of_two * ramp)
     h, by_rate = np.empty((len(x) + 1, *rates.shape)), np.zeros((len(x) + 1, *rates.shape))
     h[0] = start
@@ -161,22 +162,16 @@ def _memory_of_modes(
     return h, by_rate
 
 
-def _exponential_means(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(1 - e^-x) / x and (x - 1 + e^-x) / x^2, also at 0, and their derivatives."""
+def _slopes_of_phi(x: np.ndarray, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of both values of `_phi` by x, also at 0."""
     small = x < 1e-2
-    far = np.where(small, 1.0, x)
-    one = -np.expm1(-far) / far
-    two = (1 - one) / far
+    far, near = np.where(small, 1.0, x), [np.polynomial.polynomial.polyval(np.where(small, x, 0.0), c) for c in _SLOPES]
     of_one, of_two = (np.exp(-far) - one) / far, (one - 2 * two) / far
-    near = [np.polynomial.polynomial.polyval(np.where(small, x, 0.0), c) for c in _SERIES]
-    one, two = np.where(small, near[0], one), np.where(small, near[1], two)
-    return one, two, np.where(small, near[2], of_one), np.where(small, near[3], of_two)
+    return np.where(small, near[0], of_one), np.where(small, near[1], of_two)
 
 
-#: Coefficients of the Taylor series of `_exponential_means`: below 1e-2 the first one left out is below 1e-16.
-_SERIES = (
-    [1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040],
-    [1 / 2, -1 / 6, 1 / 24, -1 / 120, 1 / 720, -1 / 5040, 1 / 40320],
+#: Coefficients of their Taylor series: below 1e-2 the first one left out is below 1e-16.
+_SLOPES = (
     [-1 / 2, 1 / 3, -1 / 8, 1 / 30, -1 / 144, 1 / 840, -1 / 5760],
     [-1 / 6, 1 / 12, -1 / 40, 1 / 180, -1 / 1008, 1 / 6720, -1 / 51840],
 )

@@ -207,8 +207,9 @@ def _drains(porosity: Porosity) -> bool:
 
 def _at_rest(physics: Physics) -> Physics:
     """The same physics without a history: a support as stiff as it is named, an obstacle where it begins."""
-    given = ("times", "history", "by") if isinstance(physics, Obstacle) else ("times", "history")
-    changed = {name: None for name in given if getattr(physics, name, None) is not None}
+    changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
+    if isinstance(physics, Obstacle):
+        changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}
     return replace(physics, **changed) if changed else physics
 
 
