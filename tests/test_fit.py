@@ -148,8 +148,10 @@ def test_bfgs_finds_the_same_minimum():
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_auto_finds_the_two_modes_of_table_2(noise):
     s = sweep(noise, 5)
-    chosen, tried = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
+    told = []
+    chosen, tried = viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s), progress=told.append)
     assert chosen.modes == 2 and len(tried) <= 4
+    assert told == [f"{n + 1} modes" for n in range(len(tried))]
 
 
 def test_modes_limited_by_points():

@@ -4,12 +4,11 @@ import argparse
 import sys
 
 from fitting.commands import shared_options
+from fitting.commands.progress import named_bar
 
 
 def run(options: argparse.Namespace) -> int:
     """Fit all samples with one model in closed form; 1 if one of the fits did not converge."""
-    from tqdm import tqdm
-
     from fitting.fits import samples
     from fitting.reports import samples_report
     from liverjax.core.files import writable
@@ -20,12 +19,7 @@ def run(options: argparse.Namespace) -> int:
         for note in sweeps[-1].notes:
             print(f"note: {path.name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    with tqdm(desc=f"{len(sweeps)} samples", disable=None, leave=False) as bar:
-
-        def told(text: str) -> None:
-            bar.set_postfix_str(text)
-            bar.update()
-
+    with named_bar(f"{len(sweeps)} samples") as told:
         found = samples.fit(sweeps, options.model, options.modes, told)
     content = samples_report.write(options.out, found)
     print(samples_report.table(found))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
-from fitting.commands.progress import cost_bar
+from fitting.commands.progress import cost_bar, named_bar
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.core.files import writable
@@ -361,7 +361,8 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
     prony = None
     if options.model in ("prony", "auto"):
         if options.modes == "auto":
-            prony = viscoelastic.choose_modes(sweep, dense, options.optimizer)[0]
+            with named_bar("closed form") as told:
+                prony = viscoelastic.choose_modes(sweep, dense, options.optimizer, told)[0]
         else:
             prony = viscoelastic.closed_form(sweep, options.modes, dense, options.optimizer)
     if options.model == "prony":

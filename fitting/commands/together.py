@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fitting.commands import shared_options
+from fitting.commands.progress import named_bar
 from liverjax.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
 
 def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form; 1 if the fit did not converge."""
-    from tqdm import tqdm
-
     from fitting.fits.families import springpots_in_time
     from fitting.reports import together_report
     from liverjax.core.files import writable
@@ -26,12 +25,7 @@ def run(options: argparse.Namespace) -> int:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
-    with tqdm(desc=f"{len(tests)} tests", disable=None, leave=False) as bar:
-
-        def told(text: str) -> None:
-            bar.set_postfix_str(text)
-            bar.update()
-
+    with named_bar(f"{len(tests)} tests") as told:
         found = springpots_in_time.choose_together(tests, options.model, options.modes, told)
     together_report.write(options.out, found)
     print(together_report.table(found))

@@ -218,9 +218,14 @@ def information_criterion(fit: Fit) -> float:
 EXACT = 1e-7
 
 
-def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) -> tuple[Fit, list[Fit]]:
+def choose_modes(
+    sweep: Sweep,
+    dense: Spectrum,
+    optimizer: str = OPTIMIZERS[0],
+    progress: Callable[[str], None] = lambda text: None,
+) -> tuple[Fit, list[Fit]]:
     """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact. Return the chosen
-    fit and all tried.
+    fit and all tried. `progress` is told what is fitted.
 
     One failure may be a local minimum: the search ends at the second in a row. A number of modes whose computation
     breaks down is such a failure, and is named in the warnings; the others stay.
@@ -230,6 +235,7 @@ def choose_modes(sweep: Sweep, dense: Spectrum, optimizer: str = OPTIMIZERS[0]) 
     broken: dict[int, str] = {}
     chosen, failures = None, 0
     for modes in range(1, cap + 1):
+        progress(f"{modes} modes")
         try:
             fit = closed_form(sweep, modes, dense, optimizer)
         except (ArithmeticError, RuntimeError, ValueError) as error:
