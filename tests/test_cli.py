@@ -121,7 +121,7 @@ BAD = {
     "density unused": (
         HEADER + "1,300,30\n2,310,40\n",
         ["--density", "1060", "--method", "closed-form"],
-        "--density 1060 is of the simulation",
+        "--density 1060 is for the simulation only",
     ),
     "table": (HEADER + "1,300,30\n2,310,40\n", ["--table", "liver"], "--table liver is no table of the file"),
     "steps": (HEADER + "1,300,30\n2,310,40\n", ["--steps", "1"], "--steps 1 is out of range"),

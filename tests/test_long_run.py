@@ -14,7 +14,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
-from liverjax.core import programs
+from liverjax.core import program_cache
 from liverjax.jobs import output, resumable_parts
 from liverjax.scenes import scene_file
 from liverjax.simulation.run import Result
@@ -84,7 +84,7 @@ def _kept(tmp_path_factory):
     before = {name: getattr(jax.config, name) for name in names}
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-        patch.setenv(programs.SWITCH, str(tmp_path_factory.mktemp("programs")))
+        patch.setenv(program_cache.SWITCH, str(tmp_path_factory.mktemp("programs")))
         yield
     for name, value in before.items():
         jax.config.update(name, value)

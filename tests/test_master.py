@@ -172,7 +172,7 @@ def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
             "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"
             + "".join(f"{f},{m * (1 + f)},{m * f},{T}\n" for T, m in ((20, 1e-6), (30, 1e9)) for f in (1, 2, 3)),
             [],
-            "do not lie over each other",
+            "do not match",
         ),
         ("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_K\n1,2,1,-3\n2,3,1,20\n", [], "absolute zero"),
         ("", ["--with", "a.csv"], "leave out --with"),

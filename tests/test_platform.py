@@ -11,7 +11,7 @@ import pytest
 from conftest import ROOT
 
 import liverjax as lj
-from liverjax.core import programs
+from liverjax.core import program_cache
 from liverjax.laws import LAWS
 
 MISCOMPILED = """
@@ -73,7 +73,7 @@ def test_float32_is_multiplied_whole():
 def test_the_import_sets_64_bits_and_no_cache():
     """In a process of its own, as a user has it."""
     told = "import liverjax, fitting, jax; print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir)"
-    unset = ("JAX_COMPILATION", "JAX_ENABLE_X64", programs.SWITCH)
+    unset = ("JAX_COMPILATION", "JAX_ENABLE_X64", program_cache.SWITCH)
     plain = {k: v for k, v in os.environ.items() if not k.startswith(unset)}
     run = subprocess.run([sys.executable, "-c", told], cwd=ROOT, env=plain, capture_output=True, text=True)
     assert run.stdout.strip() == "True None", run.stderr

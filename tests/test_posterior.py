@@ -285,7 +285,7 @@ def test_the_posterior_through_the_simulation_is_checked_by_simulating(tmp_path)
     [
         (["--samples", "5"], "--samples 5 is out of range: give 100 to 100000"),
         (["--samples", "1000", "--model", "spectrum"], "leave it out for --model spectrum"),
-        ([str(PORCINE), "--samples", "1000"], "is of one sample, 2 files are given"),
+        ([str(PORCINE), "--samples", "1000"], "is for one sample only, and 2 files are given"),
     ],
 )
 def test_what_cannot_be_sampled_is_refused(arguments, sentence, tmp_path, capsys):

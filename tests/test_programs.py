@@ -18,7 +18,7 @@ from conftest import ROOT
 import liverjax as lj
 from liverjax.commands.exit_codes import exit_code
 from liverjax.core import compiled as compiled_module
-from liverjax.core import programs
+from liverjax.core import program_cache
 from liverjax.core.compiled import _found, compiled
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
@@ -27,7 +27,7 @@ from liverjax.elements import mjed
 WORK = """
 import jax, jax.numpy as jnp
 import liverjax
-from liverjax.core.programs import kept_on_disk
+from liverjax.core.program_cache import kept_on_disk
 def work(x):
     return jnp.linalg.inv(jnp.sin(x) @ jnp.cos(x).T + 9 * jnp.eye(7)) @ jnp.exp(x)
 with kept_on_disk():
@@ -40,7 +40,7 @@ def switched(monkeypatch, tmp_path) -> Path:
     """The folder that `LIVERJAX_CACHE` names; what JAX was told before comes back afterwards."""
     before = {name: getattr(jax.config, name) for name in CONFIGURED}
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
-    monkeypatch.setenv(programs.SWITCH, str(tmp_path / "kept"))
+    monkeypatch.setenv(program_cache.SWITCH, str(tmp_path / "kept"))
     yield tmp_path / "kept"
     for name, value in before.items():
         jax.config.update(name, value)
@@ -55,7 +55,7 @@ def _started(command: list[str], cache: str | Path) -> subprocess.Popen:
     return subprocess.Popen(
         [sys.executable, "-W", "error", *command],
         cwd=ROOT,
-        env=environment | {programs.SWITCH: str(cache)},
+        env=environment | {program_cache.SWITCH: str(cache)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -113,9 +113,9 @@ def test_commands_keep_their_programs(switched):
 
 @pytest.mark.parametrize("cache", ["off", "OFF", "/dev/null/no/folder"])
 def test_no_cache_is_no_error(switched, monkeypatch, cache):
-    monkeypatch.setenv(programs.SWITCH, cache)
+    monkeypatch.setenv(program_cache.SWITCH, cache)
     before = jax.config.jax_compilation_cache_dir
-    with programs.kept_on_disk() as folder:
+    with program_cache.kept_on_disk() as folder:
         assert folder is None and jax.config.jax_compilation_cache_dir == before
     assert not switched.exists()
 
@@ -123,7 +123,7 @@ def test_no_cache_is_no_error(switched, monkeypatch, cache):
 def test_a_folder_given_to_jax_stays(switched, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
     before = jax.config.jax_compilation_cache_dir
-    with programs.kept_on_disk() as folder:
+    with program_cache.kept_on_disk() as folder:
         assert folder is None and jax.config.jax_compilation_cache_dir == before
     assert not switched.exists()
 
@@ -131,29 +131,29 @@ def test_a_folder_given_to_jax_stays(switched, monkeypatch):
 def test_the_user_cache_follows_the_platform(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert programs._user_cache() == tmp_path
+    assert program_cache._user_cache() == tmp_path
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert programs._user_cache() == Path.home() / ".cache"
+    assert program_cache._user_cache() == Path.home() / ".cache"
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert programs._user_cache() == Path.home() / "Library" / "Caches"
+    assert program_cache._user_cache() == Path.home() / "Library" / "Caches"
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
-    assert programs._user_cache() == tmp_path
+    assert program_cache._user_cache() == tmp_path
 
 
 def test_another_source_or_processor_has_another_folder(monkeypatch, tmp_path):
-    here = programs._name()
-    assert here == programs._name() and f"jax{jax.__version__}-" in here
-    monkeypatch.setattr(programs, "_processor", lambda: "another")
-    assert programs._name() != here
+    here = program_cache._name()
+    assert here == program_cache._name() and f"jax{jax.__version__}-" in here
+    monkeypatch.setattr(program_cache, "_processor", lambda: "another")
+    assert program_cache._name() != here
     monkeypatch.undo()
     package = tmp_path / "liverjax"
     package.mkdir()
     (package / "__init__.py").write_text("")
     monkeypatch.setattr(importlib.import_module("liverjax"), "__file__", str(package / "__init__.py"))
-    empty = programs._name()
+    empty = program_cache._name()
     (package / "law.py").write_text("one = 1\n")
-    assert len({here, empty, programs._name()}) == 3
+    assert len({here, empty, program_cache._name()}) == 3
 
 
 def test_what_was_longest_not_used_goes_first(tmp_path):
@@ -165,10 +165,10 @@ def test_what_was_longest_not_used_goes_first(tmp_path):
         os.utime(entry, (1000 - k, 500))  # the first was read last
     mine = tmp_path / "old" / "notes.txt"
     mine.write_text("mine")
-    programs.bound(tmp_path, 350)
+    program_cache.bound(tmp_path, 350)
     assert {entry.name for entry in _entries(tmp_path)} == {f"jit_f-{k}-cache" for k in range(3)}
     assert mine.exists()
-    programs.bound(tmp_path, 350)
+    program_cache.bound(tmp_path, 350)
     assert len(_entries(tmp_path)) == 3
 
 
@@ -187,7 +187,7 @@ def test_a_whole_program_is_found_without_being_traced(switched, cube, monkeypat
     (mesh, law, x), traced = cube, []
     energy = type(law).strain_energy
     monkeypatch.setattr(type(law), "strain_energy", lambda self, m: traced.append(1) or energy(self, m))
-    with programs.kept_on_disk():
+    with program_cache.kept_on_disk():
         first = compiled(mjed.energy, mesh, law, x)(mesh, law, x)
         assert traced
         (file,) = _whole(switched)
@@ -204,7 +204,7 @@ def test_a_whole_program_is_found_without_being_traced(switched, cube, monkeypat
         file.write_bytes(content[:100])
         assert compiled(mjed.energy, mesh, law, x)(mesh, law, x).tobytes() == first.tobytes()
         assert len(file.read_bytes()) > 0.9 * len(content)  # replaced
-    assert programs.folder() is None
+    assert program_cache.folder() is None
 
 
 def test_what_decides_a_program_is_in_its_name(switched, cube, monkeypatch):
@@ -238,7 +238,7 @@ class Mine(lj.Law):
 
 def test_a_law_of_ones_own_is_compiled_as_it_is_now(switched, cube):
     mesh, law, x = cube
-    with programs.kept_on_disk():
+    with program_cache.kept_on_disk():
         mine = Mine(mu=law.mu, bulk=law.bulk)
         energy = compiled(mjed.energy, mesh, mine, x)(mesh, mine, x)
         assert np.isclose(energy, mjed.energy(mesh, law, x), rtol=1e-14)
@@ -250,7 +250,7 @@ FACTORISES = """
 import jax.numpy as jnp, liverjax
 from fitting.methods.least_squares import accept, begin
 from liverjax.core.compiled import compiled
-from liverjax.core.programs import kept_on_disk
+from liverjax.core.program_cache import kept_on_disk
 state, r, J = begin(jnp.ones(2), 3), jnp.arange(3.0), jnp.arange(6.0).reshape(3, 2) ** 2
 with kept_on_disk():
     print(compiled(accept, state, r, J)(state, r, J).trial.tobytes().hex())
@@ -263,5 +263,5 @@ def test_a_program_that_factorises_runs_from_disk(tmp_path):
 
 
 def test_other_warnings_are_shown(switched):
-    with programs.kept_on_disk(), pytest.warns(UserWarning, match="mine"):
+    with program_cache.kept_on_disk(), pytest.warns(UserWarning, match="mine"):
         warnings.warn("mine", stacklevel=1)

@@ -71,7 +71,7 @@ def test_what_is_not_told_changes_nothing(tmp_path):
 
 
 def test_a_sweep_of_nothing_but_the_instrument_is_refused(tmp_path):
-    with pytest.raises(InputError, match="nearly all of the sweep is the instrument's"):
+    with pytest.raises(InputError, match="nearly all points show the instrument"):
         without_inertia(export(tmp_path / "e.txt", inertia=1.0))
 
 

@@ -93,10 +93,10 @@ def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--method", "torsion"], "--method torsion is of one sample, 2 files are given"),
-        (["--profile"], "--profile is of one sample"),
-        (["--gap-error", "5e-5", "--height", "0.004"], "--gap-error is of one sample"),
-        (["--density", "1060"], "--density is of one sample"),
+        (["--method", "torsion"], "--method torsion is for one sample only, and 2 files are given"),
+        (["--profile"], "--profile is for one sample only"),
+        (["--gap-error", "5e-5", "--height", "0.004"], "--gap-error is for one sample only"),
+        (["--density", "1060"], "--density is for one sample only"),
     ],
 )
 def test_what_only_one_sample_has_is_refused(options, sentence, tmp_path, capsys):

@@ -105,7 +105,7 @@ def test_wrapped_phases_that_are_no_radians_get_a_sentence(tmp_path, monkeypatch
         ({"displacement": np.ones((2, 5, 5, 5, 3))}, "no imaginary part"),
         ({"displacement": np.ones((5, 5)) + 1j}, "frequencies first, components last"),
         ({"displacement": np.full((2, 5, 5, 5, 3), 0j)}, "zero or not a number everywhere"),
-        ({"displacement": None}, "name the waves displacement"),
+        ({"displacement": None}, "store the waves as displacement"),
         ({"mask": np.zeros((5, 5, 5), int)}, "no voxel of the mask"),
         ({"mask": np.ones((4, 5, 5), int)}, "on the same voxels"),
         ({"labels": np.full((5, 5, 5), 0.5)}, "whole numbers"),

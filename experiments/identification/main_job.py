@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from experiments.common import RESULTS, ROOT, either, save
-from liverjax.core.programs import SWITCH
+from liverjax.core.program_cache import SWITCH
 
 DATA = ROOT / "data"
 

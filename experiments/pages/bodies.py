@@ -10,7 +10,8 @@ def in_place() -> str:
     said = ", ".join(f"{r['name']} {1e3 * r['largest_m']:.1f} mm" for r in rest)
     u = data["unloaded"][0]
     return (
-        f"largest displacement under a fifth of gravity: {said}; the unloaded shape in {u['run_s']:.2g} s, and back to "
+        f"largest displacement under a fifth of gravity: {said}; the unloaded shape is found in {u['run_s']:.2g} s, "
+        "and its loads bring it back to the given shape to within "
         f"{u['back_m']:.0e} m"
     )
 

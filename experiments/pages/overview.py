@@ -74,8 +74,9 @@ def _porosity() -> str:
     found = holding(data)
     rival = next(r for r in data["rows"] if r["varied"] == "law's bulk of the rival")
     return (
-        f"no: complete {100 * both['largest_m']:.3g} cm, viscous {100 * both['without_m']:.3g} cm, for the law's K = "
-        f"{data['law_bulk_Pa']:g} Pa is off and the sponge's K0 = {table['bulk']:g} Pa acts. It takes "
+        f"no: complete {100 * both['largest_m']:.3g} cm, viscous {100 * both['without_m']:.3g} cm, because the law's "
+        f"bulk modulus of {data['law_bulk_Pa']:g} Pa does not act: the sponge's K0 = {table['bulk']:g} Pa takes its "
+        "place. What does hold it back: "
         f"{'; '.join(found['it takes'])}. Not enough: {'; '.join(found['not enough'])}. Against a viscous body whose "
         f"own bulk is K0 the sponge's fluid does hold back: {rival['ratio']:.2g} times its displacement"
     )

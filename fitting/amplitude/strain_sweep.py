@@ -69,7 +69,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     largest = LARGEST_STRAIN if chosen.strain_unit else LARGEST_WITHOUT_UNIT
     if strain[kept].max() > largest:
         raise InputError(
-            f"{path}: a strain of {strain[kept].max():g} is none: write it in % (strain_%), or as a part of 1 "
+            f"{path}: a strain of {strain[kept].max():g} is too large: write it in % (strain_%), or as a part of 1 "
             "(strain_1)"
         )
     order = np.argsort(strain[kept], kind="stable")

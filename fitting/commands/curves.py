@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     found, notes = curves.read_curves(options.files, options.unit)
     if options.law == "all":
         left = [n for n in laws.LAWS if not stress_stretch.incompressible_form(n)]
-        notes.append(f"left out, being no isochoric energy plus U(J): {', '.join(left)}")
+        notes.append(f"left out, because they are not an isochoric energy plus U(J): {', '.join(left)}")
     for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     stress_stretch.initial_modulus(found)

@@ -244,7 +244,9 @@ def _check(options: argparse.Namespace) -> None:
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
     if options.density is not None and options.method == "closed-form":
-        raise InputError(f"--density {options.density:g} is of the simulation: leave it out or give --method torsion")
+        raise InputError(
+            f"--density {options.density:g} is for the simulation only: leave it out or give --method torsion"
+        )
     _check_precompression(options)
     _check_master(options)
     if len(options.sweep) > 1 and options.master is None:
@@ -266,7 +268,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _check_friction(options: argparse.Namespace) -> None:
-    """Refuse a friction without a size, or where it is not fitted."""
+    """Refuse --friction-error without the sample's size, or with a fit that does not use it."""
     error = options.friction_error
     if error is None:
         return
@@ -311,7 +313,7 @@ def _check_master(options: argparse.Namespace) -> None:
     """Refuse options that do not go with a master curve."""
     if options.master is None:
         if options.vertical:
-            raise InputError("--vertical is of a master curve: give --master too")
+            raise InputError("--vertical is for a master curve: give --master too")
         return
     for name, asked in (
         ("--with", bool(options.others)),
@@ -335,7 +337,7 @@ def _check_samples(options: argparse.Namespace) -> None:
         ("--density", options.density is not None, "leave it out, or give one file"),
     ):
         if asked:
-            raise InputError(f"{name} is of one sample, {len(options.sweep)} files are given: {instead}")
+            raise InputError(f"{name} is for one sample only, and {len(options.sweep)} files are given: {instead}")
 
 
 def _check_together(options: argparse.Namespace) -> None:

@@ -40,7 +40,7 @@ class Nuisance(NamedTuple):
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:
-        """The number for a sentence."""
+        """The size of this error as text, for a sentence."""
         value = self.unit * deviations
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
 
@@ -55,7 +55,7 @@ class InstrumentErrors(NamedTuple):
 
     @property
     def steady(self) -> np.ndarray:
-        """Which do not move with the band by more than two standard errors of the shorter one (k,)."""
+        """Which errors (k,) change by at most two standard errors if the last half decade is left out."""
         if self.part is None or self.part_errors is None:
             return np.zeros(len(self.values), bool)
         return np.abs(self.values - self.part) <= 2 * self.part_errors
@@ -245,7 +245,7 @@ def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) ->
 
 
 def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
-    """The same u as numbers of the sample at rest: what relaxes and what stands are divided by a factor each."""
+    """The kind whose u describe the sample at rest: relaxing and equilibrium part are divided by their factors."""
     seen, shown, moduli = kind.maxwell, kind.values, kind.moduli
     if shown is None or moduli is None:
         return kind._replace(maxwell=lambda u: weighed(seen(u), 1 / factors.relaxing, 1 / factors.equilibrium))
@@ -261,7 +261,7 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
 
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
-    """Prony modes of a model at rest: those that were made for the measured moduli mix what relaxes and what stands."""
+    """New Prony modes for a model at rest: those made for the measured moduli mix relaxing and equilibrium part."""
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"

@@ -51,7 +51,7 @@ def sweep(data: Sweep) -> Test:
 
 
 def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.Drive = torsion.Drive()) -> Test:
-    """The same through the torsion simulation, of fixed or free height, at torque amplitudes [N m]."""
+    """A frequency sweep through the torsion simulation, with fixed or free height, at torque amplitudes [N m]."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -62,7 +62,9 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
 
 
 def _noise_of(data: Sweep) -> np.ndarray:
-    """Standard deviations (2n,) [Pa] of the moduli. Scales that are no noise of the points are weights only."""
+    """Standard deviations (2n,) [Pa] of the moduli. If the scales are not the noise of the points, they are only
+    weights.
+    """
     scales = np.concatenate(data.deviations)
     if data.noise_given:
         return scales

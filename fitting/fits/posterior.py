@@ -4,7 +4,7 @@ The likelihood is that of the fit: independent errors on the given scales. Their
 deviations its prior is 1 / s. With deviations it is 1 / s above 1: the deviations may be enlarged, never reduced.
 
 Errors of the instrument that a fit of a sweep has beside its modes are numbers of the posterior too, with their priors.
-The gap, of which a sweep says nothing, is drawn beside it: its factor is that of all moduli of a draw.
+A sweep says nothing of the gap, so its error is drawn independently: one factor for all moduli of a draw.
 """
 
 import time
@@ -323,8 +323,9 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
     The density is that of the linear rig, with its recursion in time. A complex factor for each frequency adds the
-    effect of the simulation at the minimum. Some draws are then simulated: `Posterior.simulated` has the largest
-    difference of their log density, so that the short cut is checked where it is used.
+    effect of the simulation at the minimum. Some draws are then simulated in full. `Posterior.simulated` has the
+    largest difference between their simulated and their approximate log likelihood: it shows how good the approximation
+    is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     law, omega, measured = data[1], data[2], data[4]

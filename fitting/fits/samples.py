@@ -133,7 +133,7 @@ def _place(name: str) -> int:
 
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
-    """Prony modes at the means of the population; where there is none, modes stay out and other numbers are medians."""
+    """Prony modes at the means of the population. Modes without a mean are left out; other numbers are then medians."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

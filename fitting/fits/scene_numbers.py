@@ -42,7 +42,7 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 
 class Unknowns(NamedTuple):
-    """What Gauss-Newton varies, u (n,), and what it stands for."""
+    """The unknowns u (n,) of Gauss-Newton, and the numbers that they stand for."""
 
     start: np.ndarray  # first u (n,)
     values_of: Callable[[jax.Array], Content]  # u -> numbers of the scenes by dotted name

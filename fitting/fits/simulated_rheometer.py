@@ -168,7 +168,7 @@ def through_torsion(
         start: fit in closed form with the number of modes wanted, and with the errors of gap and instrument.
         simulation: geometry, law and resolution.
         optimizer: one of `OPTIMIZERS`.
-        progress: told of every evaluation.
+        progress: called after every evaluation.
     """
     from liverjax.physics.viscosity import check
 

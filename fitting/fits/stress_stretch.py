@@ -68,13 +68,14 @@ _tangents = jax.jit(lambda law, F: law.tangent(F))
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """The law of that name, or of FILE.py:LAW; Ogden's with 1, 2 and 3 terms unless `terms` says; `all` shipped ones.
+    """The law with this name, FILE.py:LAW, or `all` shipped laws; Ogden's with several numbers of terms without
+    `terms`.
 
     Raises:
         InputError: unknown law, or one whose energy is no isochoric one plus U(J).
     """
     if terms is not None and name not in ("ogden", "all"):
-        raise InputError(f"--terms {terms} is of ogden only, not of {name}: leave it out")
+        raise InputError(f"--terms {terms} is for ogden only, not for {name}: leave it out")
     if name == "all":
         singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
         return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is bogen
@@ -99,7 +100,7 @@ def _candidate(label: str, law: Law) -> Candidate:
 
 
 def _sum(label: str, parts: list[Candidate]) -> Candidate:
-    """Laws that add up, each with its own numbers; parameters are named as in a scene: `1.mu` is of the second law."""
+    """Laws that add up, each with its own numbers, named as in a scene: `1.mu` is mu of the second law."""
     ends = np.cumsum([len(p.names) for p in parts])[:-1]  # as many unconstrained numbers as parameters
 
     def values(u, scale):
@@ -176,7 +177,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
     if zero:
         notes.append(f"{', '.join(zero)} held at 0 as given")
     if absent:
-        notes.append(f"{', '.join(absent)} left out: a law in FILE.py:LAW that gives them a value has them fitted")
+        notes.append(f"{', '.join(absent)} left out: to fit them, give them values in a law of your own (FILE.py:LAW)")
     told = f"{label}: fitted are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
     return fitted, (told,) if notes else ()
 

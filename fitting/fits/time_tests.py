@@ -155,7 +155,7 @@ def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
 
 
 def _corners_in_time(time: np.ndarray, driven: np.ndarray) -> np.ndarray:
-    """Points (n,) that the drive needs: its corners. Points with the same slope on both sides are left out."""
+    """Which points (n,) are corners of the driven quantity. Points with the same slope on both sides are not."""
     kept = np.ones(len(time), bool)
     middle = driven[:-2] + (driven[2:] - driven[:-2]) * (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
     kept[1:-1] = np.abs(driven[1:-1] - middle) > 1e-12 * np.max(np.abs(driven))

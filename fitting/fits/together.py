@@ -91,7 +91,7 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Scales of the relative errors of the reported numbers: the numbers; in tests in time not less than a floor."""
+    """Sizes for relative errors of the reported numbers: the numbers themselves; in tests in time with a floor."""
     _, measured, scales = reported_numbers(test)
     return scales if isinstance(test, TimeTest) else measured
 
@@ -232,7 +232,7 @@ def misfits(
 
 
 def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> Solution:
-    """The minimum with the residuals of each test over its noise: times `ratio` (K,), the noise that was used over it.
+    """The minimum with the residuals of each test divided by its noise; `ratio` (K,): noise used over noise found.
 
     Rows of a prior below take the mean ratio, as the weight of a prior is stated in the mean noise.
     """

@@ -161,7 +161,7 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
             if s is None:
                 raise InputError(
                     f"the sweeps at {celsius(temperatures[before]):.4g} and {celsius(temperatures[k]):.4g} °C do not "
-                    "lie over each other at any shift of frequency: leave one end of the temperatures out, or give "
+                    "match at any shift of frequency: leave out the temperatures on one side of this gap, or give "
                     "the factors in a column shift_factor"
                 )
             log_a[k], before = log_a[before] + s, k

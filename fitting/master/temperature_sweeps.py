@@ -89,7 +89,7 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     group[order] = np.concatenate([[0], np.cumsum(np.diff(T[order]) >= SAME)])
     factors = raw.get("shift_factor", np.full(len(T), np.nan))
     if np.any(factors <= 0):
-        raise InputError(f"{path}: a shift_factor of {factors.min():g} is none: it multiplies frequencies, above 0")
+        raise InputError(f"{path}: a shift_factor of {factors.min():g} is not above 0: it is a factor of frequencies")
     out = []
     for k in range(group.max() + 1):
         mine = group == k

@@ -90,7 +90,7 @@ def estimated(
 
 
 def _with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
-    """The reported numbers (P,) and their derivative by u, where u is: in NumPy nothing is compiled."""
+    """The reported numbers (P,) and their derivative by u. If u is NumPy's, nothing is compiled."""
     if isinstance(u, np.ndarray):
         with np.errstate(over="ignore", invalid="ignore"):  # a fit that ran away is told of by its errors
             return host.with_jacobian(natural_of, u)

@@ -159,7 +159,7 @@ Evaluate = Callable[..., tuple[np.ndarray, np.ndarray]]
 def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iterations: int = 200) -> Solution:
     """The best of the minima that `levenberg_marquardt` finds from starts (S, P), in NumPy: nothing is compiled.
 
-    Where the best has not converged yet, it goes on alone: modes that miss wide curves converge slowly.
+    If the best has not converged yet, only it is iterated further: too few modes for a wide curve converge slowly.
 
     Args:
         evaluate: of (u, *data), for example `host.with_jacobian` of a function of both.
@@ -200,7 +200,8 @@ def levenberg_marquardt_host(
 ) -> Solution:
     """The same iteration in Python, for residuals that take seconds and a start that is nearly the minimum.
 
-    `progress` is told of every evaluation. It stops where a step would gain 1e-8 of the cost: 1e-3 standard errors.
+    `progress` is called after every evaluation. It stops where a step would gain 1e-8 of the cost: 1e-3 standard
+    errors.
     """
     trial: jax.Array = start
     s: Any = None

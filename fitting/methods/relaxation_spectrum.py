@@ -4,8 +4,8 @@ nothing.
 For fixed times the moduli are linear in the strengths, so the minimum is the only one. Strengths are measured in the
 size of the data at omega = 1 / tau, and their second differences are held down by a weight. Method: Honerkamp and Weese
 (1989), Macromolecules 22. Grid and weight are those of the highest restricted likelihood (Wahba 1985, Ann. Stat. 13):
-the errors that follow from it hold the truth about as often as they say. Those of the weight that the information
-criterion would choose, a larger one, do so less often (`experiments/identification/coverage.py`).
+the errors that follow from it hold the truth about as often as they say. The information criterion would choose a
+larger weight; its errors hold the truth less often (`experiments/identification/coverage.py`).
 """
 
 from collections.abc import Sequence
@@ -119,7 +119,7 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
 
 
 def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:
-    """`GridSpectrum.evidence`: the prior leaves as many numbers free as L has columns beyond its rows."""
+    """`GridSpectrum.evidence`: the prior leaves free as many numbers as L has more columns than rows."""
     square = max(float(r @ r + np.sum((L @ x) ** 2)), 1e-300)
     with np.errstate(divide="ignore"):
         both = 2 * np.sum(np.log(np.abs(np.diag(np.linalg.qr(np.vstack([A, L]), mode="r")))))

@@ -114,7 +114,7 @@ def _farther(end: float | None, center: float, half: float) -> float | None:
 
 
 def _crossing(x: np.ndarray, rise: np.ndarray) -> float | None:
-    """First zero of `rise` walking outwards, by linear interpolation."""
+    """First place along x at which `rise` passes 0, by linear interpolation."""
     above = np.flatnonzero(rise > 0)
     if not len(above) or above[0] == 0:
         return None

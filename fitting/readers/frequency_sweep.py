@@ -161,7 +161,8 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
         return sweep._replace(notes=(*sweep.notes, note))
     if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:
         raise InputError(
-            f"{sweep.source}: {note}: nearly all of the sweep is the instrument's; measure at lower frequencies"
+            f"{sweep.source}: {note}: nearly all points show the instrument, not the sample; measure at lower "
+            "frequencies"
         )
     lowest = sweep.angular_frequency[lost].min() / (2 * np.pi)
     share = f"{100 * raw_torque.UNCERTAINTY:g} % of the inertia, which calibrations leave open"

@@ -85,7 +85,7 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
 def _offset(force: np.ndarray) -> float:
     """Mean force [N] of the first points, if the next ones have the same: the indenter does not touch there yet.
 
-    0 where the noise hides a rise of a hundredth of the largest force, or a force that the noise explains.
+    It is 0 if the noise could hide a rise of the force, or if the noise alone explains this mean.
     """
     few = max(3, len(force) // 20)
     first, after = float(np.mean(force[:few])), float(np.mean(force[few : 2 * few]))
@@ -95,7 +95,7 @@ def _offset(force: np.ndarray) -> float:
 
 
 def _margin(values: np.ndarray) -> float:
-    """How near to its largest value a held quantity comes at once: by its scatter, and a little more."""
+    """How near to its largest value a quantity counts as held: twice its noise, and 0.5 % of its range."""
     return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 

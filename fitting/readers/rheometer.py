@@ -51,7 +51,7 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
 
 
 def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
-    """Every table of a file that is a sweep, with its name; as `read_sweep` reads one."""
+    """Read every table of a file that is a sweep, as `read_sweep` does; with the name of each."""
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     return [(table.name, _sweep(str(path), table, [])) for table in tables]
 

@@ -120,8 +120,8 @@ def read_time_test(
         path: text with a header that names time and one of `FORMS`.
         kind: "relaxation" or "creep".
         sample: radius and height of a cylinder, for torque and force.
-        ramp: of a modulus or compliance: seconds in which strain or stress was raised; 0 (or None) for a step. Of two
-            columns: None, or 0 for a step at 0 s where the rows begin later.
+        ramp: for a column of modulus or compliance, seconds in which strain or stress was raised; 0 (or None) for a
+            step. For two columns: None; or 0 if the load was a step at 0 s and the rows begin later.
         start: answers before this time [s] are not fitted.
 
     Raises:
@@ -408,7 +408,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         )
     if not np.median(answer[used]) > 0:
         raise InputError(
-            f"{test.source}: most answers have the sign against the {test.kind} test's input; mend the signs"
+            f"{test.source}: most answers have the opposite sign of the {test.kind} test's input; mend the signs"
         )
     notes, before = test.notes, int(np.sum(test.time <= test.begun))
     if before > 2:

@@ -60,7 +60,7 @@ def _json_content(found: Samples) -> Content:
 
 
 def _times_of_strengths(found: Samples) -> Content:
-    """Times [s] of the strengths of a spectrum, by their names."""
+    """Relaxation time [s] of each strength of a spectrum, by the name of the strength."""
     out: Content = {}
     for fit in found.fits:
         names = (n for n in fit.kind.names if n.startswith("strengths["))

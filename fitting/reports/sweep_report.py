@@ -140,7 +140,7 @@ def own_numbers(p: Estimate | None, kind: Kind) -> Content:
 
 
 def spectrum_rows(details: Content) -> list[str]:
-    """What is told of a spectrum; nothing of other models."""
+    """Lines about a spectrum for the reader; none for other models."""
     found = details.get("spectrum")
     if not found:
         return []
@@ -154,7 +154,7 @@ def spectrum_rows(details: Content) -> list[str]:
 
 
 def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
-    """The same for a terminal, and how near the Prony modes come; those in `marked` have a star."""
+    """Lines with a model's parameters, and how near its Prony modes come; parameters in `marked` have a star."""
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):
         if not name.startswith("strengths["):

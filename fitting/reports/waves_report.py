@@ -212,7 +212,7 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
 
 
 def _short(chi2: float) -> str:
-    """Two digits behind the point, where so many mean something."""
+    """With two decimals; in scientific form from 1e4 on."""
     return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"
 
 

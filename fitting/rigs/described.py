@@ -209,7 +209,7 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     notes = [f"{w.message}" for w in said if issubclass(w.category, UserWarning)]
     notes.append(
         f"the sample's stiffness per shear modulus is {secant[0]:.4g} m, of which {100 * left_out[0] / found[0]:.2g} % "
-        "put the mesh right"
+        "correct the error of the mesh"
     )
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(

@@ -79,10 +79,10 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
 
 
 def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
-    """Estimate of what a mesh without end would add to each reading (T,) [N] or [m]; not for tracing.
+    """Estimate of what an infinitely fine mesh would add to each reading (T,) [N] or [m]; not for traced numbers.
 
-    It takes a run, and one linear solve in a richer space a step (`liverjax.simulation.mesh_error`). NaN where a
-    step shows none.
+    It takes a run, and one linear solve in a richer space a step (`liverjax.simulation.mesh_error`). It is NaN where a
+    step has no estimate.
     """
     result = lj.simulate(_with(rig, law, prony), mesh_error=True)
     assert result.mesh_error is not None

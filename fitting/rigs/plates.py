@@ -35,7 +35,7 @@ class Rig:
 
 
 def cell_size_for(radius: float, height: float) -> float:
-    """Default cell [m]: 100 to 400 nodes for any shape; geometry_factor removes the error that leaves if linear."""
+    """Default cell [m]: 100 to 400 nodes for any shape; `geometry_factor` removes their linear error."""
     return max((math.pi * radius**2 * height / 100) ** (1 / 3), radius / 6, height / 12)
 
 

@@ -108,13 +108,13 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
 
 
 def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
-    """Forces of pressures of the variance `FREE`, by those of 1 Pa and the entries of C of `TYPICAL`."""
+    """Forces of pressures with prior variance `FREE`, from forces B of 1 Pa and the C of modulus `TYPICAL`."""
     part = np.sum(shear**2) / B.shape[0]  # mean of the diagonal of C C^H
     return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B
 
 
 def _in_order(body: VoxelBody) -> np.ndarray:
-    """Unknowns of the inner nodes, slice by slice along the longest side: what acts on each other stands close."""
+    """Unknowns of the inner nodes, slice by slice along the longest side, so that coupled nodes are close."""
     nodes = np.flatnonzero(body.inner)
     voxel = body.voxel[nodes]
     longest_last = voxel[:, np.argsort(np.ptp(voxel, axis=0))]

@@ -35,7 +35,7 @@ class Patches(NamedTuple):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of how far outwards they lie (P, P) [voxels^2], as the labels have it."""
+        """Covariance (P, P) [voxels^2] of how far outwards the patches lie, from the labels alone."""
         apart = np.sum((self.centre[:, None] - self.centre[None]) ** 2, axis=-1)
         same = self.region[:, None] == self.region[None]
         return np.asarray(same * (WHOLE**2 + PATCH**2 * np.exp(-0.5 * apart / ALIKE**2)))
@@ -56,7 +56,7 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
 
     Args:
         labels: (nx, ny, nz).
-        body: its voxels hold labels; outside the nearest label goes on.
+        body: labels count at its voxels; every other voxel takes the nearest label.
         known: (R,).
         farther: how far [voxels] the edges of all regions but the largest are moved outwards.
     """
@@ -85,7 +85,7 @@ def _smoothed(place: np.ndarray) -> np.ndarray:
 
 
 def _level(above: np.ndarray, place: np.ndarray, count: int) -> float:
-    """What to add to a field so that it is positive in as much of the volume as the label has, near its voxels."""
+    """Constant to add to a field near a label, so that it is positive in as much volume as the label has."""
     reach = ndimage.find_objects(place.astype(int))[0]
     box = tuple(slice(max(0, r.start - 2), r.stop + 2) for r in reach)
     # Values within the voxels, linear between the centres.

@@ -202,7 +202,7 @@ def _integrals(
 
 
 def _with_forces(parts: list[_CutElements], kinks: int, nodes: int) -> np.ndarray:
-    """Which kinks (kinks,) bool are there: an edge through a node alone makes none."""
+    """Which kink functions (kinks,) bool are not zero: an edge that meets an element only at a node makes none."""
     size = np.zeros(kinks)
     for p in parts:
         np.add.at(size, p.functions[:, 10:] - nodes, np.einsum("eaibi->eab", p.shear)[:, range(10, 14), range(10, 14)])

@@ -132,8 +132,8 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Step (2 R + P,) of storage, loss and edges, and their covariance.
 
     Edges begin each time where the labels have them: by their place the equations are nearly linear. The derivatives by
-    the moduli are of these edges too. With those of the likeliest edges, the errors of edges would be in them twice:
-    cylinders of 2.5 voxels come out a percent stiffer.
+        the moduli are taken with these edges too. With the likeliest edges, they would count the errors of the edges
+        twice: cylinders of 2.5 voxels come out a percent stiffer.
     """
     H = now.hessian + labels
     silent = np.diagonal(H) == 0  # a region without an element of its own

@@ -2,15 +2,15 @@
 
 At frequency f the modulus of an element is g_f exp(c). g_f is the modulus of the whole organ; c = ln(size) + i (loss
 angle) is the mean of a complex nodal field (P,), the same for all frequencies. Its real and its imaginary part have the
-prior of `fitting.methods.prior`, both of the same standard deviation, which grows until chi^2 comes down to the number
-of equations (discrepancy principle; Morozov 1966), or the evidence falls: -(chi^2/n + |z|^2)/2 - ln det H. The
-deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by
-Gauss-Newton.
+prior of `fitting.methods.prior`, with the same standard deviation. Larger and larger deviations are tried. The search
+ends when chi^2 is down to the number of equations (discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n
++ |z|^2)/2 - ln det H falls. The deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the
+whitened z is sought by Gauss-Newton.
 
 The uncertainty has two parts. One comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value. The
-other is the place of what varies. The prior shows a step as a slope over its correlation length, or over a brick where
-that is longer, wherever within the slope the step is. So a place is known to this length w, with the variance w^2/12,
-and c has |w dc/dx|^2/12 of it.
+other comes from the place of a change in modulus, which is not known exactly. The prior shows a step as a slope over
+its correlation length, or over a brick where that is longer, wherever within the slope the step is. So a place is known
+to this length w, with the variance w^2/12, and c has |w dc/dx|^2/12 of it.
 """
 
 import time
@@ -333,7 +333,7 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
-    """A uniform organ, or the point of an earlier run, whose deviations before it are judged again."""
+    """Begin at a uniform organ, or at the point of an earlier run, whose earlier deviations are evaluated again."""
     start = _reached(course, np.zeros(len(course.p.root_mass), complex), 0)
     if file is None or not file.is_file():
         return _Begun(start, start, [], [])

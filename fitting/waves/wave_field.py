@@ -91,7 +91,7 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray) -> np.ndarray
 
 
 def _leave_out_rest(U: np.ndarray) -> list[str]:
-    """Make voxels NaN, in place, that do not move: many programs write so what they did not measure. Notes on it."""
+    """Set voxels that do not move to NaN, in place: many programs write 0 where they did not measure. Return notes."""
     notes, nothing = [], (U == 0) | np.isnan(U)
     still = np.all(nothing, axis=(0, 4))
     if np.any(still & np.any(U == 0, axis=(0, 4))):
@@ -129,7 +129,9 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
         known = ", ".join(sorted(key for key, value in found.items() if value is not None)) or "nothing"
         if "labels" in found and "displacement" not in found:
             known += " (real numbers are taken for labels)"
-        raise InputError(f"{name}: holds {known}: name the waves displacement (complex), or real and imag, or phases")
+        raise InputError(
+            f"{name}: it holds {known}: store the waves as displacement (complex), or real and imag, or phases"
+        )
     if U.ndim == 4:
         U = U[None]
     if U.ndim != 5 or U.shape[-1] not in (1, 3):

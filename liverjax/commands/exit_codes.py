@@ -8,15 +8,15 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from liverjax.core import programs
+from liverjax.core import program_cache
 from liverjax.core.errors import InputError
 
 
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
     """Run a command; return its exit code, 2 for unusable input and 130 for Ctrl-C.
 
-    Compiled programs are kept on disk for the next command, see `liverjax.core.programs`. Where the command names
-    `optional_files`, those of an earlier run that this one has not written again are told.
+    Compiled programs are kept on disk for the next command, see `liverjax.core.program_cache`. If the command names
+    `optional_files`, a note lists those that an earlier run has left in the folder.
 
     Args:
         run: runs the command with its options and returns 0 or 1.
@@ -27,7 +27,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         begin = time.time()
         try:
-            with programs.kept_on_disk():
+            with program_cache.kept_on_disk():
                 code = run(options)
             _tell_of_earlier_files(options, begin)
             return code
@@ -43,7 +43,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
-    """A note on what stands in the folder of results and is not of this run, which began at `begin`."""
+    """Print a note on optional files in the folder of results that are older than `begin`, the start of this run."""
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"

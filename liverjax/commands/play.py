@@ -31,7 +31,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
 def run(options: argparse.Namespace) -> int:
     """Play until Ctrl-C, or for some steps."""
     if not 0 <= options.port < 65536:
-        raise InputError(f"--port {options.port} is none: give 0 to 65535")
+        raise InputError(f"--port {options.port} is no port: give 0 to 65535")
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps} must be above 0: give e.g. 100")
     from liverjax.play import pulling

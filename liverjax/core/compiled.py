@@ -1,7 +1,7 @@
 """A function compiled for given arguments. If its program is kept on disk, it is found without tracing the function.
 
 JAX's own cache saves only the compilation. It must trace a program to find it, which takes seconds for a large one.
-Here the arguments' structure and shapes are the key, within the folder of `liverjax.core.programs`.
+Here the arguments' structure and shapes are the key, within the folder of `liverjax.core.program_cache`.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from liverjax.core import programs
+from liverjax.core import program_cache
 from liverjax.core.files import whole
 
 #: Packages whose sources the folder's name holds: nothing of another may decide what a program is.
@@ -39,7 +39,7 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any
         function: at the top of a module, or `functools.partial` of one whose keywords are fixed when compiled.
         arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept.
     """
-    folder = programs.folder()
+    folder = program_cache.folder()
     if folder is None or jax.default_backend() != "cpu":  # elsewhere JAX's own cache serves, until it is measured
         return jax.jit(function).lower(*arguments).compile()
     try:

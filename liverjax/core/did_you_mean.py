@@ -15,7 +15,7 @@ def hint(word: str, known: Iterable[str]) -> str:
 
 
 def as_word(value: object, where: str) -> str:
-    """The value, where it is text; asked before a word is looked up.
+    """Return the value if it is text; call this before a word is looked up.
 
     Args:
         value: of a scene file.

@@ -35,7 +35,7 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
 
 @contextmanager
 def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
-    """Write to the path that this gives: it stands beside `file` and becomes it at the end.
+    """Give a temporary path beside `file` to write to; at the end it is renamed to `file`.
 
     A kill leaves `file` as it was. An error leaves it as well, and removes the new file.
 

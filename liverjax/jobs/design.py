@@ -50,7 +50,9 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
     if kind not in KINDS:
         raise InputError(f"--kind {kind} is not known: use {', '.join(KINDS)}")
     if rows < 1 or not ranges:
-        raise InputError(f"--rows {rows} of {len(ranges)} parameters is nothing: give at least one of each")
+        raise InputError(
+            f"--rows {rows} with {len(ranges)} parameters makes no table: give one row and one parameter or more"
+        )
     low, high = np.array(list(ranges.values())).T
     if kind == "grid":
         along = max(2, int(np.floor(rows ** (1 / len(low)) + 1e-9)))

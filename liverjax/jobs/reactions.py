@@ -44,8 +44,8 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
 def _held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
     """Forces (T, 3) [N] of every fixed, displaced and sliding part, from those at the nodes (T, V, 3), by name.
 
-    A part has the force along the axes that it holds, a sliding one along its normal. What two parts hold at a node
-    counts in the first, so the parts add up to the force on the body.
+    A part has the force along the axes that it holds, a sliding one along its normal. If two parts hold the same axis
+    of a node, its force counts for the first alone, so the parts add up to the force on the body.
     """
     taken, found = np.zeros(reactions.shape[1:], bool), {}
 

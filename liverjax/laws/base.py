@@ -207,7 +207,7 @@ class Sum(Law):
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
     def without_volume(self):
-        """That of each law, added."""
+        """The sum of the laws, each without its U(J)."""
         return _added([part for part in (law.without_volume() for law in self.laws) if part is not None])
 
     def check(self):

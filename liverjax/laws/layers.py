@@ -40,7 +40,7 @@ def check(law: Law, name: str) -> None:
         InputError: one sentence that begins with `name`.
     """
     if any(one.fibre is not None or one.green_energy is not None for one in law.summands()):
-        raise InputError(f"{name}.law has directions, which a thin part does not know: take an isotropic law")
+        raise InputError(f"{name}.law has directions, which a thin part cannot use: take an isotropic law")
     law.check()
 
 
@@ -48,7 +48,7 @@ def in_plane_energy(law: Law, C: tuple, solved: bool) -> jax.Array:
     """Energy density (Q, m) [Pa] of a layer without stress across it.
 
     Args:
-        law: isotropic; at J = 1, or at the J that leaves no stress across where `solved`.
+        law: isotropic. It is taken at J = 1, or if `solved` at the J for which the stress across is 0.
         C: C_11, C_12, C_22 (Q, m) of the in-plane right Cauchy-Green tensor.
         solved: whether the stretch of the thickness is solved for.
     """

@@ -132,7 +132,7 @@ def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
 
 
 def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) -> Clusters | None:
-    """Clusters of the functions of elements: their numbers (n, E), places (N, 3), signs (n, E); host side."""
+    """Clusters of the elements' functions, from their numbers (n, E), places (N, 3) and signs (n, E); host side."""
     a, b = np.triu_indices(len(nodes), 1)
     pairs, elements = np.stack([nodes[a], nodes[b]]).reshape(2, -1), np.tile(np.arange(nodes.shape[1]), len(a))
     group = near_groups(places, np.unique(np.sort(pairs, axis=0), axis=1))
@@ -179,7 +179,7 @@ def _packed(group: np.ndarray) -> np.ndarray:
 
 
 def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, ...]) -> Clusters | None:
-    """Of groups of nodes (V,), with the pairs (2, n) inside them and what belongs to these."""
+    """Clusters from groups of nodes (V,) and pairs (2, n) of nodes; `sources`: arrays with an entry per pair."""
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None

@@ -25,7 +25,7 @@ def graded(length: float, cells: Mapping[float, float], largest: float, growth: 
         length: [m].
         cells: place [m] -> length of a cell there [m]; every place becomes one of the result.
         largest: no cell is longer [m].
-        growth: how much longer a cell is than one nearer to such a place, over the distance between them.
+        growth: by how much cells grow in length, per distance from such a place.
 
     Returns:
         Rising places (n,) [m].

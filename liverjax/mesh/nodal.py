@@ -85,7 +85,8 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
     """Consistent mass of an element over its mass in two parts: a diagonal (n,), and what is left (n, n).
 
-    The diagonal is the lumped mass. Functions of order 3 have none: theirs are the integrals of their squares.
+    The diagonal is the lumped mass. Functions of order 3 have no lumped mass: their entries are the integrals of their
+    squares.
     """
     whole = products(order)
     parts, lumped = np.diag(whole).copy(), _LUMPED[min(order, 2)]

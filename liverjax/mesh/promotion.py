@@ -13,8 +13,8 @@ from liverjax.mesh.tetrahedra import TetMesh
 def quadratic(mesh: TetMesh) -> TetMesh:
     """The mesh with 10 nodes in each element; a quadratic mesh is returned as it is.
 
-    The vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`. A node set takes
-    in the middles of the edges of all faces that it holds, so that a held face stays held.
+    The vertices keep their numbers, the middles of the edges follow in the order of `pattern.edges`. If a node set
+    contains the three vertices of a face, it also gets the middles of its edges, so that a fixed face stays fixed.
     """
     if mesh.order > 1:
         return mesh

@@ -99,8 +99,8 @@ def triangle_slopes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 def triangle_functions(mesh: TetMesh, l: np.ndarray) -> np.ndarray:
     """Functions (n, Q) of a triangle's nodes (`triangle_nodes`) at barycentric coordinates l (3, Q).
 
-    Of a mesh of order 3, whose functions on edges point to the higher vertex, triangles name their vertices in order
-    (`liverjax.mesh.promotion.with_faces`).
+    In a mesh of order 3 the functions on edges point to the higher vertex, so triangles must name their vertices in
+    order (`liverjax.mesh.promotion.with_faces`).
     """
     return l if mesh.order == 1 else (_quadratic if mesh.order == 2 else _ten_functions)(l)[0]
 

@@ -129,7 +129,7 @@ class TetMesh:
         return jnp.asarray((c[:, 1:] - c[:, :1]).reshape(len(c), -1).T, self.volumes.dtype)
 
     def oriented(self, values: jax.Array) -> jax.Array:
-        """Functions of order 3 on edges, among values (n, C, E), point to the higher vertex: they change their sign."""
+        """Values (n, C, E) with the signs of order-3 functions on edges, which point to the higher vertex."""
         if self.order < 3:
             return values
         t, first = self.tetrahedra, 4 + len(PAIRS)

@@ -1,1 +1,1 @@
-"""One file a physics: viscosity, porosity, averaged volumes, supports, loads and prescribed motion."""
+"""The physics, one file each: viscosity, porosity, averaged volumes, supports, loads and prescribed motion."""

@@ -7,6 +7,8 @@ A scene has a tuple of physics. Each has a memory between steps, and parts that 
 * `advance(memory, acting, end)` -> memory: after an accepted step;
 * `check(...)`: refuses what no step can use, with one sentence.
 
+Loads and motions change during a step: they are asked for at part s of it, 0 at its beginning and 1 at its end.
+
 The acting parts are of three kinds. Step, tangent and energy are sums over them and know nothing else.
 
 * `Solid` and `VolumeStress` act in elements, before assembly: stress and blocks of the stiffness.
@@ -199,8 +201,9 @@ class NodalForce:
         return without_negative(own) if isinstance(own, Attached) else own
 
     def gives_way(self, mesh: TetMesh, x: jax.Array, s: Number, definite: bool) -> GivesWay | None:
-        """The loss of stiffness by a number that adapts to motion (`definite`: that of the definite form); None:
-        nothing adapts."""
+        """The loss of stiffness by an unknown that follows the motion, such as an obstacle's travel (`definite`: that
+        of the form without negative eigenvalues); None: there is no such unknown.
+        """
         return None
 
     def predicted(self) -> jax.Array | None:

@@ -90,7 +90,7 @@ def right_side(flow: Flow, b: jax.Array) -> jax.Array:
 
 
 def lack(flow: Flow, b: jax.Array, pressure: jax.Array) -> jax.Array:
-    """b - A P (V,) of all pressures P (V,) [Pa]; where they are given, what they lack, so that a solution leaves 0."""
+    """Residual b - A P (V,) for pressures P (V,) [Pa]; where a pressure is given, its error. A solution has 0."""
     own = flow.mask * pressure
     error = own - pressure if flow.given is None else own - pressure + flow.given
     return right_side(flow, b) - flow.mask * flow_product(flow, own) + error

@@ -49,7 +49,7 @@ class Inertia(Physics):
         return Moving(mass=mass, shared=shared, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
-        """Masses (V,) [kg] of the nodes, and what elements have beside them."""
+        """Masses (V,) [kg] of the nodes, and the rest of the elements' consistent mass (None if lumped)."""
         if self.mass == "lumped":
             return self.density * nodal_volumes(mesh), None
         density, (parts, matrix) = jnp.asarray(self.density), mass_parts(mesh.order)
@@ -126,7 +126,7 @@ class Moving(NodalForce):
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """The same of what elements have beside."""
+        """The same k/dt^2 times the masses that the nodes of an element share."""
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

@@ -115,7 +115,7 @@ class Loading(NodalForce):
         return not follows(self.traction)
 
     def fraction(self, s: Number) -> Any:
-        """Part of the loads that acts at part s of the step."""
+        """The fraction of the loads that acts at part s of the step (0: its beginning, 1: its end)."""
         if self.growth == "steps":
             return (self.k - 1 + s) / self.steps
         dtype = self.dead.dtype

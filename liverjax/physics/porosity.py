@@ -137,7 +137,7 @@ def check_sponge(porosity: Porosity) -> None:
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
     """The law beside the sponge. It has no volumetric energy U(J) of its own, unless asked for, since bulk would count
-    twice: every summand is without it. What has its volume in one with its shear stays whole."""
+    twice: every summand is without it. A law that does not separate volume change from shear stays whole."""
     if porosity is None or porosity.keep_bulk:
         return law
     return law.each(lambda own: own.without_volume() or Volumetric(bulk=0.0))

@@ -1,4 +1,5 @@
-"""Prony viscohyperelasticity (chapter, section 4.2): S_v = S_h - sum_k gamma_k, one symmetric tensor of memory a mode.
+"""Prony viscohyperelasticity (chapter, section 4.2): S_v = S_h - sum_k gamma_k. Mode k remembers the symmetric tensor
+gamma_k.
 
 Both recursions have the form gamma^n = a S^n + c S^(n-1) + b gamma^(n-1):
 
@@ -100,7 +101,7 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Refuse ratios and times that are no Prony series; host side. Of traced numbers only the counts are looked at.
+    """Refuse ratios and times that are no Prony series; host side. If they are traced, only their counts are checked.
 
     Raises:
         InputError: lengths that differ, values out of bounds, ratios adding up to 1 or more.

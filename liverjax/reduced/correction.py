@@ -111,13 +111,13 @@ def _leverage(a: jax.Array, inverse: jax.Array) -> jax.Array:
 
 
 def _logarithms(corrected: jax.Array, moved: jax.Array, leverage: jax.Array) -> jax.Array:
-    """What the stated error is told from (R, 3): part that is corrected, displacement, leverage; all above 0."""
+    """Logarithms (R, 3) that give the stated error: of the relative correction, the displacement and the leverage."""
     tiny = jnp.finfo(moved.dtype).tiny
     return jnp.log(jnp.maximum(jnp.stack([corrected / moved, moved, leverage], axis=1), tiny))
 
 
 class _LeftOut(NamedTuple):
-    """Of every run (R,), by the polynomial without its group."""
+    """Errors of every run (R,), by the polynomial that is learnt without its group."""
 
     off: np.ndarray  # largest error [m]
     corrected: np.ndarray  # largest correction [m]
@@ -164,7 +164,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
 def _left_out(
     A: np.ndarray, sums: "_LeastSquares", group: np.ndarray, missing: np.ndarray, fields: np.ndarray
 ) -> _LeftOut:
-    """How far off each group of runs is, by the polynomial of the others: of terms A (R, T, k)."""
+    """Errors of every run, by the polynomial that is learnt without its group; terms A (R, T, k)."""
     found = np.zeros((3, len(A)))
     for g in range(len(sums.squares)):
         own = group == g
@@ -218,7 +218,7 @@ class _LeastSquares(NamedTuple):
 
 
 def _least_squares(A: np.ndarray, parts: np.ndarray, moved: np.ndarray, group: np.ndarray) -> _LeastSquares:
-    """Of terms A (R, T, k) and parts (R, T, m) of runs in groups (R,), each over its largest displacement (R,)."""
+    """Normal equations of terms A (R, T, k) and parts (R, T, m); each run counts by its largest displacement (R,)."""
     size = np.sqrt(np.mean(A**2, axis=(0, 1)))
     size = np.where(size > 0, size, 1.0)
     weight = (1 / moved / np.sqrt(np.mean(1 / moved**2)))[:, None, None]

@@ -113,7 +113,7 @@ def _correction(stored: "h5py.File") -> Correction | None:
 
 
 def _pressures(stored: "h5py.File") -> PressureModes | None:
-    """Modes of the pressure of an open file, where it has some."""
+    """Read the modes of the pressure from an open file; None if it has none."""
     if "pressures" not in stored:
         return None
     return PressureModes(**{name: jnp.asarray(stored["pressures"][name][()]) for name in _PRESSURES})

@@ -177,7 +177,7 @@ def nonnegative_weights(G: np.ndarray, volumes: np.ndarray, tolerance: float) ->
     from scipy.optimize import nnls
 
     if not len(G):
-        raise InputError("the runs leave nothing to choose elements by: give two rows or more, with other numbers")
+        raise InputError("the runs give no forces to choose points from: give two rows or more, with different numbers")
     # Rows of length 1: small vectors count as much as large ones.
     V = principal_fields(G, tolerance)
     V = np.concatenate([V, volumes[None] / np.linalg.norm(volumes)])

@@ -27,7 +27,7 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class ReducedMotion(NamedTuple):
-    """Velocity and acceleration of the coordinates (n,), and how the acceleration goes on."""
+    """Velocity and acceleration of the coordinates (n,), and the last change of the acceleration."""
 
     velocity: jax.Array  # [m/s]
     acceleration: jax.Array  # [m/s^2]

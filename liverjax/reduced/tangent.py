@@ -1,9 +1,9 @@
 """The tangent of a reduced step: products with it, and a near inverse that takes half the time.
 
-The tangent is K = sum_p B_p^T A_p B_p + R, with slopes B_p of the modes and moduli A_p at the points p. To make it
-takes as long as ten products with it. In single precision it takes half of that. The inverse of that matrix is near:
-it serves Newton's method, and exact solves by a few corrections x + N (b - K x), with products in double precision
-(iterative refinement: Wilkinson 1963).
+The tangent is K = sum_p B_p^T A_p B_p + R, with slopes B_p of the modes and moduli A_p at the points p. To assemble K
+takes as long as ten products with it, and half of that in single precision. The inverse of the single-precision matrix
+is nearly that of K: it serves Newton's method, and exact solves by a few corrections x + N (b - K x), with products in
+double precision (iterative refinement: Wilkinson 1963).
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class ReducedTangent(NamedTuple):
 
 
 def in_single_precision(slopes: jax.Array) -> SinglePrecision:
-    """Of slopes (9, S, n)."""
+    """The slopes (9, S, n) in single precision."""
     light = jax.lax.stop_gradient(slopes).astype(jnp.float32)
     return SinglePrecision(light, light.reshape(-1, light.shape[-1]).T)
 

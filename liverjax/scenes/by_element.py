@@ -73,7 +73,7 @@ def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_e
 
 
 def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: TetMesh) -> Porosity:
-    """The porosity with one number an element (E,), or (1, E) of quadratic ones, where a region has its own."""
+    """The porosity; numbers that a region changes have one value per element, (E,), or (1, E) if quadratic."""
     found: Content = {}
     for region in regions:
         for name, value in (region.porosity or {}).items():
@@ -84,5 +84,5 @@ def porosity_of_elements(porosity: Porosity, regions: tuple[Region, ...], mesh: 
 
 
 def sponge_at_points(porosity: Porosity, mesh: TetMesh) -> Porosity:
-    """The porosity, its numbers by element as they go with arrays over the points."""
+    """The porosity; its numbers by element get the axes that arrays over the points have."""
     return replace(porosity, **mesh.at_points({name: getattr(porosity, name) for name in POROUS}))

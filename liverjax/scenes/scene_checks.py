@@ -140,7 +140,7 @@ def _loaded(scene: Scene) -> None:
     if scene.points_are == "loaded" and scene.porosity is not None:
         raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
     if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
-        raise InputError('[mesh] is = "loaded" knows no nodes that move together: leave the rigid plate out')
+        raise InputError('[mesh] is = "loaded" cannot have nodes that move together: leave the rigid plate out')
 
 
 def _check_traction(load: Traction, name: str) -> None:
@@ -288,7 +288,7 @@ def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Refuse numbers with which physics hold a body at rest less than `before` (see `holding`), and too little.
+    """Refuse numbers if with them the physics hold a static body less than `before` (see `holding`) and not enough.
 
     Raises:
         InputError: nothing holds a connected piece any more.

@@ -133,7 +133,7 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Sizes [N] of the forces of a stretch along x and of rounded positions; the tolerance needs them without loads."""
+    """Sizes [N] of the forces by a stretch along x and by rounded positions: the tolerance without loads."""
     mesh, law = scene.mesh, law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)

@@ -4,8 +4,8 @@ The positions of a step, with nothing added, are put into quadratic elements (th
 ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot show.
 A reaction changes by its derivative along du. Memories of viscosity, fluid and inertia go along with the richer run.
 A surface that touches an obstacle does so at other points in the richer space: there, solves go on until these are
-found. With the points of one solve alone, the stated error of a flat punch's force was a quarter, the true one a
-hundredth.
+found. With only the contact points of the first solve, the stated error of a flat punch's force was 1/4; the true error
+was 1/100.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
 moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds

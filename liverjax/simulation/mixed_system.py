@@ -36,7 +36,7 @@ def coupled(
         own: 3 x 3 blocks of (V,) that nodes add to the diagonal, entries None where 0; or None.
         F: deformation gradient at the end of the step.
         pressures: matrix of the pressure equation.
-        slope: of what the pressures work on, by J (E,).
+        slope: derivative by J (E,) of the quantity that the pressures act on.
     """
     q = [scale(slope * mesh.volumes / 4, g) for g in volume_gradients(mesh, F)]
     bordered = {}
@@ -123,8 +123,8 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> jax.Array:
     """Stiffness [Pa/m^3] of every point against a change of its volume where nothing flows between elements.
 
-    C is the matrix of the pressures. Its diagonal is shared out by volume, so that the sum of the elements is not
-    softer.
+    C is the matrix of the pressures. Its diagonal is divided among the elements in proportion to their volumes, so that
+    their sum is not softer than the true matrix.
     """
     share = integrals(mesh, jnp.ones_like(mesh.volumes)) * mask / C.diagonal[0][0]
     return interpolated(mesh, share) / mesh.weights

@@ -51,7 +51,7 @@ Kind = str | tuple[str, jax.Array]
 
 
 def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
-    """`make` of a kind. Where it is chosen when the program runs, both are in it; what follows is there once."""
+    """Call `make` for a kind. A kind chosen at run time puts both into the program, and what follows once."""
     if isinstance(kind, str):
         return make(kind)
     name, taken = kind
@@ -471,7 +471,7 @@ def _one_of_both(
 
 
 def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """The same by a factorisation. Where pressures depend on motion, it is of the coupled matrix, and b may be too."""
+    """Solve K dq = b by a factorisation, of the coupled matrix if pressures depend on the motion (b may have them)."""
     n, volume, nothing = 3 * e.mesh.number_of_nodes, volume_with_pressures(e), jnp.ones(0)
     # The factorised matrix is of pressures that push inwards, and of minus their balance.
     unit = 1.0 if e.mixed is None else -e.mixed.unit

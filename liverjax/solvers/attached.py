@@ -27,7 +27,7 @@ class GivesWay(NamedTuple):
 
 
 class Masses(NamedTuple):
-    """Mass of all elements beside a diagonal one, or its stiffness over a time step: the same along every axis."""
+    """What the mass of the elements has beside a diagonal mass, or the stiffness that it gives in a time step."""
 
     nodes: jax.Array  # (n, E)
     signs: jax.Array  # (n, E) of functions that have a direction

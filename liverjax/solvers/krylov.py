@@ -135,7 +135,7 @@ class Earlier(NamedTuple):
     solutions: jax.Array  # (EARLIER, m)
 
     def combined(self, b: jax.Array) -> jax.Array:
-        """The combination (m,) of solutions whose loads come nearest to b (n,): by Gram and Schmidt, twice."""
+        """The combination (m,) of earlier solutions whose load is nearest to b (n,), by Gram-Schmidt, applied twice."""
 
         def add(c, pair):
             Q, Y, b, x, k = c

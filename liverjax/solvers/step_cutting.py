@@ -156,7 +156,7 @@ def solve(
 
 
 def _foretold(vector: jax.Array, before: jax.Array) -> jax.Array:
-    """The part of a vector, from 0 to 1, that the vector before it foretold."""
+    """How much of a vector the vector before it predicted, from 0 to 1."""
     square = jnp.vdot(before, before)
     return jnp.clip(jnp.vdot(vector, before) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
 

@@ -108,7 +108,9 @@ def harmonic(
     if motion.shape not in (mesh.points.shape, (number, *mesh.points.shape)):
         raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape} or one more axis of frequencies")
     if about is not None and scene.porosity is not None and not _drains(scene.porosity):
-        raise InputError("a sealed sponge under load keeps a pressure that about does not tell: give porosity.drained")
+        raise InputError(
+            "about does not give the pressure that a sealed sponge under load keeps: give porosity.drained"
+        )
     if about is not None and jnp.shape(about) != mesh.points.shape:
         raise InputError(f"about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}")
     motion = jnp.broadcast_to(motion, (number, *mesh.points.shape))
@@ -206,7 +208,7 @@ def _drains(porosity: Porosity) -> bool:
 
 
 def _at_rest(physics: Physics) -> Physics:
-    """The same physics without a history: a support as stiff as it is named, an obstacle where it begins."""
+    """The same physics without a history: a support with its own stiffness, an obstacle at its place at time 0."""
     changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
     if isinstance(physics, Obstacle):
         changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}

@@ -123,7 +123,7 @@ def _free_unknowns(A: Any) -> np.ndarray:
 
 
 def _digest(A: Any) -> bytes:
-    """The same for the same numbers."""
+    """Digest of all arrays of A: it is equal for equal numbers."""
 
     def of_leaf(leaf: np.ndarray) -> bytes:
         return hashlib.blake2b(np.ascontiguousarray(leaf).data, digest_size=16).digest()
@@ -224,7 +224,7 @@ def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) ->
 
 
 def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept: tuple[bytes, bool]) -> np.ndarray:
-    """The solution, with the factor kept for the next one: under which key, and whether in 16 bits."""
+    """The solution; its factor is kept for later calls (`kept`: the key, and whether 16 bits are enough)."""
     for single in (True, False):
         if single and K.shape[0] < multifrontal.SINGLE_FROM:
             continue

@@ -23,7 +23,7 @@ GENERAL = 6.0
 
 
 class Label(NamedTuple):
-    """A model with its number of modes, where it is made of modes."""
+    """The name of a model, and its number of modes if it is made of modes (else 0)."""
 
     name: str
     modes: int = 0
@@ -66,5 +66,5 @@ class OfAKind(Protocol):
 
 
 def label_of(fit: OfAKind) -> Label:
-    """The label of a fit; the number of modes is told of Prony modes alone."""
+    """The label of a fit; only Prony modes have a number of modes."""
     return Label(fit.kind.name, fit.modes if fit.kind.values is None else 0)

@@ -66,7 +66,7 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
 
 
 def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = None) -> Fit:
-    """A smooth spectrum that is not negative, at 2 or 3 times a decade; `found` where it is there already."""
+    """Fit a smooth, non-negative spectrum with 2 or 3 relaxation times per decade; `found`: one computed before."""
     found = found or relaxation_spectrum.fit(sweep)
     solid = int(found.equilibrium > 0)
     strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]

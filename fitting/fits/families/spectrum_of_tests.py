@@ -1,7 +1,7 @@
 """A smooth spectrum on a fixed grid of relaxation times, from a test in time or from several tests together.
 
-Stress is linear in the strengths, so sweeps and relaxation are solved at once (`relaxation_spectrum`). Strain of a
-driven stress and shear waves are not linear: there the same problem is solved for the tangent, again and again.
+Stress is linear in the strengths, so sweeps and relaxation are solved at once (`relaxation_spectrum`). Creep and shear
+waves are not linear in the strengths: for them the linearised problem is solved repeatedly.
 """
 
 from collections.abc import Callable, Sequence

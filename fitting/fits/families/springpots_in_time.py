@@ -125,7 +125,7 @@ class _Springpot(NamedTuple):
 
 
 def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: bool) -> _Springpot:
-    """A model at its minimum; `over_noise`: the residuals are over their noise, which is not to be found."""
+    """A model at its minimum; `over_noise`: residuals are divided by a known noise, so none is estimated."""
     free = jnp.array(case.free)
     solution = whole._replace(u=whole.u[free], jacobian=whole.jacobian[:, free])
 
@@ -242,7 +242,7 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 
 def _left_free(fit: TimeFit | Together) -> list[str]:
-    """A sentence on numbers that the data leave free. Those of a spectrum are held by its prior."""
+    """A sentence on numbers that the data leave free. Those of a spectrum never are: its prior holds them."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, models.determined(fit.parameters), strict=True) if not ok]

@@ -45,7 +45,7 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
-    """A sentence where no model can fit much better: most of the misfit lies in the data."""
+    """A sentence that no model can fit much better, because most of the misfit lies in the data."""
     errors, closer = fit.relative_errors(sweep), fit.kind.effective is None
     return (
         f"{MISSES} by {100 * errors.mean():.2g} % on average and by {100 * errors.max():.3g} % at most; the best "

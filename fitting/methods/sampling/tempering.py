@@ -1,9 +1,10 @@
 """Samples of a posterior by tempering: particles of the prior, led to the posterior in steps.
 
 The likelihood is raised to a power that grows from 0 to 1. Each step resamples the particles by the weights that it
-gives them, and moves them by differential evolution until they have forgotten where they were (Del Moral, Doucet and
-Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18, 435). Runs begin at the
-prior. So they agree only if each has found the whole posterior, with its tails and all of its maxima. It needs only a
+gives them, and moves them by differential evolution until they are nearly independent of where they were (Del Moral,
+Doucet and Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18, 435). Runs
+begin at the prior. So they agree only if each has found the whole posterior, with its tails and all of its maxima. It
+needs only a
 density that takes many points at once: no derivative, nothing to tune or to compile.
 """
 
@@ -107,7 +108,7 @@ def _rise(likelihood: np.ndarray, left: float) -> float:
 
 
 def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Places of the particles that go on (systematic resampling)."""
+    """Indices of the particles that are kept (systematic resampling)."""
     w = np.cumsum(np.exp(log_weights - log_weights.max()))
     ticks = (np.arange(len(w)) + rng.random()) / len(w) * w[-1]
     return np.minimum(np.searchsorted(w, ticks), len(w) - 1)

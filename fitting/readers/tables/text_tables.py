@@ -91,12 +91,12 @@ def decimal_sign(cells: Iterable[str]) -> str | None:
 
 
 def to_number(text: str, delimiter: str, sign: str | None = None) -> float | None:
-    """A number, with a decimal comma or with thousands apart; NaN for an empty cell; None for any other text.
+    """A number, also with a decimal comma or with separated thousands; NaN for an empty cell; None for any other text.
 
     Args:
         text: a cell.
         delimiter: of the cells.
-        sign: `decimal_sign` of the table; where it is not known, one comma or point is that of decimals.
+        sign: `decimal_sign` of the table; if it is None, a single comma or point is the decimal sign.
     """
     text = text.strip().strip('"').strip()
     if text.lower() in EMPTY:

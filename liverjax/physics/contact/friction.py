@@ -163,7 +163,7 @@ class Rubbing(Touching):
 
 
 def _of_slip(trial: jax.Array) -> jax.Array:
-    """Of slips (3, Q, m), never 0."""
+    """Size (Q, m) of slips (3, Q, m), never 0."""
     return jnp.sqrt(jnp.maximum(jnp.sum(trial * trial, axis=0), 1e-200))
 
 

@@ -261,7 +261,7 @@ def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
 
 
 def _rule(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Between three points a surface of order 3 would pass into the obstacle."""
+    """Weights and points of contact on a triangle; with three, a surface of order 3 could enter between them."""
     return triangle_rule() if mesh.order == 3 else _POINTS
 
 

@@ -67,14 +67,14 @@ class PressedObstacle(Obstacle):
             raise InputError(f"{name} force = {self.force} must be three numbers in N, not all 0: give them")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Besides: a body in the way."""
+        """Refuse also a force that leads the obstacle past the body."""
         super().check_place(mesh, name)
         if not self._meets(mesh):
             force = np.asarray(self.force, float).tolist()
             raise InputError(f"{name} force = {force} presses it past the body: turn it or move position")
 
     def _meets(self, mesh: TetMesh) -> bool:
-        """Whether the obstacle comes to the surface on its way."""
+        """Whether the obstacle reaches the surface when it moves along its force."""
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         travel = 0.0
         far = size + max(float(_gap_after(self, mesh, travel)), 0.0)
@@ -107,7 +107,7 @@ class PressedObstacle(Obstacle):
         return jnp.maximum(whole * factor, 0.0)
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
-        """None is given."""
+        """Zero: no motion is prescribed."""
         return jnp.zeros(3)
 
     def begin(self, start: Start) -> jax.Array:

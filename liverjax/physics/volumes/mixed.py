@@ -154,7 +154,7 @@ class Mixed(VolumeStress):
         return given(jnp.zeros_like(pressure), mesh.tetrahedra.T, jnp.stack(shares))
 
     def diagonal(self, mesh: TetMesh) -> jax.Array:
-        """Of `compliance` (V,) [m^3/Pa]."""
+        """Diagonal (V,) [m^3/Pa] of `compliance`."""
         none = jnp.zeros_like(self.before)
         if mesh.order == 1:
             share = jnp.stack(4 * [mesh.volumes * (2 / self.rest + 0.75 / self.shear) / 20])
