@@ -37,8 +37,8 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
         return jnp.asarray(free_places(mesh, fixed, displaced), mesh.points.dtype)  # no small programs to compile
     mask = jnp.ones(mesh.points.shape, mesh.points.dtype)
     for condition in (*fixed, *displaced):
-        for axis in condition.axes:
-            mask = mask.at[condition.nodes, AXES.index(axis)].set(0.0)
+        axes = np.array([AXES.index(axis) for axis in condition.axes])
+        mask = mask.at[jnp.asarray(condition.nodes)[:, None], axes].set(0.0)
     return mask
 
 
@@ -60,12 +60,12 @@ def prescribed(mesh: TetMesh, displaced: tuple, time: Number, fraction: Number) 
     """
     u = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     for condition in displaced:
-        for axis in condition.axes:
-            k = AXES.index(axis)
-            if condition.by is not None:
-                part = fraction if condition.history is None else entry_at(time, condition.times, condition.history)
-                value = jnp.asarray(condition.by, u.dtype)[..., k] * part
-            else:
-                value = jnp.interp(time, condition.times, jnp.asarray(condition.history)[:, k])
-            u = u.at[condition.nodes, k].set(value)
+        axes = np.array([AXES.index(axis) for axis in condition.axes])
+        if condition.by is not None:
+            part = fraction if condition.history is None else entry_at(time, condition.times, condition.history)
+            value = jnp.asarray(condition.by, u.dtype)[..., axes] * part
+        else:
+            history = jnp.asarray(condition.history)
+            value = jnp.stack([jnp.interp(time, condition.times, history[:, k]) for k in axes])
+        u = u.at[jnp.asarray(condition.nodes)[:, None], axes].set(value)
     return u

@@ -44,6 +44,7 @@ class Equations(NamedTuple):
     free: Free
     noise: Number  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
     roundoff: jax.Array  # [N] of positions rounded to their digits
+    moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed before and after the step
 
     @property
     def mesh(self) -> TetMesh:
@@ -193,19 +194,29 @@ def _of_physics(scene: Scene, physics: tuple[Physics, ...], state: State, k: Num
         free=free,
         noise=20 * float(np.finfo(np.float64).eps) / tolerance * sizes.unit_strain,
         roundoff=sizes.roundoff,
+        moved=_prescribed_motion(scene, k),
     )
+
+
+def _prescribed_motion(scene: Scene, k: Number) -> tuple[jax.Array, jax.Array] | None:
+    """Displacements (V, 3) [m] before and after step k, or `None` if nothing is moved."""
+    if not scene.displaced:
+        return None
+    solve = scene.solve
+    before, after = (
+        prescribed(scene.mesh, scene.displaced, 0.0 if solve.dt is None else solve.dt * n, n / solve.steps)
+        for n in (k - 1, k)
+    )
+    return before, after
 
 
 def positions(e: Equations, q: jax.Array, s: Number) -> jax.Array:
     """Positions (V, 3) from unknowns q (3 V,) and the held nodes, at part s of the step."""
-    held, solve, free = e.mesh.points, e.scene.solve, e.free
+    held, free = e.mesh.points, e.free
     q = q[: 3 * e.mesh.number_of_nodes]
-    if e.scene.displaced:
+    if e.moved is not None:
         # Straight from beginning to end: a history may bend within the step, and only its end counts.
-        before, after = (
-            prescribed(e.mesh, e.scene.displaced, 0.0 if solve.dt is None else solve.dt * n, n / solve.steps)
-            for n in (e.k - 1, e.k)
-        )
+        before, after = e.moved
         held = held + before + s * (after - before)
     x = free.mask * jnp.stack(columns(q), axis=-1) + (1 - free.mask) * held
     if free.normals is not None:
