@@ -255,3 +255,98 @@ def test_places_and_shapes_made_in_python_are_refused_in_one_sentence(change, se
     with pytest.raises(lj.InputError, match="^" + re.escape(sentence)) as caught:
         lj.check_scene(replace(scene, **change))
     assert "\n" not in str(caught.value)
+
+
+PULLED = lj.Scene(
+    mesh=MESH,
+    law=lj.laws.NeoHookean(mu=770.0, bulk=2200.0),
+    viscosity=lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.05])),
+    fixed=(lj.Fixed(nodes=MESH.node_sets["z_min"]),),
+    displaced=(lj.Displaced(nodes=MESH.node_sets["z_max"], by=jnp.array([0.0, 0.0, 0.01])),),
+    solve=lj.Solve(dt=0.05, steps=2),
+)
+SPONGE = replace(SOUND.porosity, drained=MESH.node_sets["z_max"])
+
+
+def _moved(**given) -> dict:
+    return {"displaced": (replace(PULLED.displaced[0], **given),)}
+
+
+#: What a run cannot mean. Each of them ran to the end once, with another model, motion or number of nodes.
+MEANINGLESS = (
+    (
+        {"viscosity": replace(PULLED.viscosity, part="volumetric")},
+        "viscosity.part = 'volumetric' is not known: use all or",
+    ),
+    (
+        {"viscosity": replace(PULLED.viscosity, scheme="backward-euler")},
+        "viscosity.scheme = 'backward-euler' is not known",
+    ),
+    (
+        {"viscosity": lj.Prony(ratios=0.5, relaxation_times=0.1)},
+        "viscosity.ratios = 0.5 is one number: give one of each",
+    ),
+    (
+        {"law": lj.laws.typical("saint_venant_kirchhoff"), "viscosity": replace(PULLED.viscosity, part="isochoric")},
+        "viscosity part = 'isochoric' needs a law with an isochoric part",
+    ),
+    (
+        {"porosity": replace(SPONGE, scheme="Implicit")},
+        "porosity.scheme = 'Implicit' is not known: use implicit or lagged",
+    ),
+    ({"porosity": replace(SPONGE, limit_bulk=300.0)}, "porosity limit_bulk = 300 must be above bulk = 400"),
+    ({"porosity": replace(SPONGE, bulk=jnp.array([400.0] * 5 + [2300.0]))}, "porosity limit_bulk = 2200 must be above"),
+    (
+        {"porosity": replace(SPONGE, drained=jnp.array([1, 990]))},
+        "porosity.drained names node 990, the mesh has 0 to 7",
+    ),
+    (_moved(by=jnp.array([0.01, 0.02])), "displaced.0 by has shape (2,): give three numbers in m, or three a node"),
+    (_moved(by=jnp.zeros(4)), "displaced.0 by has shape (4,)"),
+    (_moved(by=[0.01, 0.02]), "displaced.0 by has shape (2,)"),
+    (_moved(by=0.01), "displaced.0 by has shape ()"),
+    (_moved(by=jnp.zeros((3, 3))), "displaced.0 by has shape (3, 3)"),
+    (_moved(nodes=jnp.array([4, 700])), "displaced.0.nodes names node 700, the mesh has 0 to 7"),
+    (_moved(axes="XYZ"), "displaced.0 axes = 'XYZ' is not known: give some of the letters xyz"),
+    ({"fixed": (lj.Fixed(nodes=jnp.array([0, 1]), axes=""),)}, "fixed.0 axes = '' is not known"),
+    ({"fixed": (lj.Fixed(nodes=jnp.array([0.0, 1.0])),)}, "fixed.0.nodes has numbers of type float64"),
+    (
+        {"traction": (lj.Traction(triangles=jnp.array([[0, 1, 30]]), pressure=4.0),)},
+        "traction.0.triangles names node 30",
+    ),
+    (
+        {"physics": (Obstacle(triangles=jnp.array([[0, 1, 3]]), shape="Plane", position=jnp.zeros(3)),)},
+        "obstacle.0.shape",
+    ),
+    (
+        {"physics": (SlidingSupport(nodes=jnp.array([0]), axis="Z"),)},
+        "support.0.axis = 'Z' is not known: use x, y or z",
+    ),
+    (
+        {"mesh": lj.tet_mesh(np.asarray(MESH.points), np.asarray(MESH.tetrahedra)[:, [1, 0, 2, 3]])},
+        "mesh has 6 elements",
+    ),
+)
+
+
+@pytest.mark.parametrize(("change", "sentence"), MEANINGLESS, ids=[sentence[:40] for _, sentence in MEANINGLESS])
+def test_runs_refuse_what_means_nothing(change, sentence):
+    with pytest.raises(lj.InputError, match="^" + re.escape(sentence)):
+        lj.simulate(replace(PULLED, **change))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"law.mu": [770.0, -100.0]}, "lane 1: law.mu = -100.0 must be above 0 Pa"),
+        ({"viscosity.ratios.0": [0.5, 1.7]}, "lane 1: viscosity.ratios = [1.7] must be at most 1"),
+        ({"displaced.0.by": [[0.01, 0.02], [0.0, 0.01]]}, "lane 0: displaced.0 by has shape (2,)"),
+    ],
+)
+def test_every_lane_of_a_batch_is_checked(parameters, sentence):
+    with pytest.raises(lj.InputError, match="^" + re.escape(sentence)):
+        lj.simulate_batch(PULLED, parameters)
+
+
+def test_numbers_to_differentiate_by_are_checked():
+    with pytest.raises(lj.InputError, match=r"^law\.bulk = -500\.0 must be above 0 Pa"):
+        lj.value_and_gradient(lambda result: result.reactions.sum(), PULLED, {"law.bulk": -500.0})

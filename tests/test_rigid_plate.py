@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core import bounds
 from fitting.rigs import torsion
 from fitting.rigs.torsion import Drive
 from liverjax.core.struct import replace
@@ -117,7 +118,9 @@ REFUSED = {
 @pytest.mark.parametrize("sentence", REFUSED)
 def test_what_no_plate_can_use_is_refused(rig, sentence):
     with pytest.raises(lj.InputError, match=sentence):
-        _plate(rig, **REFUSED[sentence]).check(rig.mesh, "plate.0")
+        plate = _plate(rig, **REFUSED[sentence])
+        bounds.check(plate, "plate.0")
+        plate.check(rig.mesh, "plate.0")
 
 
 def test_a_factorisation_is_refused(rig):

@@ -61,10 +61,14 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         value: a number, an array, or a sequence of such; a traced one passes.
 
     Raises:
-        InputError: not a number, not finite, out of bounds.
+        InputError: not a number, not finite, out of bounds, none of the words that a static field may be.
     """
     lower = metadata.get("lower")
     if metadata.get("static"):
+        words = metadata.get("words")
+        if words and value not in words:
+            *first, last = filter(None, words)
+            raise InputError(f"{where} = {value!r} is not known: use {', '.join(first)} or {last}")
         whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
         if lower is not None and not (whole and value >= lower):
             raise InputError(f"{where} = {value!r} must be a whole number above {lower - 1}: give {lower} or more")

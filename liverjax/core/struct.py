@@ -21,12 +21,15 @@ Indices = Array
 Content = dict[str, Any]
 
 
-def static(default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None) -> Any:
+def static(
+    default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None, words: Sequence[str] = ()
+) -> Any:
     """A field that is part of the structure (a tag, a count): changing it compiles anew, it has no gradient.
 
-    With `lower` it is a whole number, at least that (see `liverjax.core.bounds`).
+    With `lower` it is a whole number, at least that; with `words` it is one of them (see `liverjax.core.bounds`).
     """
-    return dataclasses.field(default=default, metadata={"static": True, "about": about, "lower": lower})
+    metadata = {"static": True, "about": about, "lower": lower, "words": tuple(words)}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def param(

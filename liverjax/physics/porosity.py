@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from liverjax.core import bounds, history
 from liverjax.core.errors import InputError
@@ -61,7 +62,7 @@ class Porosity(Physics):
     drained: Indices | None = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
     inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
     initial_pressure: Number | None = param("Pa", "of the fluid at the beginning; None: 0", default=None)
-    scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)")
+    scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)", words=SCHEMES)
     keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy beside that of the sponge")
 
     def __post_init__(self) -> None:
@@ -111,8 +112,6 @@ def check(porosity: Porosity) -> None:
     Raises:
         InputError: unknown scheme, values out of bounds, K_lim not above K0.
     """
-    if porosity.scheme not in SCHEMES:
-        raise InputError(f"porosity scheme = {porosity.scheme!r} is not known: use {' or '.join(SCHEMES)}")
     check_sponge(porosity)
     for k, inlet in enumerate(porosity.inlet):
         name = f"porosity.inlet.{k}"
@@ -124,15 +123,29 @@ def check(porosity: Porosity) -> None:
 
 
 def check_sponge(porosity: Porosity) -> None:
-    """Refuse numbers of a sponge that no step can use; host side.
+    """Refuse numbers of a sponge that no step can use; traced ones pass.
 
     Raises:
         InputError: values out of bounds, K_lim not above K0.
     """
     bounds.check(porosity, "porosity")
-    bulk, limit = float(porosity.bulk), float(porosity.limit_bulk)
-    if limit <= bulk:
-        raise InputError(f"porosity limit_bulk = {limit:g} must be above bulk = {bulk:g}: a sponge stiffens")
+    check_limit(porosity)
+
+
+def check_limit(porosity: Porosity) -> None:
+    """Refuse a sponge that softens as it is compressed; traced numbers pass.
+
+    Raises:
+        InputError: K_lim not above K0.
+    """
+    if any(isinstance(number, jax.core.Tracer) for number in (porosity.bulk, porosity.limit_bulk)):
+        return
+    bulk, limit = np.broadcast_arrays(np.asarray(porosity.bulk, float), np.asarray(porosity.limit_bulk, float))
+    if np.any(limit <= bulk):
+        k = int(np.argmax(limit - bulk <= 0))
+        raise InputError(
+            f"porosity limit_bulk = {limit.flat[k]:g} must be above bulk = {bulk.flat[k]:g}: a sponge stiffens"
+        )
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:

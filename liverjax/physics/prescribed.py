@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core.errors import InputError
 from liverjax.core.history import entry_at
 from liverjax.core.struct import Indices, Number, Numbers, param, static, struct
 from liverjax.mesh.selection import AXES
@@ -29,6 +30,16 @@ class Displaced:
         "m", "displacements at these times (T, 3), or factors of by (T,); linear in between", default=None
     )
     axes: str = static(default="xyz", about="prescribed axes")
+
+
+def check_axes(axes: object, name: str) -> None:
+    """Refuse what does not name axes.
+
+    Raises:
+        InputError: one sentence that begins with `name`.
+    """
+    if not isinstance(axes, str) or not axes or set(axes) - set(AXES) or len(set(axes)) != len(axes):
+        raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
 
 
 def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:

@@ -30,7 +30,7 @@ class RigidPlate(Physics):
     )
     axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
     centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
-    by: str = static(default="angle", about="what is given: angle or torque")
+    by: str = static(default="angle", about="what is given: angle or torque", words=("angle", "torque"))
     lifts: bool = static(default=False, about="free to move along the axis, under no axial force")
 
     section: ClassVar[str] = "plate"
@@ -44,8 +44,6 @@ class RigidPlate(Physics):
             raise InputError(
                 f"{name} names fewer than two nodes or one beyond {mesh.number_of_nodes - 1}: renumber them"
             )
-        if self.by not in ("angle", "torque"):
-            raise InputError(f"{name} by = {self.by!r} is not known: use angle or torque")
         if abs(np.linalg.norm(np.asarray(self.axis)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
         if times.shape != turn.shape or (times.ndim and (np.diff(times) <= 0).any()):

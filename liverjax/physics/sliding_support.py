@@ -23,7 +23,7 @@ class SlidingSupport(Physics):
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
     normal: Numbers | None = param("1", "of the plane (3,), of length 1; not used with an axis", default=None)
-    axis: str = static(default="", about="x, y or z where the normal is that axis")
+    axis: str = static(default="", about="x, y or z if the normal is that axis", words=("", *selection.AXES))
 
     section: ClassVar[str] = "support"
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "sliding")
@@ -42,8 +42,6 @@ class SlidingSupport(Physics):
         """Refuse wrong node numbers and a missing direction."""
         selection.check_nodes(self.nodes, mesh.number_of_nodes, f"{name}.nodes")
         bounds.check_shape(f"{name}.normal", self.normal, (3,))
-        if self.axis not in ("", *selection.AXES):
-            raise InputError(f"{name} axis = {self.axis!r} is not known: use x, y or z, or a normal")
         if not self.axis and (self.normal is None or abs(np.linalg.norm(np.asarray(self.normal)) - 1) > 1e-6):
             raise InputError(f"{name} normal = {self.normal} must be of length 1: divide it by its length")
 

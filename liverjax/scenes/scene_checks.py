@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Container
 
+import jax
 import numpy as np
 
 from liverjax import laws
@@ -13,7 +14,7 @@ from liverjax.mesh.tetrahedra import TetMesh, check_mesh
 from liverjax.physics import porosity, viscosity
 from liverjax.physics.base import Physics
 from liverjax.physics.loads import Traction
-from liverjax.physics.prescribed import Displaced, Fixed, free_places
+from liverjax.physics.prescribed import Displaced, Fixed, check_axes, free_places
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.volumes.mixed import check_mixed_law
 from liverjax.scenes.region_checks import check_region_elements, check_region_numbers
@@ -47,13 +48,15 @@ MASSES = ("lumped", "consistent")
 
 
 def check_before_run(scene: Scene) -> None:
-    """Refuse choices that mean nothing and numbers out of bounds; traced numbers pass. Compiles nothing.
+    """Refuse choices that mean nothing, numbers out of bounds and nodes that are not there; traced ones pass. Compiles
+    nothing.
 
     Raises:
-        InputError: as `check_choices` and `check_bounds`.
+        InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume.
     """
     check_choices(scene)
     check_bounds(scene)
+    _known_nodes(scene)
 
 
 def check_choices(scene: Scene) -> None:
@@ -92,8 +95,32 @@ def check_choices(scene: Scene) -> None:
         _check_traction(load, f"traction.{k}")
     if scene.body is not None:
         _body(scene.body, scene.mesh.number_of_nodes)
+    if scene.viscosity is not None:
+        for law in laws_of(scene.law, scene.region):
+            viscosity.check_part(scene.viscosity.part, law, "viscosity")
+    for k, hold in enumerate(scene.fixed):
+        check_axes(hold.axes, f"fixed.{k}")
     for k, motion in enumerate(scene.displaced):
         _check_motion(motion, f"displaced.{k}")
+
+
+def _known_nodes(scene: Scene) -> None:
+    """Refuse node numbers that are not in the mesh, and elements that are inside out; what is traced passes."""
+    mesh, named = scene.mesh, {}
+    for kind, several in (("fixed", scene.fixed), ("displaced", scene.displaced)):
+        named |= {f"{kind}.{k}.nodes": condition.nodes for k, condition in enumerate(several)}
+    named |= {f"traction.{k}.triangles": load.triangles for k, load in enumerate(scene.traction)}
+    if scene.porosity is not None:
+        named["porosity.drained"] = scene.porosity.drained
+        named |= {f"porosity.inlet.{k}.nodes": inlet.nodes for k, inlet in enumerate(scene.porosity.inlet)}
+    for name, nodes in named.items():
+        if nodes is not None and not isinstance(nodes, jax.core.Tracer):
+            numbers = np.asarray(nodes)
+            check_nodes(numbers.ravel() if name.endswith("triangles") else numbers, mesh.number_of_nodes, name, least=0)
+    if not isinstance(mesh.volumes, jax.core.Tracer):
+        wrong = int(np.sum(~(np.asarray(mesh.volumes) > 0)))
+        if wrong:
+            raise InputError(f"mesh has {wrong} elements that are inside out or without volume: correct their vertices")
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
@@ -158,6 +185,11 @@ def _check_traction(load: Traction, name: str) -> None:
 
 def _check_motion(motion: Displaced, name: str) -> None:
     history.check(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
+    check_axes(motion.axes, name)
+    # Of a tuple of traced numbers NumPy knows no shape.
+    shape = (len(motion.by),) if isinstance(motion.by, tuple | list) and len(motion.by) == 3 else np.shape(motion.by)
+    if motion.by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
+        raise InputError(f"{name} by has shape {shape}: give three numbers in m, or three a node")
     if motion.by is None and motion.history is None:
         raise InputError(f"{name} needs either by (3,) or times and history: give one of them")
 
@@ -204,6 +236,8 @@ def check_bounds(scene: Scene) -> None:
         bounds.check(physics, name)
     if scene.viscosity is not None:
         viscosity.check_series(scene.viscosity)
+    if scene.porosity is not None:
+        porosity.check_limit(scene.porosity)
     check_region_numbers(scene)
 
 

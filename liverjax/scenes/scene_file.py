@@ -25,6 +25,7 @@ from liverjax.physics import boundary
 from liverjax.physics.base import Physics
 from liverjax.physics.boundary import Displaced, Fixed, Traction
 from liverjax.physics.porosity import Inlet, Porosity
+from liverjax.physics.prescribed import check_axes
 from liverjax.physics.registry import NAMED
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes import regions
@@ -394,8 +395,7 @@ def _nodes(mesh: TetMesh, name: str, table: dict) -> jax.Array:
 
 def _axes(name: str, table: dict) -> str:
     axes = table.get("axes", "xyz")
-    if not isinstance(axes, str) or not axes or set(axes) - set("xyz") or len(set(axes)) != len(axes):
-        raise InputError(f"{name} axes = {axes!r} is not known: give some of the letters xyz")
+    check_axes(axes, name)
     return axes
 
 

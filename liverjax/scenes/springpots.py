@@ -19,7 +19,7 @@ from liverjax.core import bounds
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
-from liverjax.physics.viscosity import Prony, check_part
+from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 
 @struct
@@ -30,7 +30,7 @@ class SpringpotSeries:
     exponents: Any = param("1", "alpha_k (K,), 0 a spring, 1 a dashpot", lower=0.0, upper=1.0)
     limits: Any = param("1", "stiffness over the law's of a spring in a row with each (K,)", above=0.0, default=None)
     spring: Number = param("1", "what is left at frequency 0: 1 the law, 0 nothing", lower=0.0, default=1.0)
-    part: str = static(default="all", about="all: of the whole stress; isochoric: of its isochoric part")
+    part: str = static(default="all", about="all: of the whole stress; isochoric: of its isochoric part", words=PARTS)
 
 
 def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) -> None:

@@ -14,6 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
 from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.scenes.scene_checks import check_before_run, check_bounds
 from liverjax.simulation.run import Result, simulate, unloaded
 
 STRATEGIES = ("map", "vmap")
@@ -50,7 +51,8 @@ def simulate_batch(
         devices: to spread the lanes over; None: all of the process.
 
     Raises:
-        InputError: no parameters, different numbers of lanes, a name that the scene does not have.
+        InputError: no parameters, different numbers of lanes, a name that the scene does not have; as `simulate`, with
+            the number of the lane.
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
@@ -58,6 +60,7 @@ def simulate_batch(
         raise InputError(f"strategy = {strategy!r} is not known: use {' or '.join(STRATEGIES)}")
     parameters = {name: jnp.asarray(value, float) for name, value in parameters.items()}
     lanes = _lanes(parameters)
+    _check_lanes(scene, parameters)
 
     def part(scene, values):
         def run(values):
@@ -94,3 +97,16 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
         if length != lengths[first]:
             raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give as many of each")
     return int(lengths[first] or 0)
+
+
+def _check_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> None:
+    """Refuse a lane with numbers that `simulate` refuses; traced ones pass."""
+    if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
+        return
+    on_host = {name: np.asarray(value) for name, value in parameters.items()}
+    for k in range(_lanes(parameters)):
+        own = with_parameters(scene, {name: value[k] for name, value in on_host.items()})
+        try:
+            check_before_run(own) if k == 0 else check_bounds(own)
+        except InputError as error:
+            raise InputError(f"lane {k}: {error}") from None

@@ -17,6 +17,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.scenes.scene import Scene, with_parameters
+from liverjax.scenes.scene_checks import check_before_run
 from liverjax.simulation import gradient_checkpoints
 from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.run import Result, simulate
@@ -55,7 +56,7 @@ def value_and_gradient(
             steps, at a run a parameter.
 
     Raises:
-        InputError: unknown mode or store, no parameters, a name that the scene does not have.
+        InputError: unknown mode or store, no parameters, a name that the scene does not have; as `simulate`.
     """
     if mode not in MODES:
         raise InputError(f"mode = {mode!r} is not known: use {' or '.join(MODES)}")
@@ -63,7 +64,7 @@ def value_and_gradient(
         raise InputError("no parameters to differentiate by: give some, e.g. {'law.mu': 770.0}")
     gradient_checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
-    with_parameters(scene, {name: value for name, value in values.items() if name != START})
+    check_before_run(with_parameters(scene, {name: value for name, value in values.items() if name != START}))
     return _program_of_gradient(loss, store, mode)(scene, values)
 
 
