@@ -5,7 +5,7 @@ import sys
 
 from liverjax.commands.exit_codes import exit_code
 
-#: Of their own files; everything else is a frequency sweep.
+#: Names of the other commands; without one of them the command line is for a frequency sweep.
 COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude", "waves")
 
 
@@ -16,7 +16,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m fitting") ->
     if arguments[:1] and arguments[0] in COMMANDS:
         name, arguments = arguments[0], arguments[1:]
         prog = f"{prog} {name}"
-    command = importlib.import_module(f"fitting.commands.{name}")  # the others stay unloaded, for a quick start
+    command = importlib.import_module(f"fitting.commands.{name}")  # other commands stay unloaded, for a quick start
     return exit_code(command.run, command.parser(prog).parse_args(arguments))
 
 

@@ -1,3 +1,3 @@
-"""Fits of several tests under the name that users have: all of `fitting.fits.joint`."""
+"""Fits of several tests, under the name that users import: all of `fitting.fits.joint`."""
 
 from fitting.fits.joint import *  # noqa: F403

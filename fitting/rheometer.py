@@ -1,3 +1,3 @@
-"""Readers of frequency sweeps under the name that users have: all of `fitting.readers.rheometer`."""
+"""Readers of frequency sweeps, under the name that users import: all of `fitting.readers.rheometer`."""
 
 from fitting.readers.rheometer import *  # noqa: F403

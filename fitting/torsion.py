@@ -1,3 +1,3 @@
-"""The simulated rheometer under the name that users have: all of `fitting.rigs.torsion`."""
+"""The simulated rheometer, under the name that users import: all of `fitting.rigs.torsion`."""
 
 from fitting.rigs.torsion import *  # noqa: F403

@@ -20,7 +20,7 @@ if "JAX_DEFAULT_MATMUL_PRECISION" not in os.environ:
     # A GPU multiplies float32 with 11 bits by default: quadratic elements were up to 6 % off.
     jax.config.update("jax_default_matmul_precision", "highest")
 if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) == 1:
-    # On one core JAX has one thread. A direct solve on the host would occupy it, and wait for it to copy the matrix.
+    # On one core JAX has one thread. A direct solve on the host would block it while waiting for it to copy the matrix.
     os.environ.setdefault("NPROC", "2")
 
 from liverjax import laws

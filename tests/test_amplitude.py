@@ -128,7 +128,7 @@ def test_the_command_fits_with_the_series_of_a_sweep(tmp_path, capsys):
     options = ["--model", str(tmp_path / "fit.json"), "--max-strain", "0.7", "--out", str(out)]
     assert command.main(["amplitude", "fung_demiray", str(file), *options]) == 0
     said = capsys.readouterr()
-    assert "third harmonic" in said.out and "left out as asked for" in said.err
+    assert "third harmonic" in said.out and "left out as requested" in said.err
     content = json.loads((out / "fit.json").read_text())
     (own,) = content["laws"]
     assert own["parameters"]["c1"] == pytest.approx(900, rel=1e-4) and len(own["third_harmonic_over_first"]) == 11
@@ -215,7 +215,7 @@ def test_a_strain_without_a_unit_several_tables_and_a_gap(tmp_path, tanned):
     path.write_text("\n".join(parts))
     found = strain_sweep.read_strain_sweep(path)
     np.testing.assert_allclose(found.strain, whole.strain, rtol=1e-12)
-    assert "states no unit: parts of 1" in found.notes[0]
+    assert "states no unit: the unit 1" in found.notes[0]
     path.write_text(f"sample A\n{text}\nsample B\n" + "\n".join(lines[:-1]))
     first, second = (strain_sweep.read_strain_sweep(path, table) for table in (None, "2"))
     assert "holds 2 tables" in first.notes[0] and len(first.strain) == len(whole.strain) == len(second.strain) + 1

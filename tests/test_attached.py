@@ -142,10 +142,10 @@ def test_a_tie_between_two_points_changes_no_balance():
         ({"stiffness": 1.0, "pre_tension": 0.0}, "ligament.0 needs either to = "),
         ({"to": [0, 0, 1], "where": {"z_min": SIDE}, "pre_tension": 0.1}, "ligament.0 needs stiffness in N/m"),
         ({"to": [0, 0, 1], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 needs either pre_tension in N"),
-        ({"to": [0, 0], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 to = .* is no point"),
+        ({"to": [0, 0], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 to = .* is not a point"),
         (
             {"to": [0, 0, 0.2], "where": {"z_min": SIDE}, "stiffness": 1.0, "pre_tension": 50.0},
-            "more than it could have",
+            "must be below its limit",
         ),
         ({"to": [0, 0, 0.1], "where": {"z_min": SIDE}, "stiffness": 1.0, "rest_length": 0.1}, "fibre without length"),
         ({"points": [[0, 0, 0], [0, 0, 1]], "stiffness": 1.0, "rest_length": 0.1}, "is outside the body"),

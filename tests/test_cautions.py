@@ -76,7 +76,7 @@ def test_short_bodies_and_nodes_in_one_place():
     x, tets = np.asarray(BOX.points), np.asarray(BOX.tetrahedra)
     two = lj.tet_mesh(np.concatenate([x, x + np.array([0.1, 0, 0])]), np.concatenate([tets, tets + len(x)]))
     (found,) = cautions_of_run(scene(two), run(two, [np.eye(3)], [1.0]))
-    assert found.startswith("4 nodes stand where another node stands: the body is not joined there")
+    assert found.startswith("4 nodes are at the place of another node: the body is not joined there")
 
 
 def test_waves_without_a_mass_are_told():

@@ -184,7 +184,7 @@ def test_stable_ranges_of_known_laws():
         ("nothing.py:Law", "is not a file"),
         ("mine.py", "names no law"),
         ("mine.py:Lew", "use Law"),
-        ("mine.py:number", "is no law"),
+        ("mine.py:number", "is not a law"),
         ("mine.py:Bare", "write @liverjax.core.struct"),
         ("mine.py:NoTypical", "parameter mu has no typical value"),
         ("broken.py:Law", "does not run"),
@@ -207,7 +207,7 @@ def test_plot_draws_laws(tmp_path, capsys):
     assert main(["plot", "neo_hookean", "yeoh", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "laws.png").stat().st_size > 10_000
     assert main(["plot", "yeoh", "--stretch", "1.2", "1.6", "--out", str(tmp_path)]) == 2
-    assert "no range about 1" in capsys.readouterr().err
+    assert "not a range about 1" in capsys.readouterr().err
 
 
 def test_laws_lists_every_law(capsys):

@@ -155,7 +155,7 @@ def test_what_an_earlier_run_left_is_told(tmp_path, capsys):
     given = [str(PORCINE), "--method", "closed-form", "--modes", "2", "--out", str(tmp_path)]
     assert main([*given, "--cards"]) == 0 and "earlier run" not in capsys.readouterr().err
     assert main(given) == 0
-    assert capsys.readouterr().err.endswith(f"note: cards in {tmp_path} is of an earlier run\n")
+    assert capsys.readouterr().err.endswith(f"note: cards in {tmp_path} is from an earlier run\n")
 
 
 @pytest.mark.core

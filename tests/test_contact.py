@@ -234,7 +234,7 @@ SCENE = {
         ({"shape": "sphere", "radius": [0.1, 0.2], "position": [0, 0, 1]}, "must be one number"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "friction": [0.1]}, "must be one number"),
         ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "radius": 0.1}, "which has no radius"),
-        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "where": 3}, "is no place: write where"),
+        ({"shape": "plane", "axis": [0, 0, 1], "position": [0, 0, -1], "where": 3}, "is not a place: write where"),
     ],
 )
 def test_bad_obstacles_are_one_sentence(table, words):

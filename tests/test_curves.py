@@ -135,7 +135,7 @@ def test_coefficients_that_are_given_are_fitted_and_the_others_named(tmp_path):
     (candidate,) = stress_stretch.candidates(f"{file}:third")
     assert candidate.names == ("c10", "c01", "c20", "c30")
     (note,) = candidate.notes
-    assert "c11 held at 0 as given" in note and "c02, c21, c12, c03 left out" in note
+    assert "c11 kept at 0 as given" in note and "c02, c21, c12, c03 left out" in note
     truth = lj.laws.MooneyRivlin(c10=250.0, c01=90.0, c20=30.0, c30=60.0, bulk=None)
     found = stress_stretch.fit(candidate, synthetic(truth))
     assert np.allclose(found.values, [250.0, 90.0, 30.0, 60.0], rtol=1e-4)
@@ -154,7 +154,7 @@ def test_a_law_at_its_limit_says_so_without_warnings_of_numpy():
         found = stress_stretch.fit(candidate, [softening])
     assert found.limits == {"chain_length": "infinity"} and np.isfinite(found.standard_errors[0])
     told = " ".join(found.warnings)
-    assert "runs into its limit (chain_length to infinity): the limit is the answer" in told
+    assert "runs into its limit (chain_length to infinity): the limit fits best" in told
     assert "leave chain_length free" not in told
     assert "chain_length → infinity" in curves_report.table([found])
 

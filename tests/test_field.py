@@ -95,7 +95,7 @@ _BAD = {
     "node,ux,uy,uz,sd\n1,0,0,0,0": "sd must be positive",
     "node,ux,uy,uz,time\n1,0,0,0,1": "has no dt",
     "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
-    "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is no number: mend it, or leave it empty",
+    "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is no number: correct it, or leave it empty",
     "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is no number",
     "": "cannot be read",
 }
@@ -116,8 +116,8 @@ def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
     [
         (["--noise", "0"], "--noise 0 must be above 0"),
         ([], "no column sd"),
-        (["--noise", "1e-4", "--name", "law.nu"], "no number of the scene"),
-        (["--noise", "1e-4", "--parameters", "law.mu,law.x"], "no number of the scene"),
+        (["--noise", "1e-4", "--name", "law.nu"], "not a number of the scene"),
+        (["--noise", "1e-4", "--parameters", "law.mu,law.x"], "not a number of the scene"),
         (["--noise", "1e-4", "--name", "body.gravity"], "needs one number"),
         (["--noise", "1e-4", "--unit", "mile"], "--unit 'mile' is not known"),
         (["--noise", "1e-4", "--length", "-1"], "--length -1 must be above 0"),
@@ -194,7 +194,7 @@ def test_a_map_its_uncertainty_and_going_on(problem, tmp_path):
         np.testing.assert_allclose(found.deviation * prior.field_at_nodes(p, f["z"][:]), found.log_factor, rtol=1e-12)
     again = field.estimate(problem, length=0.02, max_iterations=40, modes=5, file=file, resume=True)
     assert again.chi2 <= found.chi2 * 1.001 and again.deviation == found.deviation
-    with pytest.raises(lj.InputError, match="of another fit"):
+    with pytest.raises(lj.InputError, match="belongs to another fit"):
         field.estimate(problem, name="law.bulk", length=0.02, file=file, resume=True)
 
 
@@ -218,7 +218,7 @@ def test_a_map_goes_on_from_its_own_problem_alone(problem, tmp_path):
         with pytest.raises(lj.InputError, match=words):
             other.read()
     (tmp_path / "p.h5").write_text("no HDF5")
-    with pytest.raises(lj.InputError, match="of another fit"):
+    with pytest.raises(lj.InputError, match="belongs to another fit"):
         search(problem).read()
 
 
@@ -314,7 +314,7 @@ def test_the_command_maps(tmp_path, capsys):
     command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "5e-5", "--out", str(out)]
     assert main([*command, "--length", "0.02", "--iterations", "3"]) in (0, 1)
     said = capsys.readouterr()
-    assert "gradients keep and work with" in said.err and "prior sd" in said.out
+    assert "gradients need about" in said.err and "prior sd" in said.out
     found = json.loads((out / "field.json").read_text())
     assert found["map"]["smallest"] < found["map"]["largest"]
     for name in ("field.vtu", "field.h5", "field.png", "progress.h5"):

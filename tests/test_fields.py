@@ -175,4 +175,4 @@ def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
         assert words in capsys.readouterr().err
     (tmp_path / "other.h5").write_text("no")
     assert main(["plot", str(tmp_path / "other.h5")]) == 2
-    assert "is no result of liverjax simulate" in capsys.readouterr().err
+    assert "is not a result of liverjax simulate" in capsys.readouterr().err

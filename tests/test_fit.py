@@ -268,7 +268,7 @@ def test_user_is_told_what_the_data_do_not_tell():
     three = viscoelastic.closed_form(sweep(0.01, 2), 3)
     assert warned(three, "use fewer modes") or warned(three, "merged")
     fluid = viscoelastic.closed_form(sweep(0.01, 2, np.array([1000.0, 0.9999, 0.1])), 1)
-    assert warned(fluid, "cannot be told from zero")
+    assert warned(fluid, "cannot be distinguished from zero")
     narrow = viscoelastic.closed_form(sweep(0.01, 2, omega=2 * np.pi * np.geomspace(1, 2, 12)), 3)
     assert warned(narrow, "too short for 3 modes")
     s = sweep(0.01, 2)
@@ -370,7 +370,7 @@ def test_an_outlier_is_named():
 def test_a_plateau_that_is_measured_is_no_fluid():
     model = np.array([1e9, 0.5, 0.499, 1e-6, 1e-8])
     f = viscoelastic.closed_form(sweep(0.01, 2, model, np.geomspace(1e2, 1e10, 40)), 2)
-    assert not warned(f, "cannot be told from zero")
+    assert not warned(f, "cannot be distinguished from zero")
 
 
 def test_parameters_at_a_bound_claim_no_certainty():

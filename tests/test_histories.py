@@ -133,7 +133,7 @@ def test_derivative_by_an_entry_of_a_history():
             {"value": [0, 0, 1.0], "history": [[0, 0], [0, 1]]},
             "traction.0 history must hold finite numbers at increasing",
         ),
-        ({"value": [0, 0, 1.0], "history": [[0, 0, 1]]}, "traction.0 history is no table of numbers: write"),
+        ({"value": [0, 0, 1.0], "history": [[0, 0, 1]]}, "traction.0 history is not a table of numbers: write"),
         ({"value": [0, 0, 1.0], "history": "none.csv"}, "none.csv cannot be read"),
         ({"pressure": 1.0, "value": [0, 0, 1.0], "history": [[0, 0]]}, "traction.0 needs either value"),
         ({"pressure": 1.0, "history": [[0, 0, 0, 0]]}, "traction.0 needs either value"),
@@ -150,9 +150,12 @@ def test_bad_histories_are_refused(table, words):
     [
         (b"", "is empty: give columns time,factor or time,x,y,z"),
         (b"# alone\n\n", "is empty"),
-        (b"time;factor\n0,0;0,5\n1,0;1,0\n", "has rows of different lengths: .* commas between them and points"),
+        (
+            b"time;factor\n0,0;0,5\n1,0;1,0\n",
+            "has rows of different lengths: .* separated by commas, with decimal points",
+        ),
         (b"time,factor\n0,0\n1\n", "has rows of different lengths"),
-        (b"time;factor\n0;1\n1;2\n", "has one column: .* commas between them"),
+        (b"time;factor\n0;1\n1;2\n", "has one column: .* separated by commas"),
         (b"time\tfactor\n0\t1\n1\t2\n", "has one column"),
         (b"\xff\xfe\x00", "is not text"),
         (b"time,force\n0,0\n1,1\n", "has columns"),

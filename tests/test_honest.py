@@ -241,7 +241,7 @@ def test_points_outside_the_limits_are_left_out_and_said():
     s = read_sweep(LIONS_MANE)
     kept = within(s, 0.02, 12.65)
     assert kept.angular_frequency[0] > 0.1257 and kept.angular_frequency[-1] == pytest.approx(79.4327)
-    assert "left out as asked for" in kept.notes[-1] and len(kept.storage_sd) == len(kept.storage)
+    assert "left out as requested" in kept.notes[-1] and len(kept.storage_sd) == len(kept.storage)
     assert within(s, None, None) is s and within(s, None, 1e9) is s
     for low, high, sentence in (
         (None, 0.01, r"leave 0 of 31 points .*leave 3 or more"),

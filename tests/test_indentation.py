@@ -73,7 +73,7 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
     [
         ("a,b\n1,2\n", [], "no header names depth and force"),
         ("depth_m,force_N\n0,0\n1e-4,x\n", [], "line 3: 'x' is not a finite number"),
-        ("depth_m,force_N\n0,0\n1e-4,1\n", [], "2 points go in"),
+        ("depth_m,force_N\n0,0\n1e-4,1\n", [], "2 loading points"),
         ("depth_m,force_N\n" + "".join(f"-{k}e-5,-{k}e-3\n" for k in range(8)), [], "so change its sign"),
         ("depth_m,force_N\n0,0\n", ["--thickness", "-1"], "must be above 0"),
         ("depth_m,force_N\n0,0\n", ["--poisson", "0.7"], "must be from 0 to 0.5"),
@@ -126,7 +126,7 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
         text = "depth_nm;force_mN\n" + rows.replace(".", "x").replace(",", ".").replace("x", ",")  # 1.000,5
         (tmp_path / "c.csv").write_text(text)
         assert main(command) == 0
-        assert ("this offset of the sensor is taken off" in capsys.readouterr().err) == bool(offset)
+        assert ("this offset of the sensor is subtracted" in capsys.readouterr().err) == bool(offset)
         content = json.loads((tmp_path / "fit.json").read_text())
         assert np.isclose(content["young_modulus"], E, rtol=0.01) and not content["warnings"]
         assert np.isclose(content["contact_point"], START, atol=3e-6)

@@ -132,7 +132,7 @@ def test_perfusion_swells_a_soft_sponge():
         ({"where": LOW}, "porosity.inlet.0 needs either pressure"),
         ({"where": LOW, "pressure": 1.0, "flux": 1.0}, "porosity.inlet.0 needs either pressure"),
         ({"where": LOW, "presure": 1.0}, "did you mean pressure"),
-        ({"where": LOW, "pressure": 1.0, "history": [[0, 0, 0, 0]]}, "porosity.inlet.0 history is no table"),
+        ({"where": LOW, "pressure": 1.0, "history": [[0, 0, 0, 0]]}, "porosity.inlet.0 history is not a table"),
     ],
 )
 def test_bad_inlets_are_refused(inlet, words):

@@ -141,14 +141,14 @@ def test_refusals(tmp_path):
     import meshio
 
     meshio.Mesh(points, [("triangle", tets[:, :3])]).write(tmp_path / "surface.vtu")
-    _refused("holds triangle but no linear tetrahedra", lambda: lj.read_mesh(tmp_path / "surface.vtu"))
+    _refused("holds triangle but no linear or quadratic tetrahedra", lambda: lj.read_mesh(tmp_path / "surface.vtu"))
 
 
 def test_copies_other_cells_and_millimetres_are_told(tmp_path):
     mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     twice = lj.tet_mesh(points, np.concatenate([tets, tets[:1, [1, 2, 0, 3]]]))
-    with pytest.raises(lj.InputError, match="1 tetrahedra stand there twice"):
+    with pytest.raises(lj.InputError, match="1 tetrahedra occur twice"):
         lj.check_mesh(twice)
     cells = [("tetra", tets), ("hexahedron", np.array([[0, 1, 2, 3, 4, 5, 6, 7]]))]
     meshio.Mesh(points, cells).write(tmp_path / "mixed.vtk")

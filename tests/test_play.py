@@ -139,7 +139,7 @@ def test_the_page_gets_a_surface_and_a_step_for_every_picture(served, moving):
 @pytest.mark.parametrize(
     "content, words",
     [
-        ({"node": 27, "to": [0, 0, 0]}, "node = 27 is none of the mesh"),
+        ({"node": 27, "to": [0, 0, 0]}, "node = 27 is not in the mesh"),
         ({"node": "x", "to": [0, 0, 0]}, "node = 'x'"),
         ({"node": 1, "to": [0, 0]}, "three numbers in m"),
         ({"node": 1}, "three numbers in m"),

@@ -163,7 +163,7 @@ def test_the_simulation_tells_the_material_from_a_glued_and_compressed_sample(tm
         (["--precompression", "0.1", "--samples", "1000"], "leave out --samples"),
         (["--precompression", "0.1", "--model", "fractional"], "give --method closed-form"),
         (["--precompression", "0.1", "--profile"], "leave out --profile"),
-        (["--precompression", "0.1", "--law", "costa"], "without a direction"),
+        (["--precompression", "0.1", "--law", "costa"], "isotropic law"),
     ],
 )
 def test_what_is_refused_is_refused_in_a_sentence(tmp_path, options, words, capsys):

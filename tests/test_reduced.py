@@ -371,7 +371,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
         for name in ("modes", "slopes", "weights", "points"):
             file.create_group(name)
     for name in ("text", "foreign", "groups"):
-        with pytest.raises(lj.InputError, match=rf"{name}.h5 is no reduced model"):
+        with pytest.raises(lj.InputError, match=rf"{name}.h5 is not a reduced model"):
             lj.load_reduced(tmp_path / f"{name}.h5")
     q = np.random.default_rng(6).normal(size=(12, 6, 3))
     fields = np.ones((2, 7, 3)) * np.arange(2)[:, None, None]
@@ -383,7 +383,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
     damaged = {
         "slopes has shape": replace(whole, weights=whole.weights[:-1]),
         "points has shape": replace(whole, points=whole.points[1:]),
-        "modes has values that are no numbers": replace(whole, modes=whole.modes.at[0, 0, 0].set(jnp.nan)),
+        "modes has values that are not numbers": replace(whole, modes=whole.modes.at[0, 0, 0].set(jnp.nan)),
         "inverse has shape": replace(whole, correction=replace(learnt, inverse=learnt.inverse[1:])),
     }
     for sentence, spoiled in damaged.items():
@@ -392,7 +392,7 @@ def test_foreign_and_damaged_files_are_one_sentence(trained, tmp_path):
             lj.load_reduced(tmp_path / "spoiled.h5")
     # A part of a file, as a copy that broke off leaves it.
     (tmp_path / "short.h5").write_bytes((tmp_path / "whole.h5").read_bytes()[:3000])
-    with pytest.raises(lj.InputError, match="is no reduced model"):
+    with pytest.raises(lj.InputError, match="is not a reduced model"):
         lj.load_reduced(tmp_path / "short.h5")
 
 

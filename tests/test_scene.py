@@ -179,7 +179,10 @@ REFUSED = {
     "no triangle": (lambda c: c["traction"][0].update(where={"y_max": 0.0, "x_max": 0.0}), "no boundary triangle"),
     "steps without end": (lambda c: c["solve"].update(steps=10**24), "solve.steps must be at most 2147483647"),
     "hundreds of digits": (lambda c: c["law"][0].update(mu=10**400), "hundreds of digits"),
-    "text in a history": (lambda c: c["displaced"][0].update(history=[["0", "0", "0", "0"]]), "is no table of numbers"),
+    "text in a history": (
+        lambda c: c["displaced"][0].update(history=[["0", "0", "0", "0"]]),
+        "is not a table of numbers",
+    ),
     "history is missing": (lambda c: c["displaced"][0].update(history="none.csv"), "cannot be read"),
 }
 
@@ -275,7 +278,7 @@ def test_density_is_one_number_or_one_a_node():
     for body, sentence in (
         (
             of(np.full(mesh.number_of_elements, 1000.0)),
-            "body density has shape (18,): give one number, or one a node (16,)",
+            "body density has shape (18,): give one number or one per node (16,)",
         ),
         (of(np.full((len(share), 1), 1000.0)), "body density has shape (16, 1)"),
         (of(1000.0, (0.0, -9.81)), "body gravity has shape (2,): give three numbers in m/s^2"),

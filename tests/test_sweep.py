@@ -261,7 +261,7 @@ pre_tension = 0.05
         ("vessel.0.wall", 0.005, "thicker than the radius"),
         ("obstacle.0.radius", 0.02, "changes nothing: a plane has none"),
         # A fibre is at least 5 cm long and has no length at rest at 20 N/m times that.
-        ("ligament.0.pre_tension", 50.0, "more than it could have, 1 N"),
+        ("ligament.0.pre_tension", 50.0, "must be below its limit, 1 N"),
     ],
 )
 def test_rows_are_checked_as_the_scene_is(files, column, value, words):
@@ -347,13 +347,13 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu,law.mu\n1,2\n", "names law.mu twice"),
         ("law.mu\n1,2\n", "row 1 has 2 values for 1 names"),
         ("law.mu;law.bulk\n700;2000\n", "semicolons between its cells"),
-        ("law.mu\n1\nx\n", "row 2, law.mu = 'x' is no finite number"),
-        ("law.mu\nnan\n", "row 1, law.mu = 'nan' is no finite number"),
+        ("law.mu\n1\nx\n", "row 2, law.mu = 'x' is not a finite number"),
+        ("law.mu\nnan\n", "row 1, law.mu = 'nan' is not a finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
         ("law.nu\n700\n", "did you mean mu"),
-        ("mesh.points.0\n700\n", "'mesh.points.0' is no number of the scene file"),
+        ("mesh.points.0\n700\n", "'mesh.points.0' is not a number of the scene file"),
         ("mesh.points.0.1\n700\n", "only all points can change"),
-        ("fixed.0.nodes.0\n3\n", "is no number of the scene file"),
+        ("fixed.0.nodes.0\n3\n", "is not a number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
     ],
 )

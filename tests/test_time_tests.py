@@ -198,7 +198,7 @@ BAD = {
     "unit": ("time_s,relaxation_modulus [psi]\n" + ROWS, [], "unit 'psi' of modulus is not known"),
     "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is no number"),
     "order": ("time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n0.5,6\n2,5\n3,5\n", [], "follows"),
-    "negative": ("time_s,strain,stress_Pa\n0,1,900\n1,1,-700\n2,1,-6\n3,1,-5\n4,1,-5\n", [], "mend the signs"),
+    "negative": ("time_s,strain,stress_Pa\n0,1,900\n1,1,-700\n2,1,-6\n3,1,-5\n4,1,-5\n", [], "correct the signs"),
     "no size": ("time_s,angle_rad,torque_N.m\n0,1,9\n1,1,7\n2,1,6\n3,1,6\n", [], "give --radius and --height"),
     "no strain": ("time_s,strain,stress_Pa\n0,0,9\n1,0,7\n2,0,6\n3,0,5\n", [], "the strain is zero throughout"),
     "ramp": (
@@ -340,7 +340,7 @@ def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):
     file.write_text("\n".join([*lines[:20], "segment 2: hold,,", *lines[20:]]))
     marked = read_time_test(file, "relaxation", ramp=0.0)
     assert np.array_equal(marked.answer, whole.answer, equal_nan=True)
-    assert marked.notes == ("line 21, 'segment 2: hold,,', holds no numbers and is left out",)
+    assert marked.notes == ("line 21, 'segment 2: hold,,', has no numbers and is left out",)
     file.write_text("\n".join([*lines, "", "sample B", *lines]))
     two = read_time_test(file, "relaxation", ramp=0.0)
     assert np.array_equal(two.answer, whole.answer, equal_nan=True) and "2 tables of a test" in two.notes[0]

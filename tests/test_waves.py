@@ -232,7 +232,7 @@ def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
     for write in (lambda file: file.write_text("no progress"), lambda file: h5py.File(file, "w").close()):
         file = tmp_path / "progress.h5"
         write(file)
-        with pytest.raises(InputError, match=r"of another fit.*: leave out --resume"):
+        with pytest.raises(InputError, match=r"belongs to another fit.*: leave out --resume"):
             stiffness_map._first_or_resumed(course, file)
 
 
@@ -284,7 +284,7 @@ def test_a_map_goes_on_from_its_own_problem_alone(tmp_path, other):
     if changed:
         w = w._replace(**{changed: 1.01 * getattr(w, changed)})
     different = stiffness_map.course_of(own.body, m, w, modulus(HERTZ), 0.02 if other == "length" else length)
-    with pytest.raises(InputError, match=rf"of another fit \({other} differs?\): leave out --resume"):
+    with pytest.raises(InputError, match=rf"belongs to another fit \({other} differs?\): leave out --resume"):
         stiffness_map._first_or_resumed(different, file)
 
 

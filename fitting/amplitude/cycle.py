@@ -1,11 +1,11 @@
 """One steady cycle of large shear: storage and loss modulus of the first harmonic, and how large the third is.
 
-The sample is incompressible and isotropic, and keeps its strain energy function W; the stress S (second
-Piola-Kirchhoff) that follows from W relaxes, and strain does not change how fast (chapter, section 4.2). In simple
-shear of amount g(t) = a sin(wt) the shear stress is S12 + g S22 for every pressure. S is a sum of harmonics of w, and
-the memory multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates every ring of the sample is in simple
-shear of its own amount (a universal deformation: Rivlin 1949), so the torque is a sum over rings; a rheometer reads it
-as if the sample were linear.
+The sample is incompressible and isotropic, with a strain energy function W. The stress S (second Piola-Kirchhoff) that
+follows from W relaxes, at a rate that does not depend on the strain (chapter, section 4.2). In simple shear of amount
+g(t) = a sin(wt) the shear stress is S12 + g S22, whatever the pressure is. S is a sum of harmonics of w, and the memory
+multiplies harmonic n by m(nw) = G*(nw)/G0. In torsion between plates every ring of the sample is in simple shear, and
+its amount depends on the radius (a universal deformation: Rivlin 1949). So the torque is a sum over rings; a rheometer
+converts it into moduli as if the sample were linear.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from liverjax.tensors.matrices import pack, unpack
 
 #: Instants of a cycle, and rings between plates (Gauss' points). Stresses of harmonics beyond the 15th are left out.
 INSTANTS, RINGS = 32, 8
-#: Shears at which the law is asked: S12/g and S22 are even in g, and polynomials of g^2 lie between.
+#: Number of shears at which the law is evaluated. S12/g and S22 are even in g: polynomials of g^2 interpolate them.
 ASKED = 24
 
 
@@ -33,12 +33,12 @@ class Reading(NamedTuple):
 
 
 def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel") -> Reading:
-    """The reading for cycles with these amplitudes at the rim.
+    """Matrices for cycles with these strain amplitudes at the rim.
 
     Args:
-        strains: (A,).
-        memories: m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n); what is read is linear in it.
-        plates: parallel, or cone, between which the strain is the same everywhere.
+        strains: amplitudes (A,) at the rim.
+        memories: m(nw) for n = 0 to `INSTANTS` / 2, complex (M, n); the reading is linear in m.
+        plates: "parallel", or "cone" (cone and plate, where the strain is the same everywhere).
     """
     rho, weights = _radii_and_weights(plates)
     own = np.asarray(strains)[:, None] * rho
@@ -59,7 +59,7 @@ def reading(strains: np.ndarray, memories: np.ndarray, plates: str = "parallel")
 
 
 def _radii_and_weights(plates: str) -> tuple[np.ndarray, np.ndarray]:
-    """Radii over the radius of the rim, and weights of their moduli."""
+    """Radii divided by the radius of the rim, and the weights of the moduli at these radii."""
     if plates == "cone":
         return np.ones(1), np.ones(1)
     x, w = np.polynomial.legendre.leggauss(RINGS)
@@ -82,9 +82,9 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
     """Complex modulus of the first harmonic (A,) [Pa], and amplitude of the third over the first (A,).
 
     Args:
-        law: of the instantaneous stress; a volumetric energy has no part in it.
-        r: `reading`.
-        shares: of the memories (M,).
+        law: law of the instantaneous stress; its volumetric energy is not used.
+        r: the result of `reading`.
+        shares: factors (M,) of the memories.
     """
     S = _instantaneous_stress(law, r.F)
     asked = jnp.stack([S[:, 0, 1] / r.shears, S[:, 1, 1]])
@@ -93,7 +93,7 @@ def first_and_third(law: Law, r: Reading, shares: jax.Array) -> tuple[jax.Array,
 
 
 def _instantaneous_stress(law: Law, F: jax.Array) -> jax.Array:
-    """S (K, 3, 3) of the isochoric energy, for F that is data."""
+    """Second Piola-Kirchhoff stress (K, 3, 3) of the isochoric energy; F is a constant, without derivatives."""
     split = law.isochoric_part()
     if split is not None and split.stretch_energy is not None:
         return pack(stress_at_constant(split, unpack(F)))

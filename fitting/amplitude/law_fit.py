@@ -18,17 +18,17 @@ from fitting.readers.curves import Curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
-#: A loss tangent that changes by more than this part over the sweep is no memory that strain leaves as it is.
+#: If the loss tangent changes by more than this part over the sweep, the memory depends on the strain.
 CHANGED = 0.2
 
 
 class Memory(NamedTuple):
-    """The factor of each harmonic n: m(nw) of a Prony series; without a series, 1 with one loss tangent."""
+    """Factor m(nw) of each harmonic n, from a Prony series; without a series 1 + i times one loss tangent."""
 
     series: Maxwell | None = None
 
     def of(self, omega: float) -> np.ndarray:
-        """m(nw) (1, n) of the series; or (2, n), whose second row is multiplied by the loss tangent."""
+        """m(nw) (1, n) of the series; without it (2, n), the second row to be multiplied by the loss tangent."""
         n = np.arange(cycle.INSTANTS // 2 + 1)
         if self.series is None:
             return np.array([np.ones(len(n)), np.where(n == 0, 0, 1j)])
@@ -46,7 +46,7 @@ class StrainFit(NamedTuple):
 
 
 def memory_from(path: Path) -> Memory:
-    """The Prony series of a fit.json that a frequency sweep has left.
+    """Read the Prony series from the fit.json of a fitted frequency sweep.
 
     Raises:
         InputError: no such file, or one without a series.
@@ -66,7 +66,8 @@ def memory_from(path: Path) -> Memory:
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
     """Least squares of the relative misfit of G* at all amplitudes, the best of many starts.
 
-    Without a Prony series the loss tangent is one more number of the fit, and the modulus holds at this frequency only.
+    Without a Prony series the loss tangent is one more number of the fit, and the modulus is valid at this frequency
+    only.
     """
     own = candidate if memory.series is not None else with_loss_tangent(candidate)
     memories = memory.of(sweep.angular_frequency)
@@ -113,7 +114,7 @@ def with_loss_tangent(candidate: Candidate) -> Candidate:
 
 
 def _as_curves(sweep: StrainSweep) -> list[Curve]:
-    """The two moduli over the shear at the rim, for the warnings of a fit."""
+    """The two moduli against the shear at the rim, for the warnings of a fit."""
     F = np.tile(np.eye(3), (len(sweep.strain), 1, 1))
     F[:, 0, 1] = sweep.strain
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]

@@ -28,8 +28,8 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     """Read a strain sweep: text, CSV or workbook with frequency, storage and loss modulus, and the strain's amplitude.
 
     Args:
-        path: of the file; a strain column is named strain, with % or 1 as its unit.
-        table: name, or a part of it, of one of several tables.
+        path: path of the file; its strain column is named strain, with the unit % or 1.
+        table: name of one of several tables, or a part of the name.
         max_strain: points of larger strain [1] are left out.
 
     Raises:
@@ -56,7 +56,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         else []
     )
     if good.sum() > kept.sum():
-        notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as asked for")
+        notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:
         raise InputError(f"{path}: {kept.sum()} points of strain are left: give {FEWEST_POINTS} or more")
     if np.ptp(omega[kept]) > 0.01 * omega[kept].mean():
@@ -65,11 +65,11 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
             f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a sweep of the strain alone"
         )
     if not chosen.strain_unit:
-        notes.append("the column of strain states no unit: parts of 1 are taken")
+        notes.append("the strain column states no unit: the unit 1 is assumed, not %")
     largest = LARGEST_STRAIN if chosen.strain_unit else LARGEST_WITHOUT_UNIT
     if strain[kept].max() > largest:
         raise InputError(
-            f"{path}: a strain of {strain[kept].max():g} is too large: write it in % (strain_%), or as a part of 1 "
+            f"{path}: a strain of {strain[kept].max():g} is too large: write it in % (strain_%), or as a fraction "
             "(strain_1)"
         )
     order = np.argsort(strain[kept], kind="stable")

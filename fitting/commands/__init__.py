@@ -1,1 +1,1 @@
-"""Command lines of the fits: one file a sub-command, each with `parser` (its arguments) and `run`."""
+"""Command lines of the fits: one file per sub-command, each with `parser` (its arguments) and `run`."""

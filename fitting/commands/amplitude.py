@@ -10,7 +10,7 @@ from liverjax.core.files import writable
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Fit the numbers of a hyperelastic law to moduli that change with the amplitude of the strain, at "
@@ -21,11 +21,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument(
         "sweep", type=Path, metavar="SWEEP", help="frequency, moduli and strain: CSV, text or workbook"
     )
-    command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="of Ogden's law (default 1, 2 and 3)")
+    command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
     command.add_argument("--model", type=Path, metavar="fit.json", help="Prony series of a frequency sweep")
-    command.add_argument("--plates", choices=("parallel", "cone"), default="parallel", help="default parallel")
-    command.add_argument("--max-strain", type=float, metavar="X", help="leave out points above it; 0.1 is 10 %%")
-    command.add_argument("--table", metavar="NAME", help="of a file with several tables: a part of its name")
+    command.add_argument("--plates", choices=("parallel", "cone"), default="parallel", help="plates (default parallel)")
+    command.add_argument("--max-strain", type=float, metavar="X", help="leave out larger strains; 0.1 is 10 %%")
+    command.add_argument("--table", metavar="NAME", help="which of several tables: a part of its name")
     command.add_argument(
         "--out", type=Path, default=Path("amplitude"), metavar="DIR", help="folder of the results (amplitude)"
     )
@@ -33,7 +33,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit one law, or all; 1 if the best fit did not converge."""
+    """Fit one law, or all laws; exit code 1 if the best fit did not converge."""
     if options.max_strain is not None and not options.max_strain > 0:
         raise InputError(f"--max-strain {options.max_strain:g} must be above 0: give e.g. 0.1 for 10 %")
     from tqdm import tqdm

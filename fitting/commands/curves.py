@@ -10,7 +10,7 @@ from liverjax.core.files import writable
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Fit hyperelastic laws to tension, compression, shear, equibiaxial and pure-shear curves at once.",
@@ -18,8 +18,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
     command.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
-    command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="of Ogden's law (default 1, 2 and 3)")
-    command.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="Pa", help="of stress columns that name none")
+    command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
+    command.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="Pa", help="for stress columns without unit")
     command.add_argument(
         "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
     )
@@ -27,7 +27,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit one law, or all, to the curves; 1 if the best fit did not converge."""
+    """Fit one law, or all laws, to the curves; exit code 1 if the best fit did not converge."""
     from tqdm import tqdm
 
     from fitting.fits import stress_stretch

@@ -21,7 +21,7 @@ from liverjax.simulation import gradients
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Find a map of stiffness, or a few numbers of a scene, from displacements measured at some points. "
@@ -36,18 +36,16 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="x,y,z (or node),ux,uy,uz[,time][,sd]",
     )
     command.add_argument("--name", default="law.mu", metavar="NAME", help="number to map (default law.mu)")
-    command.add_argument("--length", type=float, metavar="M", help="over which it varies [m] (default: size / 10)")
+    command.add_argument("--length", type=float, metavar="M", help="the map varies over it [m] (default: size / 10)")
     command.add_argument(
-        "--sphere", action="store_true", help="a sphere of other stiffness as well, begun from the map"
+        "--sphere", action="store_true", help="fit also a sphere of another stiffness, started from the map"
     )
     command.add_argument(
         "--parameters", metavar="NAME,…", help="these numbers instead of a map, e.g. law.mu,viscosity.ratios"
     )
-    command.add_argument(
-        "--noise", type=float, metavar="M", help="standard deviation [m] where a file has no column sd"
-    )
-    command.add_argument("--unit", default="m", help="of the lengths in the displacement files (default m)")
-    command.add_argument("--iterations", type=int, default=60, help="of L-BFGS for each weight (default 60)")
+    command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
+    command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")
+    command.add_argument("--iterations", type=int, default=60, help="L-BFGS iterations for each weight (default 60)")
     command.add_argument("--resume", action="store_true", help="go on from the last iteration written to --out")
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
@@ -73,7 +71,7 @@ def _problem(options: argparse.Namespace) -> Problem:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find a map, or a few numbers, of scenes; 1 if a solve or the fit did not converge."""
+    """Find a map, or a few numbers, of scenes; exit code 1 if a solve or the fit did not converge."""
     return (_map if options.parameters is None else _fit_few_numbers)(options, _problem(options))
 
 
@@ -96,7 +94,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     field.start_of(problem, options.name)
     writable(options.out, ("field.json", "field.vtu", "field.h5", "field.png", "progress.h5"))
     kept = sum(gradients.memory(scene) for scene in problem.scenes) / 1e6
-    print(f"gradients keep and work with about {kept:.0f} MB", file=sys.stderr)
+    print(f"gradients need about {kept:.0f} MB of memory", file=sys.stderr)
     length = options.length or float(np.ptp(np.asarray(mesh.points), axis=0).max()) / 10
     file = options.out / "progress.h5"
     bar, told = cost_bar("iterations")
@@ -108,7 +106,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     content = _files(options) | {"map": field_report.of_field(found)}
     if not found.reached:
         print(
-            f"warning: chi2 stays at {found.chi2 / found.components:.3g} a component: the noise is larger than said, "
+            f"warning: chi2 stays at {found.chi2 / found.components:.3g} per component: the stated noise is too small, "
             "or the scene misses something (mesh, supports, loads)",
             file=sys.stderr,
         )

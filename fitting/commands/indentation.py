@@ -7,11 +7,11 @@ from pathlib import Path
 from fitting.commands.exit_codes import EXIT_CODES
 
 COLUMNS = """The file has columns of depth (or displacement, indentation) and force (or load) with their units, e.g.
-depth_um,force_mN. What follows the deepest point is left out. """
+depth_um,force_mN. Points after the deepest one are left out. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Identify Young's modulus and the contact point from an indentation curve: a rigid sphere, cone or "
@@ -20,9 +20,9 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("file", type=Path, metavar="CURVE.csv", help="depth and force")
     command.add_argument("--shape", choices=("sphere", "cone", "punch"), default="sphere", help="default sphere")
-    command.add_argument("--radius", type=float, default=0.0, metavar="M", help="of sphere or punch [m]")
-    command.add_argument("--half-angle", type=float, default=45.0, metavar="DEG", help="of the cone, axis to side")
-    command.add_argument("--thickness", type=float, required=True, metavar="M", help="of the layer [m]")
+    command.add_argument("--radius", type=float, default=0.0, metavar="M", help="radius of sphere or punch [m]")
+    command.add_argument("--half-angle", type=float, default=45.0, metavar="DEG", help="cone: from axis to side")
+    command.add_argument("--thickness", type=float, required=True, metavar="M", help="thickness of the layer [m]")
     command.add_argument("--poisson", type=float, default=0.5, metavar="NU", help="Poisson's ratio (default 0.5)")
     command.add_argument(
         "--out", type=Path, default=Path("indentation"), metavar="DIR", help="folder of the results (indentation)"
@@ -31,7 +31,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the curve; 1 if the modulus is not positive."""
+    """Fit the curve; exit code 1 if the modulus is not positive."""
     from fitting.methods.contact_point import fit_contact
     from fitting.readers.indentation_curves import read_indentation
     from fitting.reports import indentation_report

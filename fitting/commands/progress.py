@@ -1,4 +1,4 @@
-"""Progress bars of fits: with the cost of one fit, or with what is fitted at the moment."""
+"""Progress bars of fits: they show the cost of one fit, or the name of the current fit."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 
 def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[[int, float], None]]:
-    """A bar on standard error, off when that is not a terminal, and the function to call with the cost."""
+    """A bar on standard error (off if that is not a terminal), and the function to call with every cost."""
     bar = tqdm(desc=description, unit=f" {unit}", disable=None, leave=False)
 
     def told(_: int, cost: float) -> None:
@@ -19,7 +19,7 @@ def cost_bar(unit: str, description: str | None = None) -> tuple[tqdm, Callable[
 
 @contextmanager
 def named_bar(description: str) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error, off when that is not a terminal: the function to call with the name of the next fit."""
+    """A bar on standard error (off if that is not a terminal); it gives the function to call with each fit's name."""
     with tqdm(desc=description, unit=" fits", disable=None, leave=False) as bar:
 
         def told(text: str) -> None:

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from fitting.readers.time_tests import TimeTest
 
 COLUMNS = """The file has a column of time and one of these: relaxation_modulus_Pa (creep: creep_compliance_1/Pa);
-strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns the test is computed as it
-was driven, ramp included; torque and force need the sample's size. """
+strain and stress_Pa; angle_rad and torque_N.m; displacement_m and force_N. With two columns the model answers the
+measured drive, ramp included; torque and force need the sample's size. """
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     kind = prog.split()[-1]
     command = argparse.ArgumentParser(
         prog=prog,
@@ -40,11 +40,11 @@ def parser(prog: str) -> argparse.ArgumentParser:
         "--ramp",
         type=float,
         metavar="S",
-        help="seconds of the ramp, where no column has it; 0 with two columns: a step at 0 s, before the first row",
+        help="duration of the ramp [s] if no column shows it; 0 with two columns: a step at 0 s, before the first row",
     )
-    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the answers before it")
-    command.add_argument("--radius", type=float, metavar="M", help="of the sample [m], for torque and force")
-    command.add_argument("--height", type=float, metavar="M", help="of the sample [m], for torque and force")
+    command.add_argument("--min-time", type=float, default=0.0, metavar="S", help="leave out the response before it")
+    command.add_argument("--radius", type=float, metavar="M", help="radius of the sample [m], for torque and force")
+    command.add_argument("--height", type=float, metavar="M", help="height of the sample [m], for torque and force")
     shared_options.add_cards_and_samples(command)
     command.add_argument(
         "--out", type=Path, default=Path(kind), metavar="DIR", help=f"folder of the results (default {kind})"
@@ -54,7 +54,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
-    """The test that a TOML file describes; options that the file has are refused."""
+    """Read the test that a TOML file describes; options that belong into the file are refused."""
     from fitting.rigs.described import read_described
 
     for name in ("radius", "height", "ramp", "min_time"):
@@ -71,7 +71,7 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the test; 1 if the fit did not converge."""
+    """Fit the test; exit code 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time as fits
     from fitting.readers import time_tests as reader
     from fitting.reports import time_report

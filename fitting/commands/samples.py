@@ -8,7 +8,7 @@ from fitting.commands.progress import named_bar
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit all samples with one model in closed form; 1 if one of the fits did not converge."""
+    """Fit all samples with one model in closed form; exit code 1 if one of the fits did not converge."""
     from fitting.fits import samples
     from fitting.reports import samples_report
     from liverjax.core.files import writable

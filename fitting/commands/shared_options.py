@@ -1,4 +1,4 @@
-"""Options that several commands have in the same words: a number of modes, draws of the posterior, cards, the sweep."""
+"""Options that several commands share: number of modes, draws of the posterior, material cards, band of the sweep."""
 
 import argparse
 import sys
@@ -50,7 +50,7 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
-    """The sweep of a file without the points that the instrument spoils. A band that the user names is kept whole."""
+    """Read a sweep without the points that the instrument spoils; with --max-frequency all points below it are kept."""
     from fitting.methods import kramers_kronig
     from fitting.readers import rheometer
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Identify a generalised Maxwell (Prony) or fractional model from a rheometer's frequency sweep.",
@@ -49,7 +49,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         metavar="TEST",
         help="further tests of the same material (relaxation, creep, sweep, shear waves): one Prony series for all",
     )
-    command.add_argument("--table", metavar="NAME", help="of a file with several tables: number, name or a part of it")
+    command.add_argument("--table", metavar="NAME", help="which of several tables: its number, name or a part of it")
     command.add_argument("--max-frequency", type=float, metavar="HZ", help="leave out the points above it")
     command.add_argument("--min-frequency", type=float, metavar="HZ", help="leave out the points below it")
     shared_options.add_modes(command)
@@ -60,7 +60,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         help="free Prony modes (default), springpots, a smooth spectrum, or the best of all by the criterion",
     )
     command.add_argument(
-        "--method", choices=("torsion", "closed-form"), help="default torsion; of several samples closed-form"
+        "--method", choices=("torsion", "closed-form"), help="default torsion; for several samples closed-form"
     )
     command.add_argument(
         "--master",
@@ -68,7 +68,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         type=_celsius,
         const=MIDDLE,
         metavar="C",
-        help="the files hold sweeps at several temperatures: shift them to the one nearest to C degrees Celsius "
+        help="sweeps at several temperatures are given: shift them to the one nearest to C degrees Celsius "
         "(default the middle one) and fit the master curve",
     )
     command.add_argument("--vertical", action="store_true", help="with --master: moduli have shift factors too")
@@ -79,7 +79,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     return command
 
 
-#: `--master` without a temperature.
+#: Value of `--master` without a temperature: the middle temperature is the reference.
 MIDDLE = float("nan")
 
 
@@ -106,17 +106,17 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
         help="standard deviation of the friction of the instrument's bearing [N m s]: it is fitted too",
     )
     command.add_argument(
-        "--density", type=float, metavar="KG_M3", help="of the sample: simulate its inertia (default: none)"
+        "--density", type=float, metavar="KG_M3", help="density of the sample, to simulate its inertia (default: none)"
     )
     command.add_argument(
         "--precompression",
         type=float,
         default=0.0,
         metavar="E",
-        help="part of its height by which the sample was compressed before, e.g. 0.05 (default 0); --height is the gap",
+        help="compression of the sample before the sweep, a part of its height (default 0); --height is the gap",
     )
     command.add_argument("--law", default="neo_hookean", metavar="NAME", help="law of the simulated sample")
-    command.add_argument("--steps", type=int, default=50, help="time steps a cycle of the simulation (default 50)")
+    command.add_argument("--steps", type=int, default=50, help="time steps per cycle of the simulation (default 50)")
     command.add_argument(
         "--scheme", choices=("exponential", "backward_euler", "chapter"), default="exponential", help="Prony recursion"
     )
@@ -142,13 +142,13 @@ def _add_outputs(command: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit the model; 1 if the fit did not converge."""
+    """Fit the model; exit code 1 if the fit did not converge."""
     from fitting.methods import uncertainty
     from fitting.reports import sweep_report
 
     _check(options)
     if options.master is not None:
-        options.method = options.method or "closed-form"  # the moduli are of no frequency that a plate was turned at
+        options.method = options.method or "closed-form"  # no plate was turned at the shifted frequencies
     elif len(options.sweep) > 1:
         from fitting.commands import samples
 
@@ -254,7 +254,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.others:
         _check_together(options)
     if not 4 <= options.steps <= 10000:
-        raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps a cycle, e.g. 50")
+        raise InputError(f"--steps {options.steps} is out of range: give 4 to 10000 time steps per cycle, e.g. 50")
     if options.model in ("fractional", "spectrum") and options.modes != "auto":
         raise InputError(
             f"--modes {options.modes} works with --model prony only: leave it out for --model {options.model}"
@@ -284,7 +284,7 @@ def _check_friction(options: argparse.Namespace) -> None:
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--friction-error is fitted beside the Prony modes of one sample: leave out {name}")
+            raise InputError(f"--friction-error is fitted with the Prony modes of one sample: leave out {name}")
 
 
 def _check_precompression(options: argparse.Namespace) -> None:
@@ -305,7 +305,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
             f"--precompression with --model {options.model} is computed in closed form, since the modes that a "
-            "simulation needs mix what stands with what relaxes slowly: give --method closed-form"
+            "simulation needs do not separate constant from slowly relaxing stress: give --method closed-form"
         )
 
 
@@ -374,7 +374,7 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
-    """The fit in closed form, and by default the fit through the simulation; then the sweep that they fit."""
+    """The fit in closed form, by default also the fit through the simulation, and the corrected sweep that they use."""
     from fitting.fits import instrument, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell

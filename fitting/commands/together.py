@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit all tests in closed form; 1 if the fit did not converge."""
+    """Fit all tests in closed form; exit code 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time
     from fitting.reports import together_report
     from liverjax.core.files import writable
@@ -41,7 +41,7 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
     """Read a file as a test in a rig, as shear waves, as a test in time, or as another sweep.
 
     Another sweep is cut to the band that the user names, and points that the instrument spoils are left out, as in the
-    first sweep. A `whole` one, which is only predicted, is not cut.
+    first sweep. A `whole` sweep is only predicted, so it is not cut.
     """
     from fitting.methods import kramers_kronig
     from fitting.readers import rheometer, time_tests

@@ -19,33 +19,33 @@ if TYPE_CHECKING:
     from fitting.waves.elastography import Organ
 
 FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5")
-#: Memory of one factor beyond which a coarser grid is asked for [GB].
+#: Largest memory of one factor [GB]; if a grid needs more, it is made coarser, or a larger --stride is demanded.
 MOST_MEMORY = 4.0
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
-    """Options of the command, which --help calls `prog`."""
+    """Options of the command; --help shows `prog` as its name."""
     command = argparse.ArgumentParser(
         prog=prog,
         description="Find storage and loss modulus of an organ from harmonic waves on voxels (elastography): of the "
-        "whole, of regions, and as a map, each with standard deviations; the usual direct inversion beside them.",
+        "whole, of regions, and as a map, each with standard deviations; also the usual direct inversion.",
         epilog=EXIT_CODES,
     )
     command.add_argument(
         "data", type=Path, metavar="DATA", help="complex displacements: .npz, .h5, .csv, .nii, .nii.gz"
     )
-    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="where the file does not hold them")
-    command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, where the file has none")
+    command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="if the file does not state them")
+    command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, if the file has no mask")
     command.add_argument("--labels", type=Path, metavar="FILE", help="number of the region of each voxel")
-    command.add_argument("--unit", help="of the displacements: m, mm or um (default m)")
+    command.add_argument("--unit", help="unit of the displacements: m, mm or um (default m)")
     command.add_argument(
-        "--spacing", type=float, nargs=3, metavar="M", help="of the voxels [m], where the file has none"
+        "--spacing", type=float, nargs=3, metavar="M", help="spacing of the voxels [m], if the file states none"
     )
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation of one component (default: data)")
     command.add_argument("--density", type=float, default=DENSITY, metavar="KG_M3", help=f"default {DENSITY:g}")
     command.add_argument("--stride", type=int, metavar="N", help="take means of N x N x N voxels (default: as needed)")
     command.add_argument("--no-map", action="store_true", help="only the whole and the regions")
-    command.add_argument("--length", type=float, metavar="M", help="over which the map varies [m] (default 2 bricks)")
+    command.add_argument("--length", type=float, metavar="M", help="the map varies over it [m] (default 2 bricks)")
     command.add_argument(
         "--samples", type=int, default=20, metavar="N", help="maps drawn from the posterior (default 20)"
     )
@@ -56,7 +56,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find moduli; 1 if a fit did not converge."""
+    """Find moduli; exit code 1 if a fit did not converge."""
     _check_waves(options)
     from fitting.reports import waves_report
     from fitting.waves import direct_inversion, elastography, stiffness_map, wave_field
@@ -90,12 +90,12 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _forces_that_balance(data: Path) -> Iterator[None]:
-    """Run with one clear sentence if the equations have no solution."""
+    """Raise an `InputError` with one clear sentence if the equations have no solution."""
     try:
         yield
     except np.linalg.LinAlgError:
         raise InputError(
-            f"{data}: no modulus balances the forces of these waves: look at the mask, the spacing, the units and the "
+            f"{data}: no modulus balances the forces of these waves: check the mask, the spacing, the units and the "
             "noise"
         ) from None
 

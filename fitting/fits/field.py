@@ -1,11 +1,11 @@
 """A map of stiffness from measured displacements: a smooth field of one number of the law, with its uncertainty.
 
-The number of an element is the scene's number times exp(m). m is the mean of a nodal field (V,) with the prior of
-`fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 is sought by L-BFGS in the whitened z, with gradients through
-the runs. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down to the number
-of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty comes from the
-Gauss-Newton Hessian I + J^T J. Lanczos iterations find its largest eigenvalues; each product takes a linearised run and
-its transpose (Bui-Thanh et al. 2013).
+The number of an element is the scene's number times exp(m). m is the element's mean of a nodal field (V,) with the
+prior of `fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 is sought by L-BFGS in the whitened z, with gradients
+through the runs. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down to
+the number of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty comes from
+the Gauss-Newton Hessian I + J^T J. Lanczos iterations find its largest eigenvalues; each product needs a linearised run
+and its transpose (Bui-Thanh et al. 2013).
 """
 
 import time
@@ -31,9 +31,9 @@ from liverjax.scenes.scene import numbers_at
 
 #: Standard deviations of ln(modulus) to try, from a nearly uniform body to a free one.
 DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
-#: A larger one must lower chi^2 by this part, or it is no better.
+#: If the next deviation lowers chi^2 by less than this part, the search ends.
 _WORTH = 0.02
-#: z beyond this many standard deviations is not sought.
+#: Largest |z| that is allowed, in standard deviations.
 _BOUND = 8.0
 
 
@@ -42,17 +42,17 @@ class Field(NamedTuple):
 
     name: str
     log_factor: np.ndarray  # m (V,)
-    modulus: np.ndarray  # of the elements (E,)
-    sd: np.ndarray  # of m at the nodes (V,), data seen
-    prior_sd: np.ndarray  # (V,), before
+    modulus: np.ndarray  # modulus of the elements (E,)
+    sd: np.ndarray  # of m at the nodes (V,), with the data
+    prior_sd: np.ndarray  # of m at the nodes (V,), without data
     mesh_bias: np.ndarray | None  # part of m (V,) that the meshes cause: subtract it to correct; None: not known
-    deviation: float  # the prior's, chosen
-    length: float  # [m] of correlation
+    deviation: float  # standard deviation of the prior that was chosen
+    length: float  # correlation length [m]
     chi2: float
     components: int
     reached: bool  # whether chi^2 came down to the number of components
-    history: list[dict]  # one row a deviation: chi2, iterations, evaluations, seconds
-    eigenvalues: np.ndarray  # of J^T J in whitened z: directions above 1 are known from the data
+    history: list[dict]  # one row per deviation: chi2, iterations, evaluations, seconds
+    eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine directions above 1
     codes: tuple[int, ...]
     seconds: float
 
@@ -61,13 +61,13 @@ def start_of(problem: Problem, name: str) -> jax.Array:
     """The numbers of the elements (E,) before the fit.
 
     Raises:
-        InputError: scenes of different meshes, a name that is no positive number.
+        InputError: the scenes have different meshes, or `name` is not a positive number.
     """
     scene = problem.scenes[0]
     E = scene.mesh.number_of_elements
     for other in problem.scenes[1:]:
         if other.mesh.number_of_elements != E or not np.allclose(other.mesh.points, scene.mesh.points):
-            raise InputError("the scenes have different meshes: a field needs one and the same")
+            raise InputError("the scenes have different meshes: a field needs one mesh in all scenes")
     base = numbers_at(scene, name)
     if isinstance(base, tuple) or jnp.ndim(base) > 1 or (jnp.ndim(base) == 1 and base.shape != (E,)):
         raise InputError(f"a field of {name!r} needs one number: name one of the list, e.g. {name}.0")
@@ -77,7 +77,7 @@ def start_of(problem: Problem, name: str) -> jax.Array:
 
 
 def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dict[str, jax.Array]:
-    """Numbers of the scenes at the nodal field m (V,)."""
+    """Numbers of the elements for the nodal field m (V,), by name."""
     corners = m[problem.scenes[0].mesh.tetrahedra]
     return {name: base * jnp.exp(jnp.mean(corners, axis=1))}
 
@@ -94,7 +94,7 @@ def _cost_of_map(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> 
 
 
 class _Search:
-    """The course of a fit: the functions for L-BFGS, and the state that is written for a resumed run."""
+    """State of a search: the functions that L-BFGS calls, and the file from which a run is resumed."""
 
     def __init__(self, problem, name, base, p, file, progress):
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
@@ -102,7 +102,7 @@ class _Search:
         self.best, self.evaluations, self.codes = np.inf, 0, ()
         self.marks = {
             "name": name,
-            "length": float(p.scale),  # of the prior: a power of it
+            "length": float(p.scale),  # the prior's scale is a power of the length
             "noise": mark_of(*(d.sd for d in problem.data)),
             "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
@@ -116,7 +116,7 @@ class _Search:
         half, g = float(half), np.asarray(g)
         self.evaluations += 1
         if not (np.isfinite(half) and np.all(np.isfinite(g)) and not np.any(np.asarray(codes) == status.NOT_FINITE)):
-            return 1e3 * (1 + z @ z + self.problem.components), z.copy()  # a wall: the line search turns back
+            return 1e3 * (1 + z @ z + self.problem.components), z.copy()  # a large cost: the line search goes back
         self.chi2, self.codes = 2 * half, tuple(int(c) for c in codes)
         return half + 0.5 * float(z @ z), deviation * smooth.to_whitened(self.p, g) + z
 
@@ -127,7 +127,7 @@ class _Search:
         self.progress(self.k, self.chi2 / self.problem.components)
 
     def write(self) -> None:
-        """Write the point reached to a file that is there whole or not at all."""
+        """Write the current point; the file is never left half written."""
         if self.file is None:
             return
         with whole(self.file) as new, h5py.File(new, "w") as f:
@@ -139,7 +139,7 @@ class _Search:
         """Go on from the file of an earlier run.
 
         Raises:
-            InputError: a file that is damaged, or of another problem.
+            InputError: the file is damaged, or belongs to another problem.
         """
         if not self.file.is_file():
             return
@@ -148,23 +148,23 @@ class _Search:
                 refuse_other(self.file, f.attrs, self.marks)
                 self.z, self.k = f["z"][:], int(f["k"][()])
                 self.history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
-        except (OSError, KeyError):  # no HDF5, or of another program
-            raise InputError(f"{self.file} is of another fit: leave out --resume or name another --out") from None
+        except (OSError, KeyError):  # not HDF5, or from another program
+            raise InputError(f"{self.file} belongs to another fit: leave out --resume or name another --out") from None
 
 
 _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "seconds")
 
 
 class MapOptions(NamedTuple):
-    """How a map is searched for and kept."""
+    """Options of the search for a map, and of the file that keeps its progress."""
 
-    max_iterations: int = 60  # of L-BFGS for each weight
-    modes: int = 60  # the most directions of the field that the uncertainty looks at
-    file: Path | None = None  # HDF5 file for the point of every iteration; None: nowhere
-    resume: bool = False  # begin from that file if it is there
-    #: Called after each iteration: number of the weight, chi^2 over the number of components.
+    max_iterations: int = 60  # L-BFGS iterations for each deviation of the prior
+    modes: int = 60  # most directions of the field for which the uncertainty is computed
+    file: Path | None = None  # HDF5 file for the point of every iteration; None: no file
+    resume: bool = False  # begin from that file if it exists
+    #: Called after each iteration with the index of the deviation and chi^2 per component.
     progress: Callable[[int, float], None] = lambda weight, chi2: None
-    mesh_error: bool = True  # estimate the error by the meshes, and how far it moves the field (`mesh_bias`)
+    mesh_error: bool = True  # estimate the error of the meshes, and its change of the field (`mesh_bias`)
 
 
 def estimate(
@@ -177,8 +177,8 @@ def estimate(
     """The field of `name` that explains the data.
 
     Args:
-        problem: scenes of one mesh and what was measured.
-        name: dotted name of a positive number of the law; what the scenes have there is where the field begins.
+        problem: scenes with one mesh, and the measurements.
+        name: dotted name of a positive number of the law; the field begins at its value in the scenes.
         length: correlation length of the prior [m].
         options: how to search, see `MapOptions`.
         changes: fields of `options` by their names, for example ``max_iterations=40``.
@@ -220,7 +220,7 @@ def estimate(
 
 
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
-    """Try one deviation after another, each from the last field, until chi^2 is as large as the noise allows."""
+    """Try one deviation after another, each from the last field, until chi^2 is down to the noise."""
     while True:
         begin, before = time.perf_counter(), search.evaluations
         bounds = [(-_BOUND, _BOUND)] * len(search.z)
@@ -258,7 +258,7 @@ class _Asked(NamedTuple):
 
     @classmethod
     def at(cls, search: _Search, deviation: float, m: np.ndarray) -> "_Asked":
-        """At the nodal field m (V,)."""
+        """Linearise the runs at the nodal field m (V,)."""
         name = search.name
 
         @jax.jit
@@ -283,7 +283,7 @@ def _measured_directions(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray,
     """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
     k = min(modes, n - 2, jax.eval_shape(asked.push, jnp.zeros(n)).size)
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=asked.product, dtype=float)
-    # Directions of eigenvalue far below 1 are the prior's: no digit of them matters.
+    # The prior determines directions with an eigenvalue far below 1: they need no accuracy.
     values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
@@ -291,7 +291,7 @@ def _measured_directions(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray,
 def _bias_of_map(
     search: _Search, asked: _Asked, m: np.ndarray, values: np.ndarray, vectors: np.ndarray
 ) -> np.ndarray | None:
-    """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their errors of the residuals."""
+    """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their error in the residuals."""
     left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, jnp.asarray(m)))
     if left_out is None or not np.all(np.isfinite(left_out)):
         return None
@@ -304,14 +304,15 @@ def _bias_of_map(
         scipy.sparse.linalg.LinearOperator((n, n), matvec=f, dtype=float)
         for f in (lambda z: z + asked.product(z), solved)
     )
-    # A correction of first order: a hundredth of it is far below its own error.
+    # The correction is of first order only, so a tolerance of 1 % is far below its own error.
     z, _ = scipy.sparse.linalg.cg(hessian, asked.gradient(left_out), rtol=1e-2, maxiter=30, M=inverse)
     return asked.deviation * smooth.field_at_nodes(asked.p, z)
 
 
 def bias_sentence(found: Field) -> str | None:
-    """A sentence where the mesh moves the map by more than its standard deviation; None if it does so nowhere, or if
-    this is not known."""
+    """A sentence if the mesh moves the map by more than its standard deviation at some node; None if it does not, or if
+    this is not known.
+    """
     if found.mesh_bias is None:
         return None
     largest, beyond = np.abs(found.mesh_bias).max(), np.abs(found.mesh_bias) > found.sd

@@ -1,8 +1,9 @@
 """A stiff or soft sphere in a uniform body, from measured displacements: where, how large, how stiff.
 
-It has few parameters, unlike a map. A smooth map spreads a sharp edge, so its peak does not measure the modulus of an
-inclusion. A map only says where to begin. The edge is as soft as the mesh is coarse, which keeps the sphere's place
-differentiable. Radius and modulus trade off: the elements should be small beside the sphere, or quadratic.
+The sphere has few parameters, unlike a map. A smooth map spreads a sharp edge, so its peak does not measure the modulus
+of an inclusion. The map only gives the start. The edge is smooth over a length in proportion to the element size, so
+the residuals can be differentiated by the sphere's place. Errors of radius and modulus compensate each other: the
+elements should be much smaller than the sphere, or quadratic.
 """
 
 from typing import Any
@@ -18,7 +19,7 @@ from liverjax.core.struct import Number
 from liverjax.mesh.shape_functions import basis
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Width of the edge over the mean distance of two points.
+#: Width of the edge divided by the mean distance of two integration points.
 _EDGE = 0.25
 NAMES = ("centre.x", "centre.y", "centre.z", "radius", "background", "inclusion")
 
@@ -39,8 +40,9 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
-    """Unknowns u of the sphere that the map suggests: the places where ln(modulus) departs by more than half of the
-    largest departure."""
+    """Start u of the sphere from the map: elements whose ln(modulus) differs from the background by more than half of
+    the largest difference.
+    """
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
     volumes = np.asarray(mesh.volumes)
@@ -61,11 +63,11 @@ def estimate(problem: Problem, name: str, start: np.ndarray, **options: Any) -> 
     """Centre and radius [m] of the sphere, the number `name` outside and inside, with standard errors.
 
     Args:
-        problem: scenes of one mesh and what was measured.
+        problem: scenes with one mesh, and the measurements.
         name: dotted name of a positive number of the law.
         start: centre (3,), ln(radius), and logarithms of the background over the scene's number, and of the sphere's
             over the background's, (6,).
-        options: of `fitting.fits.scene_numbers.fit`.
+        options: options of `fitting.fits.scene_numbers.fit`.
     """
     base, mesh = start_of(problem, name), problem.scenes[0].mesh
     width = edge_width(mesh)

@@ -1,9 +1,10 @@
 """Errors of the instrument in a fit, shared by all points: inertia, friction, gap, each with a prior; and compression.
 
-The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K where I is off by delta. Fitted without a
-prior, such a term takes up the model's misfit. Here delta is normal around 0 with `raw_torque.UNCERTAINTY`, it
-is found from raw columns alone, and it is used only if it stays the same when the end of the band is left out. The
-friction b of the bearing adds b omega / K to G''; its error is normal around 0 with the standard deviation of the user.
+The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K if I is off by the relative error delta.
+Without a prior, such a term would fit the model's misfit. Here delta has a normal prior around 0 with the standard
+deviation `raw_torque.UNCERTAINTY`. It is fitted only if the file has raw columns, and it is used only if it stays the
+same when the end of the band is left out. The friction b of the bearing adds b omega / K to G''; its error has a normal
+prior around 0 with the standard deviation that the user gives.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ from fitting.readers.frequency_sweep import Sweep, some
 from fitting.rigs import compression
 from liverjax import laws
 
-#: Rounds of fit and correction.
+#: Most rounds of fit and correction.
 ROUNDS = 4
 
 
@@ -31,7 +32,7 @@ class Nuisance(NamedTuple):
 
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] by one standard deviation
-    unit: float  # the standard deviation, as it is reported
+    unit: float  # the standard deviation in the unit of the report
     words: str  # what is off, for a sentence; {} is the number
 
     @property
@@ -46,11 +47,11 @@ class Nuisance(NamedTuple):
 
 
 class InstrumentErrors(NamedTuple):
-    """How far what was subtracted is off, in standard deviations of the priors."""
+    """Errors of what the instrument subtracted, in standard deviations of their priors."""
 
     values: np.ndarray  # (k,)
     covariance: np.ndarray  # (k, k)
-    part: np.ndarray | None  # the values without the last half decade; None where too few points are left
+    part: np.ndarray | None  # the values without the last half decade; None if too few points are left
     part_errors: np.ndarray | None
 
     @property
@@ -62,7 +63,7 @@ class InstrumentErrors(NamedTuple):
 
 
 def nuisances_of(sweep: Sweep) -> list[Nuisance]:
-    """The errors that the sweep can tell."""
+    """The errors of the instrument for which the sweep has the inertia or the friction."""
     out = []
     if sweep.inertia is not None:
         moved, words = raw_torque.UNCERTAINTY * sweep.inertia, "the inertia that the instrument subtracted is off by {}"
@@ -74,10 +75,10 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
 
 
 def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
-    """The fit of Prony modes with the instrument's errors beside them, and the sweep corrected by them.
+    """Fit the instrument's errors together with the Prony modes; return the fit and the corrected sweep.
 
-    Fit and sweep stay as they were if nothing tells of the instrument, or if the model has no Prony modes. Where one of
-    the errors moves with the band, they are reported and not used.
+    Fit and sweep stay as they are if the sweep has no data of the instrument, or if the model has no free Prony modes.
+    If one of the errors changes with the band, all of them are reported but not used.
     """
     known = nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
@@ -105,7 +106,7 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
 
 
 def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
-    """The errors that stand beside the modes of a fit, and what its sweep is corrected by, in deviations (k,)."""
+    """The errors fitted together with the modes, and the correction (k,) of the sweep in their standard deviations."""
     told = fit.details.get("instrument")
     if told is None or told["moves_with_the_band"]:
         return [], np.zeros(0)
@@ -114,7 +115,7 @@ def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
 
 
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
-    """A sentence on each error that moves with the band."""
+    """A sentence on each error that changes with the band."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
     for k in np.flatnonzero(~errors.steady):
         n = known[k]
@@ -168,13 +169,13 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
         noise = max(fit.uncertainty.noise, 1e-12)
         d = directions(here, known)
-        own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # what the modes cannot follow
+        own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # the part that the modes cannot fit
         precision = own.T @ own / noise**2 + np.eye(len(known))
-        # The prior is of the whole error, the residuals are of what is left of it.
+        # The prior is on the whole error; the residuals show the part that is not corrected yet.
         step = np.linalg.solve(precision, own.T @ r / noise**2 - values)
         values, covariance = values + step, np.linalg.inv(precision)
         corrected = _shifted(sweep, known, values)
-        if np.any(corrected.storage <= 0) or np.any(corrected.loss <= 0):  # a sweep that is the instrument's
+        if np.any(corrected.storage <= 0) or np.any(corrected.loss <= 0):  # nothing but the instrument in the sweep
             return values - step, covariance, fit
         fit = viscoelastic.modes_from(corrected, fit.solution.u[None], fit.kind)._replace(details=fit.details)
         if np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))):
@@ -210,12 +211,12 @@ def with_gap_error(fit: Fit, relative: float) -> Fit:
 def of_compressed_sample(fit: Fit, sweep: Sweep, factors: compression.Shares) -> Fit:
     """The fit in closed form of a compressed sample, with the numbers of the sample at rest.
 
-    Storage and loss of the fit stay those that the instrument shows, and so do its residuals.
+    Storage modulus, loss modulus and residuals of the fit still are those of the compressed sample.
 
     Args:
-        fit: of the moduli as they were measured. Moduli of its own numbers are divided, too.
-        sweep: these moduli.
-        factors: what the compression makes of them.
+        fit: fit of the measured moduli. Moduli among its own numbers are divided by the factors, too.
+        sweep: the measured moduli.
+        factors: factors by which the compression changes the relaxing and the equilibrium moduli.
     """
     kind, own, details = _kind_at_rest(fit.kind, factors), fit.parameters, fit.details
     if kind.moduli is not None:
@@ -261,7 +262,7 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
 
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
-    """New Prony modes for a model at rest: those made for the measured moduli mix relaxing and equilibrium part."""
+    """New Prony modes for a model at rest: the modes of the measured moduli mix relaxing and equilibrium part."""
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"
@@ -272,7 +273,7 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
 
 
 def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) -> dict[str, object]:
-    """The part `precompression` of fit.json, of `of_compressed_sample` or of the simulation after it."""
+    """The part `precompression` of fit.json, for a fit in closed form or through the simulation."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
     factors = compression.shares(law, strain)

@@ -1,7 +1,7 @@
 """One set of Prony parameters from several tests at once: a sweep, creep, tension, indentation, each with its noise.
 
-Residuals of all tests over their noise are minimised together by Levenberg-Marquardt (forward mode through every rig);
-the law is scaled to G0, as in the torsion fit.
+Residuals of all tests, divided by their noise, are minimised together by Levenberg-Marquardt (forward mode through
+every rig); the law is scaled to G0, as in the torsion fit.
 """
 
 import time
@@ -37,11 +37,11 @@ class Test(NamedTuple):
     predict: Callable[[Law, Prony, generalised_maxwell.Maxwell], tuple[jax.Array, jax.Array]]  # (n,), worst code
     measured: np.ndarray  # (n,)
     sd: np.ndarray  # (n,) standard deviation of its noise
-    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) what a mesh without end would add; None: nothing
+    mesh_error: Callable[[Law, Prony], jax.Array] | None = None  # (n,) change by an infinitely fine mesh; None: none
 
 
 def sweep(data: Sweep) -> Test:
-    """A frequency sweep in closed form; its noise is that of the file, or what the best Prony modes leave of it."""
+    """A frequency sweep in closed form; its noise is from the file, or from the misfit of the best Prony modes."""
     omega = jnp.asarray(data.angular_frequency)
 
     def predict(law, viscosity, model):
@@ -62,14 +62,14 @@ def torsion_sweep(data: Sweep, rig: torsion.Rig, torque: Number, drive: torsion.
 
 
 def _noise_of(data: Sweep) -> np.ndarray:
-    """Standard deviations (2n,) [Pa] of the moduli. If the scales are not the noise of the points, they are only
-    weights.
+    """Standard deviations (2n,) [Pa] of the moduli. Without standard deviations in the file the scales are only
+    weights, and the misfit of Prony modes gives the noise.
     """
     scales = np.concatenate(data.deviations)
     if data.noise_given:
         return scales
     _, tried = viscoelastic.choose_modes(data, generalised_maxwell.refuse_impossible(data))
-    # Modes that this sweep leaves free count too: the other tests may determine them.
+    # Modes that this sweep does not determine count too: the other tests may determine them.
     return scales * max(QUIETEST, min(fit.uncertainty.noise for fit in tried))
 
 
@@ -77,14 +77,14 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
     """A test in a rig of `fitting.rigs.glued`: readings (T,) [N] or [m] and their noise, a number or (T,).
 
     Raises:
-        InputError: another number of readings than the rig has steps, noise that is not positive.
+        InputError: the readings are not as many as the rig's steps, or the noise is not positive.
     """
     measured = np.asarray(measured, float)
     sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
     if measured.shape != (rig.scene.solve.steps,):
-        raise InputError(f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one a step")
+        raise InputError(f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one per step")
     if not (np.all(np.isfinite(measured)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
-        raise InputError(f"{name}: readings and their positive noise must be finite numbers: mend them")
+        raise InputError(f"{name}: readings and their positive noise must be finite numbers: correct them")
 
     def predict(law, viscosity, model):
         readings, codes = glued.read(rig, law, viscosity)
@@ -103,14 +103,14 @@ def fit(
 ) -> Estimate:
     """The Maxwell parameters that explain all tests, with standard errors (names of `uncertainty.parameter_names`).
 
-    Where tests go through rigs, `mesh_bias` is the part of each value that their meshes cause: subtract it to correct.
-    A warning says where that is more than the standard error.
+    If tests are simulated in rigs, `mesh_bias` is the part of each value that their meshes cause: subtract it to
+    correct. A warning is given if it is more than the standard error.
 
     Args:
         tests: one or more.
-        start: where to begin; its number of modes is kept.
-        law: scaled to G0.
-        part: of the stress that relaxes, as in `Prony`.
+        start: first values of the parameters; the number of modes does not change.
+        law: the law of all tests; the fit scales it to G0.
+        part: part of the stress that relaxes, as in `Prony`.
         max_iterations, progress: as in `levenberg_marquardt_host`.
     """
     begin = time.perf_counter()
@@ -154,7 +154,7 @@ def fit(
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:
-    """Errors of the readings by their meshes, over the noise (n,)."""
+    """Errors (n,) of the readings by their meshes, divided by the noise."""
     return np.concatenate(
         [
             np.zeros(len(test.sd)) if test.mesh_error is None else np.asarray(test.mesh_error(*material)) / test.sd

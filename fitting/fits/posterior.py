@@ -1,10 +1,12 @@
 """Samples of the posterior of a fit, from the data and a stated prior.
 
-The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. Without
-deviations its prior is 1 / s. With deviations it is 1 / s above 1: the deviations may be enlarged, never reduced.
+The likelihood is that of the fit: independent errors on the given scales. Their size s is integrated out. If the data
+have no standard deviations, the prior of s is 1 / s. If they have, it is 1 / s for s > 1: the deviations may be
+enlarged, never reduced.
 
-Errors of the instrument that a fit of a sweep has beside its modes are numbers of the posterior too, with their priors.
-A sweep says nothing of the gap, so its error is drawn independently: one factor for all moduli of a draw.
+Errors of the instrument that are fitted together with the modes of a sweep are numbers of the posterior too, with their
+priors. A sweep does not determine the gap, so the gap's error is drawn independently: one factor for all moduli of a
+draw.
 """
 
 import time
@@ -56,16 +58,16 @@ class Posterior(NamedTuple):
     chains: Chains  # the same draws in the coordinates of the fit, and how they were found
     prior: str  # in words
     seconds: float
-    simulated: dict[str, float] | None = None  # of draws that were simulated: how many, and the largest difference
+    simulated: dict[str, float] | None = None  # number of simulated draws, and their largest difference
 
     def warnings(self) -> list[str]:
-        """Warnings where there are too few draws."""
+        """Warnings if there are too few draws, or if the linear rig is not accurate enough."""
         worst = int(np.argmax(self.r_hat))
         out = []
         if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
             out.append(
                 f"the posterior is that of the linear rig; in {SIMULATED} simulated draws its log density is off by up "
-                f"to {self.simulated['largest_difference']:.2g}: trust its intervals to that only"
+                f"to {self.simulated['largest_difference']:.2g}: its intervals are only as accurate"
             )
         if self.r_hat[worst] < AGREED:
             return out
@@ -76,14 +78,14 @@ class Posterior(NamedTuple):
         ]
 
 
-#: R-hat below which the chains agree, and the smallest relative error of data: without one a posterior is a point.
+#: R-hat below which the chains agree, and the smallest relative error of data: with none a posterior is a point.
 AGREED, QUIETEST = 1.01, 1e-6
 
 
 class Target(NamedTuple):
     """A posterior density of u, and the numbers to report."""
 
-    residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors over their scales
+    residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors divided by their scales
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
 
@@ -95,7 +97,7 @@ class Target(NamedTuple):
 
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
-    """Log of the integral of s^-m exp(-square / 2 s^2) ds / s over all s, or over s >= 1 where deviations are given."""
+    """Log of the integral of s^-m exp(-square / 2 s^2) ds / s over all s, or over s >= 1 if deviations are given."""
     half = 0.5 * np.maximum(square, QUIETEST**2 * count)
     out = -0.5 * count * np.log(half)
     return out + np.log(scipy.special.gammainc(0.5 * count, half)) if deviations_given else out
@@ -112,10 +114,10 @@ def target(
 
     Args:
         kind: what u means: Prony modes or a fractional model.
-        residuals: u (W, P) -> (W, m) over their scales.
+        residuals: u (W, P) -> (W, m), divided by their scales.
         resolved: shortest and longest relaxation time [s] that the data resolve.
         size: measured moduli (n,) [Pa].
-        given: the deviations are.
+        given: whether standard deviations of the data are given.
     """
     smallest, largest = float(size.min()), float(size.max())
     if kind.values is None:
@@ -162,7 +164,7 @@ class Modes(NamedTuple):
         return (generalised_maxwell.natural_fluid if self.fluid else generalised_maxwell.natural)(u)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported numbers, for so many coordinates."""
+        """Names of the reported numbers, for this number of coordinates."""
         first, *others = parameter_names(parameters // 2)
         return (first, *others) if self.fluid else (first, "equilibrium_modulus", *others)
 
@@ -174,11 +176,11 @@ class Modes(NamedTuple):
 
 
 class Springpots(NamedTuple):
-    """Prior and numbers of a fractional model; u are its free places of `springpots`: log moduli and logits."""
+    """Prior and numbers of a fractional model; u are its free numbers in `springpots`: log moduli and logits."""
 
     model: Fractional
     moduli: tuple[float, float]  # ends of their logs
-    values: Callable  # of one u, of JAX
+    values: Callable  # JAX function of one u
     words: str = PRIORS["fractional"]
 
     @property
@@ -208,7 +210,7 @@ class Springpots(NamedTuple):
 
 
 class WithInstrument(NamedTuple):
-    """Prior and numbers of Prony modes and of errors of the instrument: the last places of u, in their deviations."""
+    """Prior and numbers of Prony modes and of errors of the instrument; these end u, in standard deviations."""
 
     modes: Modes
     errors: list[Nuisance]
@@ -234,7 +236,7 @@ class WithInstrument(NamedTuple):
         return np.concatenate([modes, rng.standard_normal((count, len(self.errors)))], axis=1)
 
     def names(self, parameters: int) -> tuple[str, ...]:
-        """Names of the reported numbers, for so many coordinates."""
+        """Names of the reported numbers, for this number of coordinates."""
         return (*self.modes.names(parameters - len(self.errors)), *(n.reported for n in self.errors))
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
@@ -250,7 +252,7 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
         at: the density.
         parameters: P, length of u.
         count: draws of each chain.
-        seed: of the generators; the same seed gives the same draws.
+        seed: seed of the random generators; the same seed gives the same draws.
     """
     begin, prior = time.perf_counter(), at.prior
     density = Density(at.log_likelihood, prior.log_prior, lambda rng, n: prior.from_prior(rng, n, parameters))
@@ -296,7 +298,7 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
 
 
 def _beside_instrument(fit: Fit, sweep: Sweep, residuals: Callable[[np.ndarray], np.ndarray]) -> tuple[Target, int]:
-    """The posterior of Prony modes beside the errors of the instrument that the fit has, and the length of u."""
+    """The posterior of Prony modes and of the errors of the instrument that the fit has, and the length of u."""
     own, parameters = _sweep_target(fit.kind, sweep, residuals), len(fit.solution.u)
     known, corrected_by = instrument.used_errors(fit, sweep)
     if not known or not isinstance(own.prior, Modes):
@@ -315,17 +317,16 @@ def _sweep_target(kind: Kind, sweep: Sweep, residuals: Callable[[np.ndarray], np
     return target(kind, residuals, sweep.resolved, size, sweep.noise_given)
 
 
-#: Draws that are simulated, and the difference of their log density above which a warning says so.
+#: Number of draws that are simulated, and the difference of their log density above which a warning is given.
 SIMULATED, DIFFERENT = 12, 0.1
 
 
 def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, seed: int = 0) -> Posterior:
     """Sample the posterior of a fit of Prony modes through the torsion simulation.
 
-    The density is that of the linear rig, with its recursion in time. A complex factor for each frequency adds the
-    effect of the simulation at the minimum. Some draws are then simulated in full. `Posterior.simulated` has the
-    largest difference between their simulated and their approximate log likelihood: it shows how good the approximation
-    is.
+    The density is that of the linear rig, with its recursion in time. A complex factor for each frequency corrects it
+    to the simulation at the minimum. Some draws are then simulated in full. `Posterior.simulated` has the largest
+    difference between their simulated and their approximate log likelihood: it shows how good the approximation is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
     law, omega, measured = data[1], data[2], data[4]
@@ -350,7 +351,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     modes = some[:, : len(fit.solution.u)]
     program = compiled(partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data)
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
-    exact += own.residuals(some) - residuals(modes)  # by errors of the instrument
+    exact += own.residuals(some) - residuals(modes)  # change by the errors of the instrument
     likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)
     apart = float(np.max(np.abs(likelihood - own.log_likelihood(some))))
     checked = {"draws": float(SIMULATED), "largest_difference": apart}
@@ -358,7 +359,7 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
-    """The density of a relaxation or creep test in closed form, of Prony modes or of a fractional model."""
+    """Sample the posterior of a relaxation or creep test in closed form, of Prony modes or of a fractional model."""
     if fit.kind.values is None:
         one, data = time_tests.residuals_in_time(test, fit.kind)
         residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))

@@ -22,7 +22,7 @@ class Samples(NamedTuple):
     sweeps: list[Sweep]
     fits: list[Fit]
     populations: dict[str, Population | None]  # by the names of `values_of_sample`
-    typical: Maxwell  # Prony modes of the sample in the middle, for a simulation
+    typical: Maxwell  # Prony modes of a typical sample, for a simulation
     compared: list[dict]  # models and numbers of modes, best first
 
     @property
@@ -54,8 +54,8 @@ def fit(
     Args:
         sweeps: two or more.
         model: one of `models.MODELS`.
-        modes: N of "prony", or "auto".
-        progress: told what is fitted.
+        modes: number of Prony modes, or "auto".
+        progress: called with the name of each fit.
     """
     dense = [generalised_maxwell.refuse_impossible(s) for s in sweeps]
     tried: list[_Candidate] = []
@@ -89,7 +89,7 @@ def _candidate_for_all(sweeps: list[Sweep], fits: list[Fit], label: dict) -> _Ca
 def _modes_for_all(
     sweeps: list[Sweep], dense: list[Spectrum], modes: int | str, progress: Callable
 ) -> list[_Candidate]:
-    """Prony modes of growing number; two that do not lower the summed criterion end the search."""
+    """Fits of 1, 2, … Prony modes; the search ends after two that do not lower the summed criterion."""
     largest = min(generalised_maxwell.largest_number_of_modes(s) for s in sweeps)
     numbers = range(1, min(largest, min(map(uncertainty.supported_modes, sweeps))) + 1)
     if modes != "auto":
@@ -133,7 +133,7 @@ def _place(name: str) -> int:
 
 
 def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str, Population | None]) -> Maxwell:
-    """Prony modes at the means of the population. Modes without a mean are left out; other numbers are then medians."""
+    """Prony modes at the means of the population. Modes without a mean are left out; other numbers get the median."""
     kind, every = fits[0].kind, [values_of_sample(f) for f in fits]
     middle = {n: float(np.median([row.get(n, (0.0,))[0] for row in every])) for n in populations}
     mean = {name: p.mean for name, p in populations.items() if p is not None}

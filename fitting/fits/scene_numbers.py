@@ -32,7 +32,7 @@ class Problem(NamedTuple):
 
 
 def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "all") -> tuple[jax.Array, jax.Array]:
-    """Residuals of all scenes (n,), and the worst code of each, with their numbers replaced by `values`."""
+    """Residuals (n,) of all scenes with the numbers `values`, and the worst status code of each scene."""
     parts, codes = [], []
     for scene, data in zip(problem.scenes, problem.data, strict=True):
         result = lj.simulate(lj.with_parameters(scene, values), store=store)
@@ -42,12 +42,12 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
 
 
 class Unknowns(NamedTuple):
-    """The unknowns u (n,) of Gauss-Newton, and the numbers that they stand for."""
+    """The unknowns u (n,) of Gauss-Newton, and the functions that give the numbers of the scenes from u."""
 
     start: np.ndarray  # first u (n,)
     values_of: Callable[[jax.Array], Content]  # u -> numbers of the scenes by dotted name
     natural_of: Callable[[jax.Array], jax.Array]  # u -> the parameters to report (m,)
-    names: Sequence[str]  # of these
+    names: Sequence[str]  # names of these parameters
 
 
 def fit(
@@ -63,8 +63,8 @@ def fit(
         problem: scenes and data.
         unknowns: u, and how numbers and parameters follow from it.
         max_iterations, progress: see `levenberg_marquardt_host`.
-        mesh_error: estimate what the meshes leave out, and how far that moves the parameters (`mesh_bias`); a warning
-            says where it is more than the standard error. It takes a run more, and one linear solve a step.
+        mesh_error: estimate the error of the meshes, and the change of the parameters by it (`mesh_bias`); a warning is
+            given if the change is more than the standard error. It needs one more run, and one linear solve per step.
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names = unknowns
@@ -112,19 +112,19 @@ def missing(problem: Problem, values: Content) -> np.ndarray:
 
 
 def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
-    """`missing`, or None with a warning where a scene has no estimate of its mesh's error."""
+    """`missing`, or None with a warning if there is no estimate of the mesh's error for a scene."""
     try:
         return missing(problem, values)
     except InputError as e:
-        warnings.warn(f"what the mesh does to the fit is not known: {e}", stacklevel=3)
+        warnings.warn(f"the effect of the mesh on the fit is not known: {e}", stacklevel=3)
         return None
 
 
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:
-    """Numbers of the scenes by their dotted names; positive ones stay positive.
+    """Fit the numbers of the scenes with these dotted names; positive numbers stay positive.
 
     Raises:
-        InputError: a name that a scene does not have, or one of no floating-point number.
+        InputError: a scene does not have a name, or the name is not that of a floating-point number.
     """
     starts = [numbers_at(problem.scenes[0], name) for name in names]
     sizes = [np.size(v) for v in starts]

@@ -24,7 +24,7 @@ from liverjax.physics.viscosity import Prony
 
 
 class Simulation(NamedTuple):
-    """How the torsion fit simulates: geometry [m], law, recursion and resolution."""
+    """Settings of the simulated torsion: geometry [m], law, recursion and resolution."""
 
     radius: float = torsion.RADIUS
     height: float = torsion.HEIGHT
@@ -34,16 +34,16 @@ class Simulation(NamedTuple):
     steps: int = 50
     cell_size: float | None = None
     strain: float = 1e-3  # amplitude at the rim (section 5.2)
-    density: float | None = None  # of the sample [kg/m^3]; None: moduli that the instrument corrected for inertia
+    density: float | None = None  # of the sample [kg/m^3]; None: the instrument has corrected the moduli
     precompression: float = 0.0  # part of the height at rest by which the plates compress the sample (`compression`)
 
 
-#: Strain at the rim up to which the derivatives of the linear rig serve: they are off by less than the strain.
+#: Up to this strain at the rim the linear rig gives the derivatives; their relative error is below the strain.
 LINEAR_STRAIN = 1e-2
 
 
 def law_and_prony(model: Maxwell, law: laws.Law, simulation: Simulation) -> tuple[laws.Law, Prony]:
-    """The sample of Prony modes: the law scaled to their G0, and how it relaxes."""
+    """The material of the sample from Prony modes: the law scaled to their G0, and its relaxation."""
     viscosity = Prony(
         ratios=model.ratios,
         relaxation_times=model.relaxation_times,
@@ -60,7 +60,7 @@ def _and_prior(r: jax.Array, u: jax.Array, kind: Kind) -> jax.Array:
 def simulated_residuals(
     u: jax.Array, data: tuple, simulation: Simulation, kind: Kind = Kind()
 ) -> tuple[jax.Array, torsion.Moduli]:
-    """Simulated less measured moduli over their deviations (2n,), then rows of a prior; and the simulated moduli.
+    """Simulated minus measured moduli, divided by their deviations (2n,), then rows of a prior; and the moduli.
 
     Args:
         u: numbers of `kind`.
@@ -80,8 +80,9 @@ def with_jacobian(
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
     """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
 
-    The derivative is that of the linear rig; with large strain or inertia it is that of the simulation. Gauss-Newton
-    finds the same minimum with it in a small part of the time (experiments/benchmarks/torsion_speed.py).
+    The derivative is that of the linear rig, or that of the simulation if strain is large or inertia is simulated. With
+    the derivative of the linear rig Gauss-Newton finds the same minimum in a small part of the time
+    (experiments/benchmarks/torsion_speed.py).
     """
     if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
 
@@ -113,7 +114,7 @@ def _linear_moduli(
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
-    """The sample of a simulation; its mesh is coarse where the bias of the mesh is known exactly."""
+    """The sample of a simulation; its mesh is coarse if the bias of the mesh is known exactly."""
     cell, height = simulation.cell_size, simulation.height
     if cell is None and simulation.density is None and simulation.strain <= LINEAR_STRAIN:
         cell = torsion.linear_cell_for(simulation.radius, height)
@@ -121,7 +122,7 @@ def rig_of(simulation: Simulation) -> torsion.Rig:
         return torsion.make_rig(simulation.radius, height, cell, density=simulation.density)
     if simulation.part != "all":
         raise InputError(
-            f"a precompression of {simulation.precompression:g} is of a sample whose whole stress relaxes: leave out "
+            f"a precompression of {simulation.precompression:g} is for a sample whose whole stress relaxes: leave out "
             f"part {simulation.part!r}"
         )
     tall = height / (1 - simulation.precompression)
@@ -137,7 +138,7 @@ def simulation_data(sweep: Sweep, simulation: Simulation) -> tuple:
     return rig, laws.typical(simulation.law), jnp.asarray(sweep.angular_frequency), torque, measured, scales
 
 
-#: What the closed form says of data and model, which the simulation leaves as it is: words of warnings, and details.
+#: Results of the closed form that the simulation keeps: words by which its warnings are found, and names of details.
 OF_THE_DATA = (
     "modes would follow",
     "about as well as",
@@ -196,7 +197,7 @@ def through_torsion(
             return found, simulated_residuals(found.u, data, simulation, kind)[1]
 
         (found, m), compiling, running = timed(minimised, u0, *data)
-    if isinstance(start.solution.u, np.ndarray):  # what follows runs where the closed form did
+    if isinstance(start.solution.u, np.ndarray):  # what follows runs on the host, as the closed form did
         found = Solution(*(np.asarray(field) for field in found))
     storage, loss = np.asarray(m.storage), np.asarray(m.loss)
     worst = int(np.asarray(m.statistics.status).max())
@@ -226,8 +227,8 @@ def _with_shared_errors(fit: Fit, start: Fit) -> Fit:
 def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     """Change of the parameters by the simulation's mesh and time steps, to first order (`mesh_bias`).
 
-    At small strain both are known: the moduli of the recursion without a mesh, and those of continuous time. Those of
-    a compressed sample without a mesh are extrapolated from a finer mesh.
+    At small strain both follow from moduli without a mesh: by the recursion, and in continuous time. The moduli of a
+    compressed sample without a mesh are extrapolated from a finer mesh.
     """
     law, omega, scales = data
     scaled, prony = law_and_prony(fit.kind.maxwell(fit.solution.u), law, simulation)
@@ -251,7 +252,7 @@ def _of_no_mesh(law: laws.Law, prony: Prony, omega: jax.Array, steps: int) -> tu
     return torsion.linear_moduli(law, prony, omega, steps), torsion.linear_moduli(law, prony, omega, None)
 
 
-#: Length of a cell of the finer mesh over that of the mesh, for the extrapolation.
+#: Cell length of the finer mesh, divided by that of the mesh, for the extrapolation.
 FINER = 0.62
 
 
@@ -260,7 +261,7 @@ def _of_finer_mesh(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Complex moduli (n,) of a compressed sample without a mesh: by the recursion, and in continuous time.
 
-    The error of the mesh is taken to be of second order.
+    The error of the mesh is assumed to be of second order.
     """
     cell = simulation.cell_size or torsion.linear_cell_for(simulation.radius, simulation.height)
     rig = rig_of(simulation._replace(cell_size=FINER * cell))
@@ -299,7 +300,7 @@ def _simulation_details(
 
 
 def largest_shift(closed: Fit, simulated: Fit) -> float:
-    """Largest change of a parameter by the simulation, over its standard error."""
+    """Largest change of a parameter by the simulation, divided by its standard error."""
     shift = np.abs(simulated.uncertainty.values - closed.uncertainty.values)
     errors = simulated.uncertainty.standard_errors
     known = np.isfinite(errors) & (shift > 1e-6 * np.abs(closed.uncertainty.values))
@@ -307,13 +308,13 @@ def largest_shift(closed: Fit, simulated: Fit) -> float:
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:
-    """A warning where the simulation moves a parameter by more than its standard error, with the cause."""
+    """A warning, with the cause, if the simulation moves a parameter by more than its standard error."""
     shift = simulated.uncertainty.values - closed.uncertainty.values
     errors = simulated.uncertainty.standard_errors
     cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
     if simulated.details.get("precompression_strain"):
-        cause, remedy = "the plates, which hold the sides of the sample, move", "which plates yours are decides it"
-    if simulated.details.get("density_kg_m3") is not None:  # which the closed form knows nothing of
+        cause, remedy = "the plates, which hold the sides of the sample, move", "for smooth plates use closed-form"
+    if simulated.details.get("density_kg_m3") is not None:  # the closed form has no inertia
         cause, remedy = "the sample's inertia and the discretisation move", "raise --steps to see which it is"
     out = []
     for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):

@@ -21,20 +21,20 @@ from liverjax.laws import Law, gradient_check, homogeneous
 from liverjax.laws.gradient_check import ellipticity
 
 STARTS = 128
-#: Weight of a falling stress in the residuals: 1 % of a curve's stress weighs as much as all of its misfit.
+#: Weight of a falling stress in the residuals: a fall by 1 % of a curve's stress counts like a misfit of 100 %.
 STIFFNESS = 100.0
 
 
 class Candidate(NamedTuple):
-    """A law to be fitted: unconstrained numbers u to its parameters."""
+    """A law to be fitted, and the functions from unconstrained numbers u to its parameters."""
 
     label: str
     names: tuple[str, ...]
     units: tuple[str, ...]
     values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
-    law: Callable[[jax.Array], Law]  # of these values, without volumetric energy
+    law: Callable[[jax.Array], Law]  # law with these values, without volumetric energy
     random: Callable[[np.random.Generator, int], np.ndarray]  # starts (n, len(u))
-    notes: tuple[str, ...] = ()  # what is not fitted, sentences
+    notes: tuple[str, ...] = ()  # sentences on parameters that are not fitted
 
 
 class LawFit(NamedTuple):
@@ -62,17 +62,17 @@ class LawFit(NamedTuple):
     limits: dict[str, str]  # parameters that ran away to 0 or infinity
 
 
-#: A positive parameter so many times above or below its typical size ran into the limit of its law.
+#: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law.
 RUNAWAY = 1e6
 _tangents = jax.jit(lambda law, F: law.tangent(F))
 
 
 def candidates(name: str, terms: int | None = None) -> list[Candidate]:
-    """The law with this name, FILE.py:LAW, or `all` shipped laws; Ogden's with several numbers of terms without
-    `terms`.
+    """The law with this name or FILE.py:LAW, or for `all` the laws of this package. Without `terms`, Ogden's law comes
+    with several numbers of terms.
 
     Raises:
-        InputError: unknown law, or one whose energy is no isochoric one plus U(J).
+        InputError: unknown law, or a law whose energy is not an isochoric energy plus U(J).
     """
     if terms is not None and name not in ("ogden", "all"):
         raise InputError(f"--terms {terms} is for ogden only, not for {name}: leave it out")
@@ -82,14 +82,14 @@ def candidates(name: str, terms: int | None = None) -> list[Candidate]:
     typical = gradient_check.load(name)
     if laws.isochoric_part(typical) is None:
         usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
-        raise InputError(f"law {name} is not an isochoric energy plus U(J), so its curves need more: use {usable}")
+        raise InputError(f"law {name} is not an isochoric energy plus U(J), which the fit requires: use {usable}")
     if isinstance(typical, laws.Ogden) and ":" not in name:
         return [_ogden(k) for k in ((1, 2, 3) if terms is None else (terms,))]
     return [_candidate(name.rpartition(":")[2], typical)]
 
 
 def _candidate(label: str, law: Law) -> Candidate:
-    """The candidate of one law, or of several that add up."""
+    """The candidate for one law, or for a sum of laws."""
     parts = [s for s in laws.summands(law) if not isinstance(s, laws.Volumetric)]
     if len(parts) > 1:
         return _sum(label, [_candidate(f"{label}, summand {k}", s) for k, s in enumerate(parts)])
@@ -100,7 +100,7 @@ def _candidate(label: str, law: Law) -> Candidate:
 
 
 def _sum(label: str, parts: list[Candidate]) -> Candidate:
-    """Laws that add up, each with its own numbers, named as in a scene: `1.mu` is mu of the second law."""
+    """The candidate for a sum of laws; parameters are named as in a scene: `1.mu` is mu of the second law."""
     ends = np.cumsum([len(p.names) for p in parts])[:-1]  # as many unconstrained numbers as parameters
 
     def values(u, scale):
@@ -134,7 +134,7 @@ def _single(label: str, typical: Law) -> Candidate:
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata["above"] == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    size = abs(_shear_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)  # higher terms alone have none
+    size = abs(_shear_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)  # higher terms alone have G = 0
     middle = middle / np.where(modulus, size, 1.0)
 
     def values(u, scale):
@@ -155,10 +155,10 @@ def _single(label: str, typical: Law) -> Candidate:
 
 
 def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
-    """Fields that are fitted, those with a number other than 0, and notes on the others.
+    """Fields to be fitted (their number is not 0), and notes on the others.
 
     Raises:
-        InputError: a parameter that is a list, or none to be fitted.
+        InputError: a parameter is a list, or no parameter is left to be fitted.
     """
     fields = [f for f in laws.parameters(type(law)) if f.name != "bulk"]
     absent = [f.name for f in fields if getattr(law, f.name) is None]
@@ -166,7 +166,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
     for f in given:
         if isinstance(getattr(law, f.name), Law) or np.ndim(getattr(law, f.name)) > 0:
             raise InputError(
-                f"law {label}: {f.name} of {type(law).__name__} is not one number, which the fit of curves asks for: "
+                f"law {label}: {f.name} of {type(law).__name__} is not one number, which the fit of curves requires: "
                 "give a law whose parameters are numbers"
             )
     zero = [f.name for f in given if float(getattr(law, f.name)) == 0]
@@ -175,7 +175,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
         raise InputError(f"law {label}: none of its parameters has a value other than 0: give one to be fitted")
     notes = []
     if zero:
-        notes.append(f"{', '.join(zero)} held at 0 as given")
+        notes.append(f"{', '.join(zero)} kept at 0 as given")
     if absent:
         notes.append(f"{', '.join(absent)} left out: to fit them, give them values in a law of your own (FILE.py:LAW)")
     told = f"{label}: fitted are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
@@ -183,7 +183,7 @@ def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
 
 
 def _shear_modulus(law: Law) -> float:
-    """Shear modulus of the ground state [Pa]; where a law does not state it, dP12/dF12 there."""
+    """Shear modulus of the ground state [Pa]; if a law does not state it, dP12/dF12 there."""
     try:
         return float(law.shear_modulus())
     except InputError:
@@ -202,7 +202,7 @@ def _ogden_starts(rng: np.random.Generator, n: int, terms: int) -> np.ndarray:
 
 
 def _ogden(terms: int) -> Candidate:
-    """G_k = mu_k alpha_k / 2 > 0 in every term: stable for every stretch."""
+    """Ogden's law with G_k = mu_k alpha_k / 2 > 0 in every term, so that it is stable at every stretch."""
     names = tuple(f"{n}[{k}]" for n in ("mu", "alpha") for k in range(terms))
 
     def values(u, scale):
@@ -217,7 +217,7 @@ def _ogden(terms: int) -> Candidate:
 
 
 def _bogen() -> Candidate:
-    """One term of Ogden's law."""
+    """The law `Bogen`: one term of Ogden's law."""
 
     def law(p):
         return laws.Bogen(mu=p[0], alpha=p[1], bulk=None)
@@ -226,7 +226,7 @@ def _bogen() -> Candidate:
 
 
 def initial_modulus(curves: list[Curve]) -> float:
-    """Scale of the shear modulus [Pa] for starts: median of the stress over that of a law with mu = 1 Pa."""
+    """Scale of the shear modulus [Pa] for starts: median of measured stress / stress of a law with mu = 1 Pa."""
     unit = laws.NeoHookean(mu=1.0, bulk=None)  # type: ignore[arg-type]  # the sample is incompressible
     ratios = []
     for c in curves:
@@ -281,7 +281,7 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
     noise = noise_factor(misfit, n - p, deviations_given=False)
     limits = _run_away(candidate, values, scale)
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
-    # Of a parameter at its limit nothing more is known; the others' errors are those of the law at that limit.
+    # A parameter at its limit has no error; the errors of the others are those of the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
     half, s = spread(J[:n, known], noise, slope[np.ix_(known, known)])
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
@@ -329,7 +329,7 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     if fit.limits:
         ran = ", ".join(f"{name} to {end}" for name, end in fit.limits.items())
         told.append(
-            f"the law runs into its limit ({ran}): the limit is the answer, with the error and G0 given here, and the "
+            f"the law runs into its limit ({ran}): the limit fits best, with the error and G0 given here, and the "
             "number reached means nothing; take a law without that parameter"
         )
     for name, value, error in zip(fit.names, fit.values, fit.standard_errors, strict=True):
@@ -340,7 +340,7 @@ def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool
     if fit.starts_at_minimum == 1:
         told.append("only one start reached the minimum: there may be a better one")
     if held:
-        told.append("the stress would fall within the fitted range: held at the edge of stability")
+        told.append("the stress would fall within the fitted range: the fit is kept at the edge of stability")
     solid = fit.law + laws.Volumetric(bulk=jnp.asarray(1e3 * abs(fit.shear_modulus)))
     firm = ellipticity(np.asarray(_tangents(solid, jnp.asarray(np.concatenate([c.F for c in curves]))))) > 0
     parts = np.split(firm, np.cumsum([len(c.stress) for c in curves])[:-1])
@@ -361,7 +361,7 @@ def _run_away(candidate: Candidate, values: np.ndarray, scale: float) -> dict[st
     return ends
 
 
-#: Stress at rest that is told of, over the root mean square of a curve.
+#: Stress at rest above which there is a warning, divided by the root mean square of a curve.
 _PRELOAD = 0.05
 
 
@@ -373,7 +373,7 @@ def loaded_at_rest(curves: list[Curve]) -> list[str]:
         near = np.argsort(np.abs(driven), kind="stable")[:3]
         if curve.test == "general" or np.abs(driven[near]).max() > 0.2 * np.ptp(driven):
             continue
-        # The straight line through the three points next to rest, at rest.
+        # The value at rest of the straight line through the three points nearest to rest.
         offset = np.polyfit(driven[near], curve.stress[near], 1)[1] if np.ptp(driven[near]) > 0 else 0.0
         if abs(offset) > _PRELOAD * curve.scale and np.abs(driven[near]).min() < 0.02 * np.ptp(driven):
             told.append(

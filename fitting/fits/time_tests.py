@@ -1,4 +1,4 @@
-"""Prony modes from a relaxation or creep test as it was driven, in closed form."""
+"""Prony modes from a relaxation or creep test with its measured drive, in closed form."""
 
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -20,7 +20,7 @@ from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Answers that are fitted at most: of longer records those nearest to equal steps of log time.
+#: Most answers (measured responses) that are fitted; a longer record is thinned to equal steps of log time.
 MOST = 300
 #: Starting points of a fit.
 STARTS = 12
@@ -35,23 +35,23 @@ class TimeFit(NamedTuple):
     uncertainty: Estimate
     converged: bool
     time: np.ndarray  # (m,) [s] of the answers that were fitted
-    measured: np.ndarray  # (m,) [Pa], of creep [1]
+    measured: np.ndarray  # (m,) stress [Pa]; in creep strain [1]
     fitted: np.ndarray
-    scales: np.ndarray  # (m,) what the errors are relative to
+    scales: np.ndarray  # (m,) divisors of relative errors
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
     details: Content
-    parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
+    parameters: Estimate | None = None  # of the model's own numbers; None: these are the modes
 
     @property
     def modes(self) -> int:
-        """N."""
+        """Number of Prony modes."""
         return len(self.model.ratios)
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """|fit - data| (m,) over the scales, which are the data where these are above the noise."""
+        """|fit - data| (m,) divided by the scales: by the data, with a lower bound for small ones."""
         return np.abs(self.fitted - self.measured) / self.scales
 
 
@@ -79,11 +79,11 @@ def thinned(test: TimeTest) -> np.ndarray:
 
 
 def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
-    """Choose the number of modes, and solid or fluid: the lowest criterion among those that the test determines.
+    """Choose the number of modes, and solid or fluid, by the lowest criterion among fits that the test determines.
 
     Args:
         test: data.
-        modes: N, or "auto".
+        modes: number of modes, or "auto".
     """
     rows = thinned(test)
     largest = (len(rows) - 2) // 2
@@ -94,14 +94,14 @@ def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:
     tried = _raised(test, rows, numbers, Kind())
     solid = min(tried, key=criterion)
     stays = solid.model.shear_modulus * (1 - solid.model.ratios.sum())
-    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the data may be a fluid's
+    if not stays > 2 * uncertainty.equilibrium_error(solid.uncertainty):  # the material may be a fluid
         begin = max(numbers.start, solid.modes - 1)
         tried += _raised(test, rows, range(begin, numbers.stop), FLUID)
     return _told(_chosen_model(tried, test), test, tried)
 
 
 def _raised(test: TimeTest, rows: np.ndarray, numbers: range, kind: Kind) -> list[TimeFit]:
-    """Fits with more and more modes; two that do not lower the criterion end the search."""
+    """Fits with more and more modes; the search ends after two that do not lower the criterion."""
     tried: list[TimeFit] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -146,7 +146,7 @@ def residuals_in_time(test: TimeTest, kind: Kind) -> tuple[Callable[..., jax.Arr
 
 
 def data_in_time(test: TimeTest) -> tuple[np.ndarray, ...]:
-    """Times (n,), what is driven (n,), rows (m,) among them, answers (m,) and their scales (m,)."""
+    """Times (n,), driven quantity (n,), rows (m,) of the answers in both, answers (m,) and their scales (m,)."""
     rows = thinned(test)
     kept = _corners_in_time(test.time, test.driven)
     kept[rows] = True
@@ -171,14 +171,14 @@ def _scales(test: TimeTest, rows: np.ndarray) -> np.ndarray:
 def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Array:
     """Predicted measurements: G' then G'' [Pa] at angular frequencies, or the answers at the rows of a driven test.
 
-    In JAX; of a sweep and of dispersion in NumPy as well (`fitting.methods.host`).
+    It works with JAX arrays; for a sweep and for dispersion with NumPy arrays as well (`fitting.methods.host`).
 
     Args:
         kind: "sweep", "dispersion", "relaxation" or "creep".
         model: Prony modes.
         at: angular frequencies (n,) [rad/s], or times (n,) [s].
-        drive: of a test in time: what is driven (n,), and the rows (m,) that are answered; of dispersion: the density,
-            and the numbers (m,) that were measured, of velocities [m/s] followed by attenuations [1/m].
+        drive: for a test in time the driven quantity (n,) and the rows (m,) of the answers; for dispersion the density,
+            and the indices (m,) of the measured numbers among velocities [m/s] followed by attenuations [1/m].
     """
     xp = arrays_of(model.ratios)
     if kind == "sweep":
@@ -194,7 +194,7 @@ def response_in_time(kind: str, model: Maxwell, at: Array, *drive: Array) -> Arr
 
 
 def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
-    """Stress over strain (m,) [Pa] of the answers that are fitted, and their times: G(t) roughly."""
+    """Stress divided by strain (m,) [Pa] at the fitted answers, which is roughly G(t), and their times."""
     rows = thinned(test)
     driven, answer = np.abs(test.driven[rows]), np.maximum(np.abs(test.answer[rows]), 1e-3 * _scales(test, rows))
     ratio = answer / np.maximum(driven, 1e-6 * driven.max())
@@ -202,14 +202,14 @@ def apparent(test: TimeTest) -> tuple[np.ndarray, np.ndarray]:
 
 
 def apparent_equations(test: TimeTest, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right-hand side of relative least squares for the equilibrium modulus and modes of these times."""
+    """Matrix and right-hand side of relative least squares for the equilibrium modulus and modes with these times."""
     modulus, at = apparent(test)
     A = np.column_stack([np.ones(len(at)), np.exp(-at[:, None] / times)])
     return A / modulus[:, None], np.ones(len(at))
 
 
 def _starts(test: TimeTest, modes: int, kind: Kind) -> np.ndarray:
-    """Times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
+    """Starts: times over the test's decades, strengths from the apparent modulus by non-negative least squares."""
     each = generalised_maxwell.times_over(test.resolved, modes, STARTS)
     found = [generalised_maxwell.start_at_times(times, *apparent_equations(test, times)) for times in each]
     return np.stack([generalised_maxwell.fluid_of(u) if kind.name == FLUID.name else u for u in found])
@@ -250,7 +250,7 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
 
 
 def structured_misfit(fit: TimeFit) -> list[str]:
-    """A sentence where the residuals keep their sign over many answers."""
+    """A sentence if the residuals keep their sign over many answers."""
     residuals = fit.fitted - fit.measured
     runs, chance = kramers_kronig.runs_probability(np.sign(residuals))
     if chance >= kramers_kronig.CHANCE or fit.relative_errors.max() <= viscoelastic.EXACT:

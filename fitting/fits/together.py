@@ -1,4 +1,4 @@
-"""One Prony series for several tests of one material in closed form, and what each adds.
+"""One Prony series for several tests of one material in closed form, and the contribution of each test.
 
 Tests are sweeps, relaxation, creep, and phase velocities of shear waves.
 
@@ -25,11 +25,11 @@ from fitting.waves.dispersion import Dispersion
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Rounds of fit and weights, smallest relative noise that a test is given, and starts.
+#: Rounds of fit and weights, smallest relative noise of a test, and number of starts.
 ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
-#: The misfit of a test in the common fit over that by itself, above which the tests do not agree.
+#: Ratio of a test's noise in the common fit to its noise in a fit to it alone, above which the tests do not agree.
 APART = 1.5
-#: A misfit that is told of.
+#: Misfit above which there is a warning.
 MISSED = 0.05
 
 Measured = Sweep | TimeTest | Dispersion
@@ -47,12 +47,12 @@ class Share(NamedTuple):
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     points: int  # measured numbers
-    noise: float  # of the numbers, over their scales: what the common fit leaves, given deviations never made smaller
-    alone: float  # the same of a fit of as many modes to this test by itself
-    misfit: float  # relative size of what the common fit leaves
-    misfit_alone: float  # and of what the fit to this test by itself leaves
+    noise: float  # of the numbers over their scales, from the common fit; given deviations are not reduced
+    alone: float  # this noise from a fit of as many modes to this test alone
+    misfit: float  # relative misfit of the common fit
+    misfit_alone: float  # relative misfit of the fit to this test alone
     mean_relative_error: float
-    errors_without: np.ndarray  # (P,) standard errors of the others alone, at the common fit
+    errors_without: np.ndarray  # (P,) standard errors without this test, at the common fit
 
 
 class Together(NamedTuple):
@@ -70,12 +70,12 @@ class Together(NamedTuple):
     warnings: tuple[str, ...]
     run_time: float
     compile_time: float
-    parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
+    parameters: Estimate | None = None  # of the model's own numbers; None: these are the modes
     details: Content | None = None  # of the model
 
     @property
     def modes(self) -> int:
-        """N."""
+        """Number of Prony modes."""
         return len(self.model.ratios)
 
 
@@ -91,13 +91,13 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Sizes for relative errors of the reported numbers: the numbers themselves; in tests in time with a floor."""
+    """Sizes for relative errors of the reported numbers: the numbers themselves; bounded below in tests in time."""
     _, measured, scales = reported_numbers(test)
     return scales if isinstance(test, TimeTest) else measured
 
 
 def least_noise(test: Measured) -> float:
-    """The smallest noise of a test over its scales: deviations that are given are believed."""
+    """Lower bound of a test's noise divided by its scales: given standard deviations are not reduced."""
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
@@ -117,7 +117,7 @@ def _tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) ->
 
 
 def name_of(test: Measured) -> str:
-    """sweep, dispersion, relaxation or creep."""
+    """Name of the kind of test: sweep, dispersion, relaxation or creep."""
     if isinstance(test, TimeTest):
         return test.kind
     return "sweep" if isinstance(test, Sweep) else "dispersion"
@@ -126,12 +126,12 @@ def name_of(test: Measured) -> str:
 def fit(
     tests: Sequence[Measured], modes: int | str = "auto", progress: Callable[[str], None] = lambda text: None
 ) -> Together:
-    """Choose the number of modes: the lowest criterion among those that the tests determine together.
+    """Choose the number of modes by the lowest criterion among fits that the tests together determine.
 
     Args:
         tests: two or more.
-        modes: N, or "auto".
-        progress: told what is fitted.
+        modes: number of modes, or "auto".
+        progress: called with the name of each fit.
     """
     tests = list(tests)
     band = ResolvedBand(resolved_by(tests))
@@ -162,7 +162,7 @@ def resolved_by(tests: Sequence[Measured]) -> tuple[float, float]:
 def _raised_together(
     tests: list[Measured], band: ResolvedBand, numbers: range, kind: Kind, progress: Callable
 ) -> list[Together]:
-    """Fits with more and more modes; two that do not lower the criterion end the search."""
+    """Fits with more and more modes; the search ends after two that do not lower the criterion."""
     tried: list[Together] = []
     best, failures = np.inf, 0
     for n in numbers:
@@ -187,7 +187,7 @@ def criterion_of_all(fit: Together) -> float:
 
 
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
-    """Fit and weights in turn, for one number of modes."""
+    """Fit one number of modes to all tests; the fit and the weights are found in turn."""
     parts = [reported_numbers(t) for t in tests]
     begin, evaluate = time.perf_counter(), partial(_tests_evaluated, list(map(name_of, tests)), kind)
     starts, noise = _starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
@@ -196,7 +196,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
         found = from_starts(evaluate, starts, data)
         noise = noises(tests, parts, np.asarray(found.residuals), noise, len(found.u))
-        starts = np.asarray(found.u)[None]  # near already
+        starts = np.asarray(found.u)[None]  # near the minimum already
     running = time.perf_counter() - begin
     modes_found = kind.maxwell(found.u)
     shares, fitted = misfits(tests, data, np.asarray(found.residuals), noise, len(found.u))
@@ -210,13 +210,13 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
 def misfits(
     tests: list[Measured], data: list, residuals: np.ndarray, noise: np.ndarray, free: float
 ) -> tuple[list[Share], list[np.ndarray]]:
-    """What the fit leaves of each test, and the numbers that it predicts for it.
+    """The misfit of each test, and the numbers that the fit predicts for it.
 
     Args:
-        tests: K.
-        data: of each test what predicts it, its numbers, and what the residuals are divided by.
-        residuals: of all tests; rows of a prior may stand below.
-        noise: (K,) of the tests over their scales.
+        tests: K tests.
+        data: for each test the arrays that predict it, its measured numbers, and the divisors of its residuals.
+        residuals: of all tests; rows of a prior may follow.
+        noise: noise (K,) of the tests divided by their scales.
         free: number of parameters that the data determine.
     """
     counts = [len(y) for _, y, _ in data]
@@ -232,9 +232,9 @@ def misfits(
 
 
 def over_own_noise(found: Solution, shares: list[Share], ratio: np.ndarray) -> Solution:
-    """The minimum with the residuals of each test divided by its noise; `ratio` (K,): noise used over noise found.
+    """The minimum with the residuals of each test divided by its noise; `ratio` (K,): used noise / found noise.
 
-    Rows of a prior below take the mean ratio, as the weight of a prior is stated in the mean noise.
+    Rows of a prior are multiplied by the mean ratio, because the weight of a prior refers to the mean noise.
     """
     factor = np.repeat(ratio, [s.points for s in shares])
     prior = np.full(len(found.residuals) - len(factor), np.exp(np.mean(np.log(ratio))))
@@ -247,7 +247,7 @@ def _size_of_noise(residuals: np.ndarray, freedom: float) -> float:
 
 
 def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.ndarray, free: float) -> np.ndarray:
-    """Relative noise of each test: root mean square of its residuals, less its share of the degrees of freedom."""
+    """Relative noise of each test: root mean square of its residuals, by its degrees of freedom."""
     counts = np.array([len(y) for _, y, _ in parts])
     left = np.split(residuals, np.cumsum(counts)[:-1])
     out = []
@@ -257,7 +257,7 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
 
 
 def _starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
-    """Times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
+    """Starts: times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
     out = []
     for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
         A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
@@ -276,13 +276,13 @@ def _apparent(test: Measured, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _moduli_of(test: Sweep | Dispersion) -> tuple[np.ndarray, ...]:
-    """G' and G'' [Pa]; for velocities alone, about |G| in place of G'."""
+    """G' and G'' [Pa]; from velocities alone only about |G|."""
     if isinstance(test, Sweep):
         return test.storage, test.loss
     if test.attenuation is None:
         return (test.density * test.velocity**2,)
     found = shear_waves.moduli_of(test.velocity, test.attenuation, test.angular_frequency, test.density)
-    # Where noise makes them negative they are nothing to begin with.
+    # A fit cannot begin from moduli that noise makes negative: small positive ones replace them.
     return tuple(np.maximum(G, 1e-2 * np.abs(found[0]).max()) for G in found)
 
 
@@ -317,7 +317,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
 
 
 def disagreements(shares: list[Share]) -> list[str]:
-    """A sentence on each test that the common fit misses by more than a fit of its own."""
+    """A sentence on each test that the common fit misses by more than a fit to this test alone."""
     return [
         f"the tests do not agree: {s.source or s.name} is missed by {100 * s.misfit:.2g} % in the common fit and by "
         f"{100 * s.misfit_alone:.2g} % by itself; look for another temperature, strain or sample"
@@ -327,7 +327,7 @@ def disagreements(shares: list[Share]) -> list[str]:
 
 
 def missed(shares: list[Share]) -> list[str]:
-    """A sentence on each test that the common fit misses, and a fit of its own as well."""
+    """A sentence on each test that the common fit misses, and that a fit to this test alone misses as well."""
     return [
         f"{viscoelastic.MISSES} of {s.source or s.name} by {100 * s.misfit:.2g} %: try another --model, or look at them"
         for s in shares
@@ -338,7 +338,7 @@ def missed(shares: list[Share]) -> list[str]:
 def _shares(fit: Together) -> list[Share]:
     """The contribution of each test: errors without it, and the misfit of a fit to this test alone with as many modes.
 
-    Infinite deviations take a test out.
+    Infinite deviations exclude a test.
     """
     parts = [reported_numbers(t) for t in fit.tests]
     evaluate = partial(_tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
@@ -362,10 +362,11 @@ def shares_by_rows(
 
     Args:
         fit: the common fit.
-        jacobian: of the residuals of all tests by u; rows of a prior may stand below.
+        jacobian: of the residuals of all tests by u; rows of a prior may follow.
         slope: derivative of the reported numbers by u.
         values: of the reported numbers.
-        alone: place of a test -> residuals over its scales of a fit to it alone, at the rows that the test has in all.
+        alone: index of a test -> residuals, divided by their scales, of a fit to this test alone; its rows are where
+            they are in the common fit.
     """
     counts = [s.points for s in fit.shares]
     free = jacobian.shape[1] if fit.kind.effective is None else fit.kind.effective

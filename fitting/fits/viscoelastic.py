@@ -26,10 +26,10 @@ class Kind(NamedTuple):
 
     name: str = "prony"
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
-    names: tuple[str, ...] = ()  # of its own parameters, where they are not the modes
+    names: tuple[str, ...] = ()  # of its own parameters; empty: these are the modes
     units: tuple[str, ...] = ()
     values: Callable[[jax.Array], jax.Array] | None = None  # u -> its own parameters (P,)
-    prior: Callable[[jax.Array], jax.Array] | None = None  # u -> rows that stand below the residuals of the data
+    prior: Callable[[jax.Array], jax.Array] | None = None  # u -> rows that follow the residuals of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
     moduli: Callable[[Array, Array], Array] | None = None  # (u, omega) -> its own G* (n,) [Pa] at any frequency
 
@@ -49,12 +49,12 @@ class Fit(NamedTuple):
     compile_time: float
     details: Content
     kind: Kind = Kind()
-    parameters: Estimate | None = None  # of the model's own numbers, where they are not the modes
-    rivals: tuple["Fit", ...] = ()  # the other models that it was chosen from
+    parameters: Estimate | None = None  # of the model's own numbers; None: these are the modes
+    rivals: tuple["Fit", ...] = ()  # the other models of the choice
 
     @property
     def modes(self) -> int:
-        """N."""
+        """Number of Prony modes."""
         return len(self.model.ratios)
 
     def relative_errors(self, sweep: Sweep) -> np.ndarray:
@@ -74,7 +74,7 @@ def timed(function: Callable, *arguments: Any) -> tuple[Any, float, float]:
     return result, middle - begin, time.perf_counter() - middle
 
 
-@lru_cache(maxsize=16)  # the fits of several samples, and of parts of a band, are one program
+@lru_cache(maxsize=16)  # fits of several samples, and of parts of a band, use one program
 def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
     arguments = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
     return jax.jit(function).lower(*arguments).compile()
@@ -82,7 +82,7 @@ def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
 
 @lru_cache(maxsize=16)
 def best_of(minimise: Callable, residuals: Callable, each: int = 0) -> Callable[..., Solution]:
-    """The lowest minimum over starting points (S, P). The first `each` arrays of data have a row a start."""
+    """The lowest minimum over starting points (S, P). The first `each` arrays of data have one row per start."""
 
     def best(starts, *data):
         rows, common = data[:each], data[each:]
@@ -94,7 +94,7 @@ def best_of(minimise: Callable, residuals: Callable, each: int = 0) -> Callable[
 
 
 def check_modes(sweep: Sweep, modes: int) -> None:
-    """`InputError` where the sweep has too few points for the parameters, naming the largest number of modes."""
+    """Raise `InputError`, with the largest number of modes, if the sweep has too few points for the parameters."""
     largest = generalised_maxwell.largest_number_of_modes(sweep)
     if modes < 1:
         raise InputError(f"--modes {modes} must be at least 1, or auto")
@@ -110,8 +110,8 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
 
     Args:
         sweep: data; residuals are divided by `sweep.deviations`.
-        modes: N.
-        dense: `generalised_maxwell.spectrum(sweep)` if already there.
+        modes: number of modes.
+        dense: `generalised_maxwell.spectrum(sweep)`, if it was computed before.
         optimizer: one of `OPTIMIZERS`.
     """
     check_modes(sweep, modes)
@@ -151,7 +151,7 @@ class BestPoint(NamedTuple):
     solution: Solution
     storage: np.ndarray
     loss: np.ndarray
-    advice: tuple[str, ...] = ()  # where the simulation broke down
+    advice: tuple[str, ...] = ()  # given if the simulation broke down
 
 
 def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float], details: Content) -> Fit:
@@ -180,7 +180,7 @@ FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
-    """A sentence where the model does not follow the data, naming the worst point."""
+    """A sentence with the worst point, if the model does not follow the data."""
     e = np.abs(np.concatenate([storage / sweep.storage, loss / sweep.loss]) - 1)
     if e.mean() < 0.05 and e.max() < 0.3:
         return ()
@@ -198,7 +198,7 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
 
 
 def number_of_parameters(fit: Fit) -> float:
-    """The number of parameters, or the effective one where a prior holds them."""
+    """Number of parameters; with a prior the effective number."""
     return len(fit.solution.u) if fit.kind.effective is None else fit.kind.effective
 
 
@@ -225,10 +225,10 @@ def choose_modes(
     progress: Callable[[str], None] = lambda text: None,
 ) -> tuple[Fit, list[Fit]]:
     """Raise N while the criterion falls and every mode is identifiable, or until the fit is exact. Return the chosen
-    fit and all tried. `progress` is told what is fitted.
+    fit and all tried. `progress` is called with the name of each fit.
 
     One failure may be a local minimum: the search ends at the second in a row. A number of modes whose computation
-    breaks down is such a failure, and is named in the warnings; the others stay.
+    breaks down is such a failure, and is named in the warnings; the other fits are kept.
     """
     cap = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     tried: list[Fit] = []
@@ -291,22 +291,22 @@ def _other_numbers(sweep: Sweep, chosen: Fit, tried: list[Fit], broken: dict[int
 
 
 def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> str:
-    """A sentence on a number of modes with a lower criterion; `errors` are mean ones, of it and of the chosen fit."""
+    """A sentence on a number of modes with a lower criterion; `errors`: mean errors of this and of the chosen fit."""
     reason = "the data leave some of their parameters free" if converged else "their fit did not converge"
     a, b = (100 * e for e in errors)
     return (
         f"{modes} modes would follow the data more closely ({a:.2g} % instead of {b:.2g} % on average), but {reason}; "
-        f"--modes {modes} gives them all the same"
+        f"--modes {modes} fits them nevertheless"
     )
 
 
-#: Words of the warnings that come first, the most important of all at the beginning.
+#: Words of the warnings that come first, the most important at the beginning.
 MISSES = "the fit misses the data"
 IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", "half decade")
 
 
 def by_importance(sentences: Sequence[str]) -> tuple[str, ...]:
-    """Warnings in the order of `IMPORTANT`; the others as they stand."""
+    """Warnings in the order of `IMPORTANT`; the others follow in their own order."""
 
     def place(sentence: str) -> int:
         return next((k for k, words in enumerate(IMPORTANT) if words in sentence), len(IMPORTANT))

@@ -13,7 +13,7 @@ from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Distance of a sweep from the common curve that is worth a sentence, and the error [decades] of a loose factor.
+#: Distance of a sweep from the common curve, and error [decades] of a factor, above which there is a sentence.
 FAR_OFF, LOOSE = 0.05, 0.3
 
 
@@ -21,9 +21,9 @@ class MasterCurve(NamedTuple):
     """All sweeps at the reference temperature."""
 
     sweep: Sweep
-    parts: list[Sweep]  # each one shifted, in the order of the temperatures
+    parts: list[Sweep]  # the shifted sweeps, in the order of the temperatures
     shifts: Shifts
-    laws: list[TemperatureLaw]  # nearest first
+    laws: list[TemperatureLaw]  # best first
 
 
 def master_curve(data: AtTemperatures, reference: float | None, vertical: bool = False) -> MasterCurve:
@@ -31,8 +31,8 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
 
     Args:
         data: two or more sweeps.
-        reference: temperature [K]; None: the middle one. The nearest one that was measured is taken.
-        vertical: find factors of the moduli too; not where the shift factors are given.
+        reference: temperature [K]; None: the middle one. The nearest measured temperature is used.
+        vertical: find factors of the moduli too; not possible if the shift factors are given.
     """
     T = data.temperatures
     place = len(T) // 2 if reference is None else int(np.argmin(np.abs(T - reference)))
@@ -43,7 +43,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
         )
     if data.shift_factors is not None:
         log_a, none = np.log10(data.shift_factors), np.zeros(len(T))
-        if reference is None:  # the temperature that the given factors are of
+        if reference is None:  # the reference temperature of the given factors
             place = int(np.argmin(np.abs(log_a)))
         log_a = log_a - log_a[place]
         found = Shifts(
@@ -71,7 +71,7 @@ def _shifted_sweep(sweep: Sweep, log_a: float, log_b: float) -> Sweep:
 
 
 def _sentences(found: Shifts) -> list[str]:
-    """Notes on how the sweeps were shifted, and warnings where superposition does not hold."""
+    """Notes on how the sweeps were shifted, and warnings if superposition is not valid."""
     T = celsius(found.temperatures)
     out = [
         f"{len(T)} sweeps from {T[0]:.4g} to {T[-1]:.4g} °C are shifted to {T[found.reference]:.4g} °C; they lie "

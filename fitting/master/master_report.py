@@ -1,4 +1,4 @@
-"""What a master curve leaves behind: shift_factors.csv, master_curve.csv, shift.png, and a table on the terminal."""
+"""Output of a master curve: shift_factors.csv, master_curve.csv, shift.png, and a table on the terminal."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ def write_master_curve(out: Path, found: MasterCurve) -> None:
 
 
 def shift_table(found: MasterCurve) -> str:
-    """Factors by temperature, and the laws."""
+    """Table of the factors by temperature, and lines with the laws."""
     s, moved = found.shifts, bool(np.any(found.shifts.log_b))
     lines = [
         f"{'temperature':>12s} {'log10 a_T':>18s}{'log10 b_T':>18s}" if moved else f"{'temperature':>12s} log10 a_T"

@@ -1,8 +1,8 @@
 """Time-temperature superposition: shift factors that bring sweeps at several temperatures onto one smooth curve.
 
-A sweep at temperature T has at frequency omega the modulus that a sweep at the reference temperature has at a_T omega,
-times 1 / b_T. The curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors
-by least squares: no model of the material is needed, and every factor has a standard error. Source: Ferry (1980),
+The modulus at temperature T and frequency omega is 1 / b_T times the modulus at the reference temperature and frequency
+a_T omega. The curve is a cubic spline of log G' and of log G'' over log frequency, found together with all factors by
+least squares: no model of the material is needed, and every factor has a standard error. Source: Ferry (1980),
 Viscoelastic properties of polymers, chapter 11.
 """
 
@@ -16,19 +16,19 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Decades between two knots of the spline, and the weight of its third differences where no data hold it.
+#: Decades between two knots of the spline, and weight of its third differences, for knots without data.
 KNOTS, SMOOTH = 0.4, 1e-3
-#: Longest step of a factor in one iteration [decades], and the step that counts as none.
+#: Longest step of a factor in one iteration [decades], and the step below which the iteration ends.
 LONGEST, CONVERGED = 0.3, 1e-6
-#: Part of a sweep that must lie over its neighbour where shifts are looked for; where they are looked for [decades].
+#: Part of a sweep that must overlap its neighbour at its first shift, and the shifts that are tried [decades].
 OVERLAP, REACH = 0.25, np.linspace(-8.0, 8.0, 801)
 
 
 class Shifts(NamedTuple):
-    """Factors of every sweep, in the order of the temperatures, and what the superposition leaves over."""
+    """Factors of every sweep, in the order of the temperatures, and the misfit of the superposition."""
 
     temperatures: np.ndarray  # (K,) [K], ascending
-    reference: int  # place of the sweep that stays where it is
+    reference: int  # index of the sweep that is not shifted
     log_a: np.ndarray  # (K,) log10 of a_T
     log_a_errors: np.ndarray  # (K,) standard errors, 0 at the reference and for factors that were given
     log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
@@ -46,13 +46,13 @@ def found(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, ver
     """Shift factors by least squares.
 
     Args:
-        sweeps: K of them.
+        sweeps: K sweeps.
         temperatures: (K,) [K], ascending.
-        reference: which of them stays.
+        reference: index of the sweep that is not shifted.
         vertical: moduli have factors b_T too.
 
     Raises:
-        InputError: a sweep does not lie over its neighbour at any shift.
+        InputError: a sweep does not match its neighbour at any shift.
     """
     columns = [(np.log10(s.angular_frequency), np.log10(s.storage), np.log10(s.loss)) for s in sweeps]
     log_a, log_b = _first_shifts(columns, temperatures, reference), np.zeros(len(sweeps))
@@ -145,14 +145,14 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray) -> tupl
 
 
 def _errors_of_shifts(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
-    """Standard errors of all unknowns; the first `data` rows are measured, the others hold the curve."""
+    """Standard errors of all unknowns; the first `data` rows are of the data, the others keep the curve smooth."""
     inverse = np.linalg.pinv(A)
     noise = np.sqrt(np.sum(b[:data] ** 2) / max(1, data - A.shape[1]))
     return noise * np.sqrt(np.sum(inverse[:, :data] ** 2, axis=1))
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:
-    """First shifts: each sweep is laid over its neighbour, beginning at the reference."""
+    """First shifts: each sweep is matched to its neighbour, beginning at the reference."""
     log_a = np.zeros(len(columns))
     for way in (range(reference + 1, len(columns)), range(reference - 1, -1, -1)):
         before = reference
@@ -169,7 +169,7 @@ def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np
 
 
 def _over(fixed: tuple, moving: tuple) -> float | None:
-    """The shift [decades] that brings one sweep nearest to its neighbour; None where there is none."""
+    """The shift [decades] that brings one sweep nearest to its neighbour; None if no shift matches."""
     best, where = np.inf, None
     for s in REACH:
         x = moving[0] + s
@@ -180,4 +180,4 @@ def _over(fixed: tuple, moving: tuple) -> float | None:
         score = float(np.mean(np.square(apart)))
         if score < best:
             best, where = score, float(s)
-    return where if best < 0.25 else None  # half a decade apart: nothing lies over anything
+    return where if best < 0.25 else None  # half a decade apart: no match

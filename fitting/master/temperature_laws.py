@@ -12,12 +12,12 @@ import scipy.optimize
 
 from fitting.master.shifts import Shifts
 
-#: Molar gas constant [J / (mol K)], and the least that a factor's error is taken to be [decades].
+#: Molar gas constant [J / (mol K)], and the lower bound of a factor's error [decades].
 GAS, LEAST = 8.314462618, 0.01
 
 
 class TemperatureLaw(NamedTuple):
-    """A law and how far the factors are from it."""
+    """A law, and the distance of the factors from it."""
 
     name: str
     numbers: dict[str, tuple[float, float]]  # name with unit -> value and standard error
@@ -57,10 +57,10 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
-    """The WLF law; None if the factors bend the other way, for which the law has no finite numbers."""
+    """The WLF law; None if the factors curve the other way, because then the law has no finite numbers."""
     w = _weights_of_factors(shifts)
 
-    # C2 stays above the distance of the lowest temperature: there the law has its pole.
+    # C2 stays above T0 minus the lowest temperature: the law has its pole at T0 - C2.
     lowest = T0 - T.min()
 
     def curve(u: np.ndarray, T: np.ndarray) -> np.ndarray:

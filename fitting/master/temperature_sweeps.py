@@ -12,7 +12,7 @@ from fitting.readers.rheometer import read_all_sweeps
 from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 
-#: Temperatures that are nearer than this [K] are one: an instrument holds its set point within some tenths.
+#: Temperatures closer than this [K] count as one: an instrument keeps its set point to some tenths.
 SAME = 1.0
 
 
@@ -21,14 +21,14 @@ class AtTemperatures(NamedTuple):
 
     sweeps: list[Sweep]
     temperatures: np.ndarray  # (K,) [K], ascending
-    shift_factors: np.ndarray | None  # (K,) a_T, where the files give them
+    shift_factors: np.ndarray | None  # (K,) a_T; None: not in the files
 
 
 def read_temperatures(paths: Sequence[Path]) -> AtTemperatures:
-    """Every sweep of the files, those of one temperature together.
+    """Read every sweep of the files; sweeps at one temperature are joined.
 
-    The temperature is a column (`temperature_C`, `Temperature` with its unit), or stands in the name of the table. A
-    column `shift_factor` holds factors that are known already.
+    The temperature is a column (`temperature_C`, `Temperature` with its unit), or a part of the name of the table. A
+    column `shift_factor` contains factors that are already known.
 
     Raises:
         InputError: a table without temperature, or fewer than two temperatures.
@@ -70,12 +70,12 @@ def joined(sweeps: Sequence[Sweep]) -> Sweep:
 
 
 def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, float, Sweep]]:
-    """Temperature [K], shift factor (NaN: not known) and points, of each temperature in a table."""
+    """Temperature [K], shift factor (NaN: not known) and points for each temperature in a table."""
     raw = sweep.raw or {}
     if "temperature" in raw:
         T = raw["temperature"]
     else:
-        # A hyphen behind a letter or a digit parts words ("Sweep-25C"), it is no sign.
+        # A hyphen after a letter or a digit separates words ("Sweep-25C"): it is not a minus sign.
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
         if stated is None:
             raise InputError(

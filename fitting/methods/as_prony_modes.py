@@ -2,7 +2,7 @@
 
 The relaxation times are fixed, equally spaced on a log axis. The strengths come from non-negative least squares of the
 relative errors of G' and G''. While the set of non-zero strengths stays the same, the strengths are linear in the
-moduli of the model. So derivatives pass through the conversion.
+moduli of the model. So the conversion can be differentiated.
 """
 
 from collections.abc import Callable
@@ -16,18 +16,18 @@ from fitting.methods.generalised_maxwell import Maxwell, non_negative
 
 #: Largest relative error of G' and of G'' over the band that a conversion may have.
 ALLOWED = 0.01
-#: Frequencies a decade at which the conversion is matched and checked, and the widest margin of its times [decades].
+#: Frequencies per decade for the match and its check, margins of the times [decades], and most modes.
 PER_DECADE, MARGINS, MOST = 20, (0.0, 0.25, 0.5, 1.0, 2.0), 60
 
 
 class Conversion(NamedTuple):
-    """How moduli at `omega` become Prony modes."""
+    """The linear map from moduli at `omega` to Prony modes."""
 
     omega: np.ndarray  # (n,) [rad/s], over the band
     times: np.ndarray  # (N,) [s], descending
     solid: bool  # an equilibrium modulus comes first among the strengths
-    strengths_of: np.ndarray  # (N + solid, 2n): strengths [Pa] of G' then G''
-    error: float  # largest of G' and G'', relative, at the model it was made for
+    strengths_of: np.ndarray  # (N + solid, 2n): strengths [Pa] from G' then G''
+    error: float  # largest relative error of G' and G'', for the model it was made from
 
 
 def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.ndarray:
@@ -38,12 +38,12 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
 
 
 def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float, solid: bool) -> Conversion:
-    """Take the fewest modes with an error below `ALLOWED`, or the best fit of `MOST` modes.
+    """Find the fewest modes with an error below `ALLOWED`, or the best fit of at most `MOST` modes.
 
     Args:
         moduli: complex modulus (n,) [Pa] of angular frequencies (n,).
         low, high: ends of the band [rad/s].
-        solid: whether the modes have an equilibrium modulus beside them.
+        solid: whether the model has an equilibrium modulus.
     """
     decades = np.log10(high / low)
     omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))
@@ -68,7 +68,7 @@ def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float,
     error, times, strengths, A = best
     kept = strengths[solid:] > 1e-9 * strengths.sum()
     columns = np.concatenate([[True], kept]) if solid else kept
-    if solid and strengths[0] <= 1e-12 * strengths.sum():  # what is zero stays zero, without a slope
+    if solid and strengths[0] <= 1e-12 * strengths.sum():  # a modulus of zero stays zero and has no slope
         solid, columns = False, np.concatenate([[False], kept])
     weighed = A[:, columns] / target[:, None]
     return Conversion(omega, times[kept], solid, np.linalg.pinv(weighed) / target, error)

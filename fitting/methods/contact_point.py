@@ -1,7 +1,7 @@
 """Modulus and contact point of a force-depth curve whose force is linear in the modulus.
 
-F = E f(d - d0), 0 before contact. For a contact point d0 the best modulus is a quotient of sums, so one number is
-sought: on a grid, then between its neighbours (variable projection; Golub and Pereyra 1973).
+F = E f(d - d0), 0 before contact. For a given contact point d0 the best modulus is a quotient of sums, so the search is
+for d0 alone: on a grid, then between grid points (variable projection; Golub and Pereyra 1973).
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def fit_contact(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.n
         E, f = modulus(start)
         return float(np.sum((force - E * f) ** 2))
 
-    # The contact may lie before the first point, not behind the last.
+    # The contact may lie before the first point, but not after the last.
     grid = np.linspace(depth.min() - 0.5 * span, depth.max() - 1e-3 * span, _GRID)
     k = int(np.argmin([misfit(start) for start in grid]))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]

@@ -10,7 +10,7 @@ import scipy.special
 from fitting.methods import host
 from fitting.methods.least_squares import Solution
 
-#: Stands in a covariance for an error that has no bound; a square of it is still a number.
+#: Replaces an unbounded error in a covariance; its square is still a finite number.
 LOST = 1e140
 
 
@@ -19,20 +19,20 @@ class Estimate(NamedTuple):
 
     names: tuple[str, ...]
     values: np.ndarray  # (P,)
-    root: np.ndarray  # (P, k) square root of the covariance; huge where the data leave a direction free
+    root: np.ndarray  # (P, k) square root of the covariance; huge in directions that the data leave free
     standard_errors: np.ndarray
     correlation: np.ndarray
     chi2: float  # sum of squared residuals over the noise
     components: int  # measured numbers
-    noise: float  # factor on the given scales: 1, or what the residuals ask for
-    freedom: float  # components less the numbers that the data determine, which need not be those of `names`
+    noise: float  # factor on the given scales: 1, or estimated from the residuals
+    freedom: float  # components minus the numbers that the data determine, not always those of `names`
     iterations: int
     converged: bool
     codes: tuple[int, ...] = ()  # worst code of each simulation
     seconds: float = 0.0
     mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
-    time_step_bias: np.ndarray | None = None  # (P,) the same of its time steps
-    shared: np.ndarray | None = None  # (P, s) the columns of `root` by errors that all points share: gap, instrument
+    time_step_bias: np.ndarray | None = None  # (P,) part of the values that its time steps cause
+    shared: np.ndarray | None = None  # (P, s) columns of `root` from errors common to all points: gap, instrument
 
     @property
     def covariance(self) -> np.ndarray:
@@ -53,16 +53,16 @@ def estimated(
     deviations_given: bool = True,
     effective: float | None = None,
 ) -> Estimate:
-    """The estimate at a minimum: covariance of u, carried to the reported numbers by the delta method.
+    """The estimate at a minimum: covariance of u, transformed to the reported numbers by the delta method.
 
     Args:
         names: of the numbers to report.
         natural_of: u -> these numbers (P,).
-        found: minimum over u; if it is NumPy's, `natural_of` is one for `host.with_jacobian`.
-        components: how many of the residuals are measured; those that are not are 0 and count for nothing.
+        found: minimum over u; if its arrays are NumPy's, `natural_of` must work in `host.with_jacobian`.
+        components: number of residuals that are measured; the others are 0 and have no effect.
         deviations_given: as in `noise_factor`.
-        effective: where a prior holds u: the number of parameters that the data determine. The rows of the prior
-            then stand below the `components` rows of the data.
+        effective: number of parameters that the data determine, if u has a prior. The rows of the prior then follow the
+            `components` rows of the data.
     """
     u, jacobian, r = (np.asarray(v) for v in (found.u, found.jacobian, found.residuals))
     if effective is not None:
@@ -90,18 +90,19 @@ def estimated(
 
 
 def _with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
-    """The reported numbers (P,) and their derivative by u. If u is NumPy's, nothing is compiled."""
+    """The reported numbers (P,) and their derivative by u. If u is a NumPy array, nothing is compiled."""
     if isinstance(u, np.ndarray):
-        with np.errstate(over="ignore", invalid="ignore"):  # a fit that ran away is told of by its errors
+        with np.errstate(over="ignore", invalid="ignore"):  # the errors show that a fit diverged
             return host.with_jacobian(natural_of, u)
     return np.asarray(natural_of(u)), np.asarray(jax.jacfwd(natural_of)(u))
 
 
 def noise_factor(residuals: np.ndarray, freedom: float, deviations_given: bool) -> float:
-    """Noise over the residual scales.
+    """Noise divided by the scales of the residuals.
 
-    Without deviations the residuals estimate it. Given deviations are believed, except where the residuals are larger
-    than they allow: then errors grow with the misfit and never shrink (the rule of the Particle Data Group).
+    Without given deviations it is estimated from the residuals. Given deviations are used as they are, unless the
+    residuals are larger: then the errors are enlarged by the misfit. They are never reduced (the rule of the Particle
+    Data Group).
     """
     estimate = float(np.sqrt(np.sum(residuals**2) / max(1, freedom)))
     return max(1.0, estimate) if deviations_given else estimate
@@ -120,13 +121,13 @@ def spread(jacobian: np.ndarray, noise: float, to_natural: np.ndarray) -> tuple[
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     # A direction that the data leave free gets an error of 1e14 times the best known one, not infinity times zero.
-    with np.errstate(over="ignore", invalid="ignore"):  # a number that ran away has no finite error
+    with np.errstate(over="ignore", invalid="ignore"):  # a number that diverged has no finite error
         root = noise * ((to_natural / scale) @ Vt.T) / np.maximum(s, 1e-14 * s[0])
     return np.clip(np.where(np.isfinite(root), root, LOST), -LOST, LOST), s
 
 
 def errors_and_correlation(root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors (P,) and correlation (P, P) of the square root of a covariance."""
+    """Standard errors (P,) and correlation (P, P) from the square root of a covariance."""
     with np.errstate(over="ignore", invalid="ignore"):  # infinite where nothing is known
         covariance = root @ root.T
         errors = np.sqrt(np.diag(covariance))
@@ -145,7 +146,7 @@ def wider(estimate: Estimate, direction: np.ndarray) -> Estimate:
 
 
 def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
-    """The estimate with the shared errors of `other`, relative to the values of the same numbers there."""
+    """The estimate with the shared errors of `other`; each keeps its size relative to the value of its number."""
     if other.shared is None:
         return estimate
     known = other.values != 0
@@ -155,15 +156,15 @@ def with_shared_errors(estimate: Estimate, other: Estimate) -> Estimate:
     return estimate
 
 
-#: Part of the numbers by which what the mesh leaves out may move them, all directions together, to first order.
+#: Largest relative change of a number by the mesh at which the first-order estimate `mesh_bias` is used.
 LARGEST_BIAS = 0.3
 
 
 def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], missing: np.ndarray) -> np.ndarray:
-    """Change of the numbers (P,) by meshes: J^+ times their errors of the data, `missing` (n,) over the noise.
+    """Change of the numbers (P,) by meshes: J^+ times `missing` (n,), their errors of the data over the noise.
 
-    It is of first order. It is good if the missing part is below a quarter and the numbers are not nearly dependent.
-    Subtract it once to correct.
+    It is of first order. It is accurate if the meshes' errors are below a quarter and the numbers are not nearly
+    dependent. Subtract it once to correct.
     """
     J, (_, to_natural) = np.asarray(found.jacobian), _with_slope(natural_of, found.u)
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
@@ -172,14 +173,14 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
 
 
 def bias_sentences(estimate: Estimate) -> list[str]:
-    """Warnings where the mesh moves a number by more than its standard error, or by too much for an estimate."""
+    """Warnings if the mesh moves a number by more than its standard error, or by too much for an estimate."""
     bias, values = estimate.mesh_bias, np.asarray(estimate.values)
     if bias is None:
         return []
     lost = np.flatnonzero(~(np.abs(bias) <= LARGEST_BIAS * np.abs(values)))
     if len(lost):
         names = ", ".join(estimate.names[k] for k in lost)
-        return [f"the mesh moves {names} by a third or more: the data do not say them on this mesh; refine it"]
+        return [f"the mesh moves {names} by a third or more: the data do not determine them on this mesh; refine it"]
     more = np.flatnonzero(np.abs(bias) > estimate.standard_errors)
     if not len(more):
         return []

@@ -1,7 +1,7 @@
 """The generalised Maxwell model: closed-form moduli, an unconstrained parametrisation, starting points.
 
-G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), chapter section 5.2; g_i are ratios of G0 (Table 2 prints Pa).
-The formulas take arrays of NumPy and of JAX, with axes in front of those named here (see `fitting.methods.host`).
+G(t) = G0 (1 - sum_i g_i (1 - exp(-t/tau_i))), chapter section 5.2; g_i are ratios of G0 (Table 2 prints Pa). The
+formulas work with NumPy and JAX arrays, also with more axes in front of the named ones (see `fitting.methods.host`).
 """
 
 from typing import NamedTuple
@@ -91,7 +91,7 @@ def residuals(u: Array, omega: Array, storage: Array, loss: Array, scales: Array
 
 
 def natural_fluid(u: Array) -> Maxwell:
-    """Model without an equilibrium modulus from u (2N,): like `natural`, but the last mode takes its place."""
+    """Model without an equilibrium modulus from u (2N,): like `natural`, with the last mode as the last share."""
     n = u.shape[-1] // 2
     return Maxwell(arrays_of(u).exp(u[..., 0]), _softmax_shares(u[..., 1:n]), _times_of_gaps(u[..., n:]))
 
@@ -162,7 +162,7 @@ HOPELESS = 0.3
 
 
 def refuse_impossible(sweep: Sweep) -> Spectrum:
-    """The dense spectrum, or `InputError` where no generalised Maxwell solid is near the data."""
+    """The dense spectrum; raises `InputError` if no generalised Maxwell solid is near the data."""
     dense = spectrum(sweep)
     if dense.misfit > HOPELESS:
         above = np.median(sweep.loss / sweep.storage)
@@ -181,7 +181,7 @@ def refuse_impossible(sweep: Sweep) -> Spectrum:
 def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int = 0) -> np.ndarray:
     """Starting points (count, 2N + 1): the dense spectrum cut into N groups, then log-uniform times.
 
-    For given times the strengths are linear, so each start takes them from non-negative least squares.
+    For given times the problem is linear in the strengths, so non-negative least squares gives them.
     """
     omega = sweep.angular_frequency
     low, high = -np.log(omega[-1]) - 0.5, -np.log(omega[0]) + 0.5
@@ -192,7 +192,7 @@ def starts(sweep: Sweep, modes: int, dense: Spectrum, count: int = 24, seed: int
 
 
 def _grouped(dense: Spectrum, modes: int, low: float, high: float) -> np.ndarray:
-    """Log times that share the spectrum's strength equally."""
+    """Log times that divide the spectrum into parts of equal strength."""
     if dense.strengths.sum() <= 0:
         return np.linspace(low, high, modes)
     share = np.cumsum(dense.strengths) / dense.strengths.sum()

@@ -5,9 +5,9 @@ Every material that relaxes has a spectrum of non-negative strengths. With x = o
     0 <= dG'/d ln(omega) <= G''      and      |dG''/d ln(omega)| <= G''
 
 because 2 x^2 / (1 + x^2)^2 <= x / (1 + x^2). Data that break these bounds by more than their scatter do not show the
-material alone. At the high end the inertia of the instrument breaks them (it adds a term that grows as omega^2 to G'),
-at the low end the start of the test. The distance of the data from the best spectrum of any shape tests the whole band:
-this is the Kramers-Kronig relation together with non-negative dissipation.
+material alone. At the high end the inertia of the instrument breaks them: it adds a term that grows as omega^2 to G'.
+This is the instrument's mark. At the low end the start of the test breaks them. The distance of the data from the best
+spectrum of any shape tests the whole band: this is the Kramers-Kronig relation together with non-negative dissipation.
 """
 
 import math
@@ -19,9 +19,9 @@ import scipy.special
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.readers.frequency_sweep import FEWEST, Sweep, merged, scatter, some
 
-#: How many standard deviations of the scatter a breach must exceed, and the part of the modulus that is never one.
+#: A breach must exceed this number of standard deviations of the scatter, and this part of the modulus.
 SIGNIFICANT, NEGLIGIBLE = 4.0, 0.002
-#: Distance of the best spectrum [1] that is worth a sentence, and its ratio to the scatter.
+#: Distance of the best spectrum [1], and its ratio to the scatter, above which there is a sentence.
 FAR, FAR_RATIO = 0.01, 5.0
 #: Chance below which signs of residuals are called structured.
 CHANCE = 0.005
@@ -37,7 +37,7 @@ class Consistency(NamedTuple):
 
     @property
     def far(self) -> bool:
-        """No linear material comes near the data."""
+        """Whether no linear material comes near the data."""
         return self.misfit > max(FAR, FAR_RATIO * self.scatter)
 
 
@@ -55,10 +55,10 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
 
 
 def without_instrument(sweep: Sweep) -> Sweep:
-    """The points before the instrument's mark; those behind it become `grey`, and a note names them.
+    """The points before the instrument's mark; the points after it become `grey`, and a note names them.
 
-    The search goes on in the points that are left until it finds no mark. It looks only at the last half decade of the
-    sweep.
+    The search is repeated with the remaining points until it finds no mark. It looks only at the last half decade of
+    the sweep.
     """
     here, end = sweep, sweep.angular_frequency[-1] / math.sqrt(10)
     told = ""
@@ -97,7 +97,7 @@ def onset_of(sweep: Sweep) -> tuple[float, str] | None:
 def _breach(omega, storage, loss, noise) -> str:
     """The name of the bound that two neighbouring points break, or an empty text."""
     step = math.log(omega[1] / omega[0])
-    # Of all spectra the largest mean of G'' between two values is reached where it changes as fast as it may.
+    # The mean of G'' between two points is largest if G'' changes as fast as the bound allows.
     most = step * min(max(loss) * math.exp(step / 2), math.inf)
     rise, sd = storage[1] - storage[0], noise[0] * math.hypot(*storage)
     margin = max(SIGNIFICANT * sd, NEGLIGIBLE * max(storage))
@@ -116,7 +116,7 @@ def sentences(found: Consistency, sweep: Sweep) -> list[str]:
     if found.onset is not None:
         hertz, bound = found.onset / (2 * np.pi), next(why for low, _, why in found.breaches if low == found.onset)
         out.append(
-            f"above {hertz:.3g} Hz the storage modulus moves as that of no material that relaxes "
+            f"above {hertz:.3g} Hz the storage modulus changes as in no material that relaxes "
             f"({bound}): the mark of the instrument, whose inertia adds a term that grows as "
             f"frequency^2; no model follows these points, leave them out with --max-frequency {_rounded_up(hertz):.4g}"
         )
@@ -146,14 +146,14 @@ def _rounded_up(hertz: float) -> float:
 
 
 def runs_probability(signs: np.ndarray) -> tuple[int, float]:
-    """Number of runs of equal sign, and the chance of so few or fewer in random order (Wald and Wolfowitz 1940)."""
+    """Number of runs of equal sign, and the chance of at most as many in random order (Wald and Wolfowitz 1940)."""
     up = np.asarray(signs)[np.asarray(signs) != 0] > 0
     n, a = len(up), int(up.sum())
     b = n - a
     runs = int(1 + np.sum(up[1:] != up[:-1])) if n else 0
     if min(a, b) == 0:  # one sign only: as likely as 2^(1 - n)
         return runs, 2.0 ** (1 - n) if n else 1.0
-    # Of r runs one sign has r // 2 and the other as many, or one more.
+    # If there are r runs, one sign has r // 2 of them, the other as many or one more.
     r = np.arange(2, runs + 1)
     k, more = r // 2, r // 2 + r % 2
     ways = np.logaddexp(_log_splits(a, k) + _log_splits(b, more), _log_splits(a, more) + _log_splits(b, k))
@@ -161,7 +161,7 @@ def runs_probability(signs: np.ndarray) -> tuple[int, float]:
 
 
 def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
-    """Logarithm of the number of ways to part n points in order into runs, C(n - 1, parts - 1); -inf for none."""
+    """Logarithm of the number of ways to divide n points in order into runs, C(n - 1, parts - 1); -inf for none."""
     top, low = n - 1, np.asarray(parts) - 1
     log = scipy.special.gammaln
     return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
@@ -179,5 +179,5 @@ def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple
         return numbers, []
     return numbers, [
         f"structured misfit: the residuals {' and those '.join(told)}; the model misses something that is no noise, "
-        "and the standard errors do not know of it: take the total errors, or another --model"
+        "and the standard errors do not contain it: use the total errors, or another --model"
     ]

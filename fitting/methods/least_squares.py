@@ -1,6 +1,5 @@
-"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy beside it.
-
-One code serves all: its arrays may be JAX's or NumPy's, and axes in front may hold many fits.
+"""Nonlinear least squares: Levenberg-Marquardt, compiled or in NumPy, and BFGS of jax.scipy. The code is the same for
+all: its arrays may be JAX's or NumPy's, and axes in front may be for many fits at once.
 """
 
 from collections.abc import Callable
@@ -34,7 +33,7 @@ class State(NamedTuple):
     r: Array
     J: Array
     trial: Array
-    predicted: Array  # gain of cost that the trial promises
+    predicted: Array  # predicted decrease of the cost by the trial
     damping: Array
     growth: Array
     iterations: Array
@@ -42,14 +41,14 @@ class State(NamedTuple):
     stuck: Array
 
 
-#: Convergence: gain of the undamped step over the cost, and mean squared residual that counts as zero.
+#: Convergence: relative decrease of the cost by the undamped step, and mean squared residual that counts as zero.
 GAIN, ZERO, MAX_DAMPING = 1e-10, 1e-26, 1e12
-#: How many times as long the best of many fits may go on alone.
+#: The best of many fits may use this many times as many iterations.
 LONGER = 8
 
 
 def _damped_steps(J: Array, r: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """The damped step, its expected gain of cost, and that of the undamped step; one singular value decomposition."""
+    """The damped step, and the decrease of the cost expected from it and from the undamped step; by one SVD."""
     xp = host.arrays_of(J)
     scale = xp.maximum(xp.linalg.norm(J, axis=-2), 1e-300)
     U, s, Vt = xp.linalg.svd(J / scale[..., None, :], full_matrices=False)
@@ -87,7 +86,7 @@ def accept(s: State, r: Array, J: Array, gain: float = GAIN) -> State:
     xp = host.arrays_of(s.u)
     first = s.iterations < 0
     cost, cost_new = _cost(s.r), _cost(r)
-    # False for NaN; without its derivatives a point leads nowhere.
+    # False for NaN. A point without finite derivatives is refused: no step could follow.
     better = (cost_new < cost) & xp.all(xp.isfinite(J), axis=(-2, -1))
     rho = xp.where(first, 0.5, (cost - cost_new) / xp.where(s.predicted > 0, s.predicted, 1.0))
     easier = xp.where(first, s.damping, s.damping * xp.maximum(1 / 9, 1 - (2 * rho - 1) ** 3))
@@ -123,7 +122,7 @@ def solution(s: State) -> Solution:
 
 
 def with_jacobian(residuals: Callable[..., jax.Array]) -> Callable[..., tuple[jax.Array, jax.Array]]:
-    """(r, dr/du) of a residual function of (u, …) in one forward-mode pass."""
+    """A function that gives (r, dr/du) of a residual function of (u, …) in one forward-mode pass."""
 
     def evaluate(u: jax.Array, *data: Any) -> tuple[jax.Array, jax.Array]:
         def twice(u):
@@ -162,10 +161,10 @@ def from_starts(evaluate: Evaluate, starts: np.ndarray, *data: Any, max_iteratio
     If the best has not converged yet, only it is iterated further: too few modes for a wide curve converge slowly.
 
     Args:
-        evaluate: of (u, *data), for example `host.with_jacobian` of a function of both.
+        evaluate: function of (u, *data), for example `host.with_jacobian` of a function of both.
         starts: where to begin.
         data: as in `evaluate`.
-        max_iterations: of each fit; of the best, `LONGER` times as many.
+        max_iterations: for each fit; for the best fit `LONGER` times as many.
     """
     found = _best_minimum(evaluate, starts, data, max_iterations)
     if found.converged or found.iterations < max_iterations:
@@ -200,8 +199,8 @@ def levenberg_marquardt_host(
 ) -> Solution:
     """The same iteration in Python, for residuals that take seconds and a start that is nearly the minimum.
 
-    `progress` is called after every evaluation. It stops where a step would gain 1e-8 of the cost: 1e-3 standard
-    errors.
+    `progress` is called after every evaluation. It stops if a step would lower the cost by less than 1e-8 of it: this
+    is 1e-3 standard errors.
     """
     trial: jax.Array = start
     s: Any = None
@@ -218,8 +217,8 @@ def levenberg_marquardt_host(
 def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol: float = 1e-8) -> Solution:
     """The same problem by BFGS of `jax.scipy.optimize`; `gtol` bounds the gradient of the cost.
 
-    Its line search often ends at roundoff before gtol is met, so convergence is judged by the least-squares gain
-    that is left, as in Levenberg-Marquardt.
+    Its line search often ends at roundoff before gtol is met, so convergence is judged by the decrease of the cost that
+    a least-squares step would still give, as in Levenberg-Marquardt.
     """
 
     def cost(u):
@@ -230,5 +229,5 @@ def bfgs(residuals: Callable[..., jax.Array], start: jax.Array, *data: Any, gtol
     r, J = with_jacobian(residuals)(found.x, *data)
     s = accept(begin(found.x, r.shape[0]), r, J)
     _, _, left = _damped_steps(J, r, s.damping)
-    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the latter: exact to any data's digits
+    near = (left <= 1e-4 * (r @ r)) | (r @ r <= 1e-14 * r.shape[0])  # the latter: more exact than any data
     return solution(s._replace(iterations=jnp.asarray(found.nit), converged=s.converged | near))

@@ -19,7 +19,7 @@ class Population(NamedTuple):
     spread: float  # standard deviation of the logarithms between samples
     mean_interval: tuple[float, float]
     new_interval: tuple[float, float]  # of a further sample
-    pooled: np.ndarray  # (n,) values of the samples, drawn towards the mean as far as their errors ask
+    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean according to their errors
     pooled_errors: np.ndarray  # (n,) standard deviations of their logarithms
 
 

@@ -2,8 +2,8 @@
 
 (kappa^2 - Laplace) m = white noise, kappa = 1 / length: in three dimensions a covariance sd^2 exp(-distance / length).
 With lumped mass M and stiffness L of linear tetrahedra, m = A^-1 M^(1/2) z for independent standard normal z, A =
-(kappa^2 M + L) / (sd sqrt(8 pi kappa)). Nothing flows out at the boundary, so
-sd is larger there. It is largest in corners.
+(kappa^2 M + L) / (sd sqrt(8 pi kappa)). The normal derivative is 0 at the boundary, so sd is larger there. It is
+largest in corners.
 """
 
 import math
@@ -17,7 +17,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 
 class Prior(NamedTuple):
-    """Factorised on the host; functions below."""
+    """A prior, factorised on the host, for the functions below."""
 
     solver: Any  # of kappa^2 M + L
     root_mass: np.ndarray  # (V,)
@@ -25,7 +25,7 @@ class Prior(NamedTuple):
 
 
 def prior(mesh: TetMesh, length: float) -> Prior:
-    """The field of standard deviation 1 and correlation length `length` [m]."""
+    """The prior of a field with standard deviation 1 and correlation length `length` [m]."""
     kappa, n = 1 / length, mesh.number_of_nodes
     tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
     D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)
@@ -56,7 +56,7 @@ def variances(p: Prior, modes: np.ndarray, kept: np.ndarray, chunk: int = 512) -
 
     Args:
         modes: orthonormal directions of z (V, k).
-        kept: variance that is left in each of them, of 1.
+        kept: part of the variance that is left in each of them.
     """
     n = len(p.root_mass)
     before = np.zeros(n)

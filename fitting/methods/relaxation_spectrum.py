@@ -1,11 +1,11 @@
-"""A spectrum on a fixed grid of relaxation times. Strengths are not negative, and they are smooth where the data say
-nothing.
+"""A spectrum on a fixed grid of relaxation times. Strengths are not negative, and they are smooth where the data do not
+determine them.
 
-For fixed times the moduli are linear in the strengths, so the minimum is the only one. Strengths are measured in the
-size of the data at omega = 1 / tau, and their second differences are held down by a weight. Method: Honerkamp and Weese
-(1989), Macromolecules 22. Grid and weight are those of the highest restricted likelihood (Wahba 1985, Ann. Stat. 13):
-the errors that follow from it hold the truth about as often as they say. The information criterion would choose a
-larger weight; its errors hold the truth less often (`experiments/identification/coverage.py`).
+For fixed times the moduli are linear in the strengths, so there is only one minimum. The unit of a strength is the size
+of the data at omega = 1 / tau, and a weight penalises the second differences of the strengths. Method: Honerkamp and
+Weese (1989), Macromolecules 22. Grid and weight are those of the highest restricted likelihood (Wahba 1985, Ann. Stat.
+13): the errors that follow from it contain the truth about as often as they should. The information criterion would
+choose a larger weight; its errors contain the truth less often (`experiments/identification/coverage.py`).
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ import numpy as np
 from fitting.methods.generalised_maxwell import mode_columns, non_negative
 from fitting.readers.rheometer import Sweep
 
-#: Grids tried [times a decade], decades beyond the band on either side, weights tried.
+#: Grids that are tried [times per decade], decades beyond the band on either side, weights that are tried.
 GRIDS, MARGIN, WEIGHTS = (2, 3), 1.0, np.logspace(-6, 4, 31)
-#: Relative standard error below which a strength counts as carried by the data.
+#: Relative standard error below which a strength counts as determined by the data.
 CARRIED = 0.5
 
 
@@ -30,28 +30,28 @@ class GridSpectrum(NamedTuple):
     equilibrium: float  # [Pa], 0 for a fluid
     per_decade: int
     smoothing: float  # weight of the second differences
-    prior: np.ndarray  # (R, 1 + K): its rows are the penalty, in equilibrium and strengths [1/Pa]
+    prior: np.ndarray  # (R, 1 + K): rows of the penalty on equilibrium modulus and strengths [1/Pa]
     effective: float  # number of parameters that the data determine
     criterion: float  # information criterion, for the comparison with other models
-    evidence: float  # -2 log of the restricted likelihood but for a constant, the level of the noise estimated
-    decades: float  # of relaxation times whose strengths the data carry
-    places: np.ndarray  # (K,) of these times in the whole grid
+    evidence: float  # -2 log of the restricted likelihood, up to a constant, with the noise estimated
+    decades: float  # number of decades of times whose strengths the data determine
+    places: np.ndarray  # (K,) indices of these times in the whole grid
 
 
 def fit(sweep: Sweep) -> GridSpectrum:
-    """The spectrum of the likeliest grid and weight."""
+    """The spectrum for the grid and the weight of the highest restricted likelihood."""
     return min((at(sweep, grid, w) for grid in GRIDS for w in WEIGHTS), key=lambda found: found.evidence)
 
 
 def fit_all(sweeps: Sequence[Sweep]) -> list[GridSpectrum]:
-    """Spectra of several samples on one grid with one weight: the likeliest for all."""
+    """Spectra of several samples on one grid with one weight, of the highest restricted likelihood for all."""
     band = min(s.resolved[0] for s in sweeps), max(s.resolved[1] for s in sweeps)
     every = ([at(s, grid, w, band) for s in sweeps] for grid in GRIDS for w in WEIGHTS)
     return min(every, key=lambda found: sum(f.evidence for f in found))
 
 
 def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float] | None = None) -> GridSpectrum:
-    """The spectrum of one grid and one weight; a convex problem, solved exactly. `band`: of times [s], for the grid."""
+    """The spectrum of one grid and one weight; a convex problem, solved exactly. `band`: range of times [s]."""
     omega = sweep.angular_frequency
     times = grid_of_times(*(band or sweep.resolved), per_decade)
     size = np.exp(np.interp(-np.log(times), np.log(omega), np.log(np.hypot(sweep.storage, sweep.loss))))
@@ -65,10 +65,10 @@ def at(sweep: Sweep, per_decade: int, smoothing: float, band: tuple[float, float
 
 
 class GridOfTimes(NamedTuple):
-    """Where the strengths of a spectrum stand, what they are measured in, and how they are held."""
+    """Grid of a spectrum: times and units of the strengths, and the weight of their smoothness."""
 
     times: np.ndarray  # (K,) [s], descending
-    unit: np.ndarray  # (1 + K,) [Pa]; the first is of the equilibrium modulus
+    unit: np.ndarray  # (1 + K,) [Pa]; the first is for the equilibrium modulus
     per_decade: int
     smoothing: float
 
@@ -80,19 +80,19 @@ def grid_of_times(low: float, high: float, per_decade: int) -> np.ndarray:
 
 
 def second_differences(count: int, smoothing: float) -> np.ndarray:
-    """The rows (K - 2, 1 + K) that hold the strengths."""
+    """Rows (K - 2, 1 + K) of the penalty on second differences of the strengths."""
     rows = np.column_stack([np.zeros(count - 2), np.diff(np.eye(count), 2, axis=0)])
     return np.sqrt(smoothing) * rows
 
 
 def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) -> GridSpectrum:
-    """The spectrum at a minimum, with its number of parameters in effect.
+    """The spectrum at a minimum, with its effective number of parameters.
 
     Args:
         x: equilibrium modulus and strengths (1 + K,) in `grid.unit`.
         A: derivative (m, 1 + K) of the residuals of the data.
         r: these residuals (m,).
-        grid: of the strengths.
+        grid: grid of the strengths.
     """
     L = second_differences(len(grid.times), grid.smoothing)
     m, free = len(r), x > 1e-10 * x.max()
@@ -119,7 +119,7 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
 
 
 def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:
-    """`GridSpectrum.evidence`: the prior leaves free as many numbers as L has more columns than rows."""
+    """Compute `GridSpectrum.evidence`. The prior has no effect on (columns of L - rows of L) numbers."""
     square = max(float(r @ r + np.sum((L @ x) ** 2)), 1e-300)
     with np.errstate(divide="ignore"):
         both = 2 * np.sum(np.log(np.abs(np.diag(np.linalg.qr(np.vstack([A, L]), mode="r")))))

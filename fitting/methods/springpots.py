@@ -1,12 +1,13 @@
 """Fractional models in closed form: springs and springpots, whose moduli are powers of the frequency.
 
 A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). Sources:
-Bagley and Torvik (1983), J. Rheol. 27; Schiessel et al. (1995), J. Phys. A 28. All models here are cases of one:
+Bagley and Torvik (1983), J. Rheol. 27; Schiessel et al. (1995), J. Phys. A 28. All models here are special cases of
+one:
 
     G* = E (i omega)^gamma + 1 / (1 / (V (i omega)^alpha) + 1 / (W (i omega)^beta))     gamma, beta < alpha
 
-with some of its six numbers absent, so that one compiled program fits them all. Inside, frequencies are measured in
-units of the middle of the band, x = omega / reference: starts and scales of all fits are then alike.
+with some of its six numbers absent, so that one compiled program fits them all. The code divides frequencies by the
+middle of the band, x = omega / reference, so that starts and scales of all fits are alike.
 """
 
 from collections.abc import Callable
@@ -35,7 +36,7 @@ class Fractional(NamedTuple):
 
     @property
     def solid(self) -> bool:
-        """There is an equilibrium modulus."""
+        """Whether there is an equilibrium modulus."""
         return 0 in self.free and 1 not in self.free
 
     @property
@@ -62,12 +63,12 @@ def modulus(u: jax.Array, switches: jax.Array, x: jax.Array, angle: float = 0.5 
     return beside + 1 / compliance
 
 
-#: Times a decade of `as_modes`, and the decades that they reach beyond the shortest and the longest time looked at.
+#: Relaxation times per decade in `as_modes`, and decades by which they exceed the shortest and the longest time.
 DENSE, BEYOND = 6, (3.0, 3.0)
 
 
 def times_of_modes(low: float, high: float) -> np.ndarray:
-    """Relaxation times (K,) [s], descending, for answers from `low` to `high` [s]."""
+    """Relaxation times (K,) [s], descending, for responses at times from `low` to `high` [s]."""
     decades = np.log10(high / low) + sum(BEYOND)
     return np.logspace(np.log10(high) + BEYOND[1], np.log10(low) - BEYOND[0], int(np.ceil(decades * DENSE)) + 1)
 
@@ -76,16 +77,17 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
     """Prony modes of the model's own relaxation spectrum, for responses in time.
 
     The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
-    exponentially. Two more terms stand for slower and faster times; they make G* exact at one slow and one fast real s.
+    exponentially. Two more terms replace slower and faster times; they are chosen so that G* is exact at one slow and
+    one fast real s.
 
     Args:
         u, switches: as in `modulus`.
-        times: (K,) [s], descending, of equal ratio, as in `times_of_modes`.
-        reference: frequency [rad/s] that u is measured in.
+        times: (K,) [s], descending, with a constant ratio, as in `times_of_modes`.
+        reference: frequency [rad/s] that is the unit of frequency in u.
     """
     step = jnp.log(times[0] / times[1])
     H = step * modulus(u, switches, 1 / (times * reference), np.pi).imag / np.pi
-    ends = jnp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: there each lump is whole
+    ends = jnp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: each term is whole there
     fast = times[-1] / 3
 
     def of_modes(s):
@@ -154,7 +156,7 @@ FRACTIONAL = (
         _zener,
         lambda s, e, m, tau, a: e + m * (s * tau) ** a / (1 + (s * tau) ** a),
     ),
-    # Two springpots in a row, a fluid: the one of larger exponent gives way at low frequencies.
+    # Two springpots in series, a fluid: the springpot of larger exponent deforms most at low frequencies.
     _case(
         "fractional_maxwell",
         (2, 3, 4, 5),
@@ -162,7 +164,7 @@ FRACTIONAL = (
         _maxwell,
         lambda s, v, a, w, b: 1 / (1 / (v * s**a) + 1 / (w * s**b)),
     ),
-    # Two springpots side by side, a fluid: the one of larger exponent leads at high frequencies.
+    # Two springpots in parallel, a fluid: the springpot of larger exponent dominates at high frequencies.
     _case(
         "fractional_parallel",
         (0, 1, 2, 3),
@@ -184,7 +186,7 @@ def reference_frequency(sweep: Sweep) -> float:
 
 
 def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
-    """Starting points (count, SIZE): two pots that cross inside or near the band, then spread around the data."""
+    """Starting points (count, SIZE): two springpots that cross inside or near the band, then random ones."""
     rng = np.random.default_rng(seed)
     size = np.log(np.hypot(sweep.storage, sweep.loss))
     half = 0.5 * np.log(sweep.angular_frequency[-1] / sweep.angular_frequency[0])
@@ -198,7 +200,7 @@ def starting_points(sweep: Sweep, count: int = 24, seed: int = 0) -> np.ndarray:
     return np.concatenate([np.array(ordered), spread])[:count]
 
 
-#: Where the two pots are equally stiff, in half bands from the middle.
+#: Frequencies at which the two springpots are equally stiff, in half bands from the middle.
 _CROSSINGS = (-1.5, -0.75, 0.0, 0.75, 1.5)
 
 
@@ -207,6 +209,6 @@ def _logit(p: np.ndarray | float) -> np.ndarray:
 
 
 def _softer_pot(level: float, smaller: float, alpha: float, log_x: float) -> list[float]:
-    """A pot of exponent `alpha` that is as stiff as one of exponent `smaller` at log_x."""
+    """Start u of two springpots with exponents `alpha` and `smaller` that are equally stiff at log_x."""
     ratio = float(_logit(min(smaller / alpha, 0.95)))
     return [level, ratio, level - (alpha - smaller) * log_x, float(_logit(alpha)), level, ratio]

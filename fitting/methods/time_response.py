@@ -1,16 +1,17 @@
 """Stress of a driven strain and strain of a driven stress: the generalised Maxwell model in time, in closed form.
 
-Between the points of the input both are linear, and there the convolution is exact. Relaxation is a sum over the modes.
-Creep is the same model solved for the strain: with b_i = sqrt(g_i / tau_i) the modes of
+The input is linear between its points, and for such an input the convolution is exact. Relaxation is a sum over the
+modes. Creep is the same model solved for the strain: with b_i = sqrt(g_i / tau_i) the eigenvalues -r_k and eigenvectors
+q_k of
 
     S = b b^T - diag(1 / tau)
 
-are its retardation modes: rates r_k >= 0 and weights (q_k . b)^2 (Gross 1953, Mathematical structure of the theories of
-viscoelasticity). A fluid has one rate 0: it flows.
+give its retardation modes: rates r_k >= 0 and weights (q_k . b)^2 (Gross 1953, Mathematical structure of the theories
+of viscoelasticity). A fluid has one rate 0: it flows.
 
-Fits take the same in NumPy with derivatives by hand (`residuals_with_jacobian`): nothing is compiled. The derivatives
-follow the recursions. Those of the retardation modes are the first-order changes of eigenvalues and eigenvectors of S,
-whose eigenvalues differ where the relaxation times do.
+Fits compute the same in NumPy with derivatives by hand (`residuals_with_jacobian`): nothing is compiled. The
+derivatives follow the recursions. The derivatives of the retardation modes are the first-order changes of eigenvalues
+and eigenvectors of S. The eigenvalues of S differ from each other if the relaxation times do.
 """
 
 from collections.abc import Callable
@@ -102,7 +103,7 @@ def residuals_with_jacobian(
         kind: "relaxation" or "creep".
         maxwell: u -> Prony modes.
         u: (…, P).
-        data: times (n,) [s]; what is driven (n,); rows (m,) that are answered; answers (m,); their scales (m,).
+        data: times (n,) [s]; driven quantity (n,); rows (m,) of the answers; answers (m,); their scales (m,).
     """
     time, driven, rows, answer, scales = data
     modes, slope = host.with_jacobian(partial(parameter_vector, maxwell=maxwell), u)
@@ -170,7 +171,7 @@ def _slopes_of_phi(x: np.ndarray, one: np.ndarray, two: np.ndarray) -> tuple[np.
     return np.where(small, near[0], of_one), np.where(small, near[1], of_two)
 
 
-#: Coefficients of their Taylor series: below 1e-2 the first one left out is below 1e-16.
+#: Coefficients of the Taylor series of these slopes: for x below 1e-2 the first term left out is below 1e-16.
 _SLOPES = (
     [-1 / 2, 1 / 3, -1 / 8, 1 / 30, -1 / 144, 1 / 840, -1 / 5760],
     [-1 / 6, 1 / 12, -1 / 40, 1 / 180, -1 / 1008, 1 / 6720, -1 / 51840],
@@ -188,7 +189,7 @@ def _retardation(model: Maxwell) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     eigenvalues, Q = np.linalg.eigh(np.where(known, S, 0.0))
     Q = np.where(known, Q, np.nan)
     c = np.einsum("...ik,...i->...k", Q, b)
-    # Of every number p of mode i: db_i/dp, and what p changes in the diagonal of -1/tau.
+    # For every number p of mode i: db_i/dp, and the derivative of the diagonal of -1/tau by p.
     of_b = np.concatenate([b / (2 * g), -b / (2 * tau)], axis=-1)
     of_diagonal = np.concatenate([np.zeros_like(tau), 1 / tau**2], axis=-1)
     at = np.swapaxes(np.concatenate([Q, Q], axis=-2), -1, -2)  # (…, k, p): Q_ik of the mode of p

@@ -41,8 +41,9 @@ def estimate(
     Args:
         found: minimum over u.
         deviations_given: as in `noise_factor`.
-        maxwell: u -> Prony modes; the default is of their own parametrisation.
-        components: number of measured residuals (default all), and of effective parameters (default those of u).
+        maxwell: u -> Prony modes; by default the parametrisation `natural`.
+        components: number of measured residuals (default all), and effective number of parameters (default length of
+            u).
     """
     count, effective = components or (len(found.residuals), None)
 
@@ -58,7 +59,7 @@ def equilibrium_error(u: Estimate) -> float:
     """Standard error of the equilibrium modulus G0 (1 - sum g) [Pa]; infinite for a fluid."""
     modes = (len(u.values) - 1) // 2
     rest = 1 - u.values[1 : modes + 1].sum()
-    # Through the square root of the covariance, which keeps it non-negative.
+    # By the square root of the covariance, so that the variance is never negative.
     slope = np.concatenate([[rest], np.full(modes, -u.values[0]), np.zeros(modes)])
     return float(np.linalg.norm(slope @ u.root)) if rest > 1e-10 else np.inf
 
@@ -66,8 +67,9 @@ def equilibrium_error(u: Estimate) -> float:
 def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:
     """95 % intervals by profile likelihood, closed form: all other parameters refitted along each one.
 
-    The likelihood is that of the noise. Where `uncertainty` has errors of the gap or the instrument too, each end is
-    moved out by them: the root of the sum of the squares, which is right to the first order of these errors.
+    The likelihood contains the noise only. If `uncertainty` has errors of the gap or the instrument too, they widen the
+    interval: each half width becomes the root of the sum of the squares, which is right to the first order of these
+    errors.
 
     Returns:
         name -> [low, high]; `None` for an end that four standard errors do not reach.
@@ -95,7 +97,7 @@ def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, poin
             intervals[name] = [None, None]
             continue
         grid = center + error * np.linspace(-4, 4, points) * uncertainty.quantile / 2
-        # The penalty only steers: wherever it comes to rest, that point is the constrained optimum there.
+        # The penalty need not reach its value exactly: the point reached is the constrained optimum for its own value.
         reached, chi2 = (
             np.asarray(v) for v in along(j, jnp.maximum(grid, 1e-3 * center), 1e3 * uncertainty.noise / error)
         )
@@ -131,7 +133,7 @@ class Band(Protocol):
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest of them [s]."""
+        """Shortest and longest resolved relaxation time [s]."""
 
 
 def _decades(data: Band) -> float:
@@ -145,7 +147,7 @@ def supported_modes(data: Band) -> int:
 
 
 def superfluous(data: Band, u: Estimate) -> list[str]:
-    """Sentences that advise against some of the modes; none for a number of modes that may be chosen."""
+    """Sentences that advise against some of the modes; empty if this number of modes may be chosen."""
     modes = (len(u.values) - 1) // 2
     kind, measured = ("sweep", "measured frequencies") if isinstance(data, Sweep) else ("test", "measured times")
     fewer = f"use fewer modes or a wider {kind}" if modes > 1 else f"use a wider {kind}"
@@ -158,7 +160,7 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
             product = f"G0 ratios[{k}] relaxation_times[{k}]" if tau[k] < low else f"G0 (1 - ratios[{k}])"
             out.append(
                 f"relaxation_times[{k}] = {tau[k]:.3g} s lies far outside the {low:.3g}-{high:.3g} s that the "
-                f"{measured} resolve: only {product} is determined, no factor of it; "
+                f"{measured} resolve: only {product} is determined, not its factors; "
                 f"{'use fewer modes or another band' if modes > 1 else 'use another band'}"
             )
         if not g_err[k] < 0.5 * g[k]:
@@ -180,7 +182,7 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     if modes > supported_modes(data) or _decades(data) < 0.3:
         out.append(
             f"the {kind} spans {_decades(data):.2g} decades, too short for {modes} mode{'s' if modes > 1 else ''} "
-            f"(about one a decade and one more); {fewer}"
+            f"(about one per decade and one more); {fewer}"
         )
     return out
 
@@ -202,14 +204,14 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
     equilibrium = u.values[0] * (1 - ratios)
     if model == "prony" and not equilibrium > 2 * equilibrium_error(u):
         out.append(
-            f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be told "
+            f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be distinguished "
             "from zero (a fluid); measure at lower frequencies"
         )
     if sweep.storage_sd is not None and not sweep.noise_given:
         out.append(
             f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are no noise: the points scatter by "
-            f"{100 * sweep.point_scatter:.2g} % only. They are taken as weights, and as the spread between samples: "
-            "the moduli of one sample differ by as much from these; give the files of the samples to fit each"
+            f"{100 * sweep.point_scatter:.2g} % only. They are used as weights, and as the spread between samples: "
+            "one sample may differ by as much from these moduli; give the files of the samples to fit each"
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(

@@ -25,7 +25,7 @@ class Curve(NamedTuple):
     F: np.ndarray  # (n, 3, 3), det F = 1, face 3 free
     component: tuple[int, int]  # of the nominal stress that was measured
     stress: np.ndarray  # (n,) [Pa]
-    returns: int = 0  # how often the file's rows go back over what they have been through
+    returns: int = 0  # how often the rows of the file turn and repeat a range
 
     @property
     def driven(self) -> np.ndarray:
@@ -47,9 +47,9 @@ class Curve(NamedTuple):
 def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[str]]:
     """Curves of CSV files, and notes for the user.
 
-    Two forms, `#` comments in both: columns F11 … F33 and P11 … P33 (components that are zero throughout were not
-    measured), or `test`, `stretch`, `shear`, `nominal_stress_kPa` with `test` one of uniaxial, equibiaxial, pure_shear,
-    simple_shear. A stress column may end in _Pa, _kPa or _MPa; without, it is in `unit`.
+    The file has one of two forms, both with `#` comments: columns F11 … F33 and P11 … P33 (a stress that is zero in all
+    rows counts as not measured), or `test`, `stretch`, `shear`, `nominal_stress_kPa` with `test` one of uniaxial,
+    equibiaxial, pure_shear, simple_shear. A stress column may end in _Pa, _kPa or _MPa; without, it is in `unit`.
 
     Raises:
         InputError: no such file, no such columns, values that are no numbers, volume that changes, too few points.
@@ -129,7 +129,7 @@ def _column(file: Path, rows: list[dict], name: str, default: float | None = Non
 
 
 def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str, float, bool] | None:
-    """Name, factor to Pa, and whether the unit was named."""
+    """Name of the stress column, its factor to Pa, and whether it names its unit."""
     for name in row:
         match = re.fullmatch(pattern + r"(?:[_ ]*[\[(]?(Pa|kPa|MPa)[\])]?)?", name)
         if match:
@@ -212,7 +212,7 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
         raise InputError(f"{file}: {label} has a mean stress of {rms:g} Pa: give measured stresses")
     if np.ptp(F, axis=0).max() == 0:
         raise InputError(f"{file}: {label} has the same deformation in every row: give a curve")
-    # Rounded digits of F: the volume is made 1 by the free side.
+    # F has rounded digits: the free side is scaled so that det F = 1.
     F = F.copy()
     F[:, 2, 2] /= J
     driven = Curve(label, test, F, component, stress).driven
@@ -220,12 +220,12 @@ def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tupl
     return Curve(label, test, F[order], component, stress[order], _returns(driven))
 
 
-#: Part of its range by which a curve goes back where it turns.
+#: A curve turns if it goes back by more than this part of its range.
 _TURN = 0.05
 
 
 def _returns(driven: np.ndarray) -> int:
-    """How often rows (n,) turn and go over a range again in which they had rows before."""
+    """How often the rows (n,) turn and repeat a range that they have passed before."""
     turns, low, high, least = [0], 0, 0, _TURN * np.ptp(driven)
     rises: bool | None = None
     for k, value in enumerate(driven):

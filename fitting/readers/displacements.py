@@ -1,4 +1,4 @@
-"""Measured displacements of points of a body: read from CSV, and what a simulation says at the same points."""
+"""Measured displacements of points of a body: read from CSV, and a simulation's displacements at these points."""
 
 import warnings
 from pathlib import Path
@@ -15,17 +15,17 @@ from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
 from liverjax.scenes.scene import Scene
 
-#: A point this far from the mesh, in lengths of its longest edges, is not one of the body.
+#: A point farther from the mesh than this, in sizes of the nearest element, does not belong to the body.
 _FAR = 2.0
 _COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
 
 
 class Displacements(NamedTuple):
-    """n points, each seen at one step of the scene."""
+    """Displacements of n points, each measured at one step of the scene."""
 
     step: np.ndarray  # (n,) which step, from 0
-    nodes: np.ndarray  # (n, 4) of the element it is in; (n, 10) of a quadratic one
-    weights: np.ndarray  # of these nodes, the values of their functions there
+    nodes: np.ndarray  # (n, 4) nodes of the element of the point; (n, 10) if quadratic
+    weights: np.ndarray  # shape functions of these nodes at the point
     measured: np.ndarray  # (n, 3) [m]; 0 where not measured
     sd: np.ndarray  # (n, 3) [m] standard deviation of the noise; infinite where not measured
 
@@ -39,18 +39,18 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     """Displacements of a CSV file with a header.
 
     Columns: ``node`` (its number), or ``x, y, z`` (place at rest); ``ux, uy, uz``, empty where not measured; ``time``
-    [s] where the scene has time steps (without it: the last step); ``sd``, standard deviation of the noise. `#` begins
-    a comment.
+    [s] if the scene has time steps (without it: the last step); ``sd``, standard deviation of the noise. `#` begins a
+    comment.
 
     Args:
         path: CSV file.
         scene: the scene that is to explain them.
-        noise: standard deviation [m] where the file has no ``sd``.
+        noise: standard deviation [m] if the file has no ``sd``.
         unit: of all lengths in the file, one of `liverjax.mesh.tetrahedra.UNITS`.
 
     Raises:
-        InputError: unreadable file, unknown or missing columns, values that are not finite, a node or point that the
-            mesh has not, a time at which there is no step, no noise level.
+        InputError: unreadable file, unknown or missing columns, values that are not finite, a node or point that is not
+            in the mesh, a time without a step, no noise level.
     """
     path = Path(path)
     if unit not in UNITS:
@@ -109,22 +109,20 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
 
 
 def _refuse_words(path: Path, table: dict[str, np.ndarray]) -> None:
-    """`InputError` where a cell that is not empty is no number: it would pass for one that was not measured."""
+    """Raise `InputError` if a cell is neither empty nor a number: it would count as not measured."""
     cells = np.atleast_2d(np.genfromtxt(path, delimiter=",", comments="#", dtype=str, encoding="utf-8"))
     for j, (name, column) in enumerate(table.items()):
         for k in np.flatnonzero(np.isnan(column)):
             cell = cells[k - len(column), j].strip().strip('"')  # the header, if it is there, is above
             if cell.lower() not in EMPTY:
-                raise InputError(f"{path}: row {k + 1}: {name} = {cell!r} is no number: mend it, or leave it empty")
+                raise InputError(f"{path}: row {k + 1}: {name} = {cell!r} is no number: correct it, or leave it empty")
 
 
 def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     whole = np.isfinite(node) & (node == np.round(node)) & (node >= 0) & (node < mesh.number_of_nodes)
     if not whole.all():
         bad = node[np.flatnonzero(~whole)[0]]
-        raise InputError(
-            f"{path}: node {bad:g} is none of the mesh's: give whole numbers 0 to {mesh.number_of_nodes - 1}"
-        )
+        raise InputError(f"{path}: node {bad:g} is not in the mesh: give whole numbers 0 to {mesh.number_of_nodes - 1}")
     weights = np.zeros((len(node), 4))
     weights[:, 0] = 1
     return np.repeat(node.astype(np.int32)[:, None], 4, axis=1), weights
@@ -143,11 +141,11 @@ def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The element that holds each point or is nearest to it: its nodes, the values of their functions, and the
+    """The element that contains each point or is nearest to it: its nodes, the values of their functions, and the
     distance.
 
-    Returns nodes (n, 4) and barycentric coordinates (n, 4), of quadratic elements 10 of both; and how far outside the
-    point is (n,), in sizes of the element; host side.
+    Returns nodes (n, 4) and barycentric coordinates (n, 4), or for quadratic elements nodes (n, 10) and their functions
+    (n, 10); and the distance (n,) of the point from the element, in sizes of the element; host side.
     """
     X, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     candidates = min(candidates, len(tets))
@@ -191,5 +189,5 @@ def predicted(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Ar
 
 
 def weighted_differences(data: Displacements, scene: Scene, positions: jax.Array) -> jax.Array:
-    """Differences over the noise, flat (3 n,); 0 where nothing was measured."""
+    """Predicted minus measured displacements over the noise, flat (3 n,); 0 where nothing was measured."""
     return ((predicted(data, scene, positions) - data.measured) / data.sd).ravel()

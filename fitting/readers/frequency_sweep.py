@@ -9,10 +9,10 @@ from fitting.readers import raw_torque
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Frequencies that must remain where points are left out: more would be lost than a fit of one mode can spare.
+#: Fewest frequencies that must remain if points are left out: a fit of one mode needs them.
 FEWEST = 3
 #: Deviations above a tenth of the moduli, and above the scatter of the points by this factor, are the spread between
-#: samples, which all frequencies share: no rheometer is so noisy and so smooth.
+#: samples, which is common to all frequencies: with noise of this size the points would scatter as much.
 SHARED, LARGE = 3.0, 0.1
 
 
@@ -25,14 +25,14 @@ class Sweep(NamedTuple):
     storage_sd: np.ndarray | None = None  # (n,) standard deviations [Pa]
     loss_sd: np.ndarray | None = None
     source: str = ""
-    notes: tuple[str, ...] = ()  # what the reader changed or chose, sentences
-    raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], where the file has them
+    notes: tuple[str, ...] = ()  # sentences on what the reader changed or chose
+    raw: dict[str, np.ndarray] | None = None  # (n,) raw torque [N m], angle [rad], phase [rad], if in the file
     inertia: np.ndarray | None = (
-        None  # (n,) [Pa] what the instrument subtracted for its inertia, where raw columns tell
+        None  # (n,) [Pa] that the instrument subtracted for its inertia, if raw columns show it
     )
     friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
     friction_error: float = 0.0  # this deviation [N m s]
-    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out for the instrument's sake
+    grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out that show the instrument
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -82,12 +82,12 @@ def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
     for k in range(len(x) - 3):
         own = x[k : k + 4] - x[k]
         _, _, Vt = np.linalg.svd(np.vander(own, 3, increasing=True).T)
-        left.append(Vt[-1] @ y[k : k + 4])  # what no parabola can follow, of unit variance
+        left.append(Vt[-1] @ y[k : k + 4])  # distance from any parabola, scaled to unit variance
     return float(np.median(np.abs(left)) / 0.6745)
 
 
 def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """One point a frequency: repeated ones are averaged."""
+    """One point per frequency: repeated points are averaged."""
     different, place = np.unique(omega, return_inverse=True)
     count = np.bincount(place)
     return different, *(np.bincount(place, column) / count for column in columns)
@@ -117,7 +117,7 @@ def within(sweep: Sweep, low: float | None, high: float | None) -> Sweep:
     ends = " and ".join(
         f"{word} {limit:g} Hz" for word, limit in (("below", low), ("above", high)) if limit is not None
     )
-    note = f"{(~kept).sum()} of {len(kept)} points {ends} are left out as asked for"
+    note = f"{(~kept).sum()} of {len(kept)} points {ends} are left out as requested"
     return some(sweep, kept)._replace(notes=(*sweep.notes, note))
 
 
@@ -138,7 +138,8 @@ def with_friction(sweep: Sweep, error: float, radius: float, height: float) -> S
 def without_inertia(sweep: Sweep, radius: float | None = None, height: float | None = None) -> Sweep:
     """The points whose modulus exceeds the uncertain part of the instrument's inertia; the others become `grey`.
 
-    Needs raw torque and angle in the file, and the torque of the sample or its radius and height [m]; or the raw phase.
+    This needs raw torque and angle in the file, and the torque of the sample or its radius and height [m]; or it needs
+    the raw phase.
     """
     if not sweep.raw:
         return sweep
@@ -156,7 +157,7 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     if np.isfinite(found.inertia):
         shows = f"torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2"
     times = found.modulus[k] / np.abs(G[k])
-    note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it carries {times:.3g} times the torque of the sample"
+    note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it needs {times:.3g} times the torque of the sample"
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))
     if len(np.unique(sweep.angular_frequency[~lost])) < FEWEST:

@@ -14,24 +14,24 @@ from liverjax.core.errors import InputError
 #: First words of the two columns.
 _WORDS = {"depth": ("depth", "displacement", "indentation"), "force": ("force", "load")}
 _FEWEST = 6
-#: The part of the depth by which an indenter goes back where a loading ends, and the part of the points that is held.
+#: A loading ends where the indenter goes back by this part of the depth; a longer hold at its end, in points, is cut.
 _BACK, _HELD = 0.1, 0.15
-#: A rise of the force, over the largest, that must be seen to tell an offset.
+#: An offset is subtracted only if the noise could not hide a rise by this part of the largest force.
 _FLAT = 0.01
 
 
 class IndentationCurve(NamedTuple):
     """The measured approach of an indenter."""
 
-    depth: np.ndarray  # (n,) [m] of the indenter, from anywhere, larger further in
+    depth: np.ndarray  # (n,) [m] of the indenter, from any origin, larger further in
     force: np.ndarray  # (n,) [N]
     source: str
     notes: tuple[str, ...] = ()
 
 
 def read_indentation(path: str | Path) -> IndentationCurve:
-    """Read the loading part of a curve: up to the deepest point, or to where depth or force is held before; of several
-    loadings the first.
+    """Read the loading part of a curve, up to the deepest point or to an earlier hold of depth or force; of several
+    loadings the first is read.
 
     Args:
         path: text with a header that names depth (or displacement, indentation) and force (or load), with units m, mm,
@@ -55,16 +55,16 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
         remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
-        raise InputError(f"{path}: {last} points go in; a fit needs {_FEWEST} or more, at different depths: {remedy}")
+        raise InputError(f"{path}: {last} loading points; a fit needs {_FEWEST} or more, at different depths: {remedy}")
     depth, force = depth[:last], force[:last]
     offset = _offset(force)
     if offset:
-        notes.append(f"the force is {offset:.3g} N before it rises: this offset of the sensor is taken off")
+        notes.append(f"the force is {offset:.3g} N before it rises: this offset of the sensor is subtracted")
     return IndentationCurve(depth, force - offset, str(path), tuple(notes))
 
 
 def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str]]:
-    """Number of points of the first loading, without what is held at its end; then notes."""
+    """Number of points of the first loading, without a hold at its end; then notes."""
     number, notes = len(depth), []
     back = np.maximum.accumulate(depth) - depth > _BACK * np.ptp(depth)
     end = int(np.argmax(back)) if back.any() else number
@@ -74,7 +74,7 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
     reached = [int(np.argmax(v[:last] >= np.max(v[:last]) - _margin(v[:last]))) + 1 for v in (depth, force)]
     if last - min(reached) > max(5, _HELD * last):
         notes.append(
-            f"{last - min(reached)} points are left out where depth or force is held at the end of the loading"
+            f"{last - min(reached)} points are left out, as depth or force is constant at the end of the loading"
         )
         last = min(reached)
     elif last < number:
@@ -95,7 +95,7 @@ def _offset(force: np.ndarray) -> float:
 
 
 def _margin(values: np.ndarray) -> float:
-    """How near to its largest value a quantity counts as held: twice its noise, and 0.5 % of its range."""
+    """Distance from the largest value at which a quantity counts as held: twice its noise, plus 0.5 % of its range."""
     return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 

@@ -4,9 +4,9 @@ import numpy as np
 
 
 def noise_of_series(values: np.ndarray) -> float:
-    """Standard deviation of independent noise on a smooth series (n,), from third differences; 0 of fewer than four.
+    """Standard deviation of independent noise on a smooth series (n,), from third differences; 0 for fewer than four.
 
-    Three differences have 20 times the variance of the noise. The median is not moved by a few jumps.
+    Three differences have 20 times the variance of the noise. A few jumps do not change the median.
     """
     steps = np.abs(np.diff(values, 3))
     return float(np.median(steps)) / 0.6745 / np.sqrt(20) if len(steps) else 0.0

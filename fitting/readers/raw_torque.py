@@ -11,9 +11,9 @@ import numpy as np
 
 from fitting.readers.units import RAW_TORQUE_UNITS
 
-#: Relative standard deviation of an instrument's inertia: how far calibrations of one instrument lie apart.
+#: Relative standard deviation of an instrument's inertia: the spread of repeated calibrations of one instrument.
 UNCERTAINTY = 0.03
-#: What a heading begins with and the quantity; where several name one quantity, the first of this list is taken.
+#: First words of a heading, and its quantity; if several headings name one quantity, the first of this list is used.
 HEADINGS = (
     ("oscillation torque (sample)", "sample_torque"),
     ("oscillation torque", "torque"),
@@ -33,7 +33,7 @@ HEADINGS = (
 class SampleShare(NamedTuple):
     """The inertia of the instrument in a sweep."""
 
-    inertia: float  # I [N m s^2]; NaN where K is not known
+    inertia: float  # I [N m s^2]; NaN if K is not known
     modulus: np.ndarray  # (n,) I omega^2 / K [Pa]
 
 
@@ -42,13 +42,13 @@ def known_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, fl
 
     Args:
         cells: headings.
-        units: of a line of their own, or nothing.
+        units: units from a line of their own; may be empty.
     """
     return {q: (place, RAW_TORQUE_UNITS[q][unit]) for q, (place, unit) in _places_and_units(cells, units).items()}
 
 
 def unit_of(quantity: str, cells: list[str], units: list[str]) -> str:
-    """The unit of a quantity as headings or the line of units state it; empty where they do not."""
+    """The unit of a quantity as headings or the line of units state it; empty if they do not."""
     return _places_and_units(cells, units).get(quantity, (0, ""))[1]
 
 
@@ -73,13 +73,13 @@ def _plain_unit(unit: str) -> str:
 
 
 def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry: float | None) -> SampleShare | None:
-    """The inertia that was subtracted; None where the columns do not tell it.
+    """The inertia that the instrument subtracted; None if the columns do not show it.
 
     Args:
         omega: (n,) [rad/s].
         G: complex modulus (n,) [Pa], as corrected by the instrument.
         raw: columns (n,) in SI: torque and angle, perhaps phase and sample_torque.
-        geometry: K [m^3], torque of 1 Pa and 1 rad; needed where there is no sample_torque.
+        geometry: K [m^3], torque per Pa and rad; needed if there is no sample_torque.
     """
     if not {"torque", "angle"} <= set(raw) or np.any(~(np.abs(raw["angle"]) > 0)):
         return None
@@ -100,9 +100,10 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
 
 
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
-    """The same by the raw phase alone, which needs no torque and no size: I omega^2 / K = G' - G'' / tan(phase).
+    """The inertia by the raw phase alone, without torque and size: I omega^2 / K = G' - G'' / tan(phase).
 
-    None if there is no phase, if the phases do not agree on one inertia, or if inertia leads at no frequency.
+    None if there is no phase, if the phases do not agree on one inertia, or if the inertia is below the modulus even at
+    the highest frequency.
     """
     if "phase" not in raw:
         return None

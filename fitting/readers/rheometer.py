@@ -1,8 +1,8 @@
 """Frequency sweeps from files: plain CSV, TA TRIOS text and Anton Paar RheoCompass exports.
 
-One reader serves all: it looks for a line that names a frequency and two of storage modulus, loss modulus, |G*|, phase
-and tan(delta), an optional line of units below it, and numbers below that. Everything leaves in rad/s and Pa, sorted by
-frequency.
+One reader is used for all: it looks for a line that names a frequency and two of storage modulus, loss modulus, |G*|,
+phase and tan(delta), an optional line of units below it, and numbers below that. The result is in rad/s and Pa, sorted
+by frequency.
 """
 
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-# Some of these are here for users alone: `fitting.rheometer` offers what this module has.
+# Some of these imports are for users only: `fitting.rheometer` exports all names of this module.
 from fitting.readers.frequency_sweep import FEWEST, Sweep
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
@@ -25,7 +25,7 @@ from fitting.readers.tables.text_tables import to_number as to_number
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Beyond these no modulus [Pa] or frequency [rad/s] was ever measured, and squares overflow.
+#: A modulus [Pa] or frequency [rad/s] outside of these is beyond any measurement, and its square may overflow.
 SMALLEST, LARGEST = 1e-30, 1e30
 
 
@@ -39,8 +39,8 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
         path: text with a header naming ``frequency_Hz`` or ``angular_frequency_rad_s``, ``storage_modulus_Pa``,
             ``loss_modulus_Pa`` (kPa, MPa likewise), optional ``storage_modulus_sd_Pa`` and ``loss_modulus_sd_Pa``;
             ``#`` comments; or an instrument's export.
-        table: of a file with several tables, the number (from 1), the name or a part of the name of the one to read;
-            by default the one with most frequencies, the first of equals.
+        table: the table to read of a file with several: its number (from 1), its name or a part of its name; by default
+            the table with most frequencies, the first of them if several have as many.
 
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
@@ -99,7 +99,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     values = {q: v[good] for q, (_, v) in first.items()}
     omega = values["frequency"]
     if len(np.unique(omega)) < 2:
-        raise InputError(f"{path}: it holds {len(np.unique(omega))} frequency; give at least two different ones")
+        raise InputError(f"{path}: it has {len(np.unique(omega))} frequency; give at least two different ones")
     values = storage_and_loss(values, notes)
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
@@ -117,7 +117,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
 
 
 def _check_agreement(path: str, first: dict, column: Column, written: np.ndarray, good: np.ndarray) -> None:
-    """`InputError` where a second column of a quantity does not say the same as the first."""
+    """Raise `InputError` if a second column of a quantity disagrees with the first."""
     own, values = first[column.quantity]
     both = column_in_si(path, column, written, [])[good]
     both = both / 3 if column.quantity.split("_")[0] in MODULI and is_tensile(column) else both

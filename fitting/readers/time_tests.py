@@ -1,4 +1,4 @@
-"""Relaxation and creep from files: time with modulus, compliance, strain and stress, torque and angle, force and path.
+"""Relaxation and creep from files: time with modulus, compliance, strain and stress, or other pairs of columns.
 
 Files have the forms of sweeps: plain CSV, TRIOS and RheoCompass text, units in the header or below it.
 """
@@ -37,7 +37,7 @@ WORDS = (
     ("step time", "time"),
     ("time", "time"),
 )
-#: What a file must have beside the time, best first.
+#: Quantities that a file must have in addition to the time, best first.
 FORMS = (
     ("strain", "stress"),
     ("angle", "torque"),
@@ -47,14 +47,14 @@ FORMS = (
 )
 
 
-#: TRIOS writes the time since the test began, and since the experiment began: the first is the test's own.
+#: TRIOS writes two times, since the test began and since the experiment began. The time of the test is used.
 OWN_TIME = "step time"
-#: A load below this part of the largest one, at the first row, counts as rest: it moves no answer by more.
+#: A load at the first row below this part of the largest load counts as rest: its effect on answers is as small.
 AT_REST = 0.01
 
 #: Scatter of the load that is too small to matter, as a part of the largest one.
 QUIET = 1e-3
-#: Relative error at which a floor of the noise begins to count; of a test in cycles, part of the largest answer.
+#: Lower bound of the scales: noise over this relative error; in a cyclic test this part of the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
 
@@ -63,23 +63,22 @@ class TimeTest(NamedTuple):
 
     kind: str  # relaxation or creep
     time: np.ndarray  # (n,) [s], ascending
-    driven: np.ndarray  # (n,) strain, of creep stress [Pa], at these times
-    answer: np.ndarray  # (n,) stress [Pa], of creep strain
+    driven: np.ndarray  # (n,) strain, in creep stress [Pa], at these times
+    answer: np.ndarray  # (n,) measured response: stress [Pa], in creep strain
     used: np.ndarray  # (n,) rows whose answer is fitted
     source: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def scales(self) -> np.ndarray:
-        """Scales of the residuals: the size of each answer, but not less than a floor for answers that are lost in
-        noise."""
+        """Scales of the residuals: the size of each answer, with a lower bound for answers that are lost in noise."""
         answer = self.answer[self.used]
         floor = max(noise_of_series(answer) / RELATIVE, CYCLIC * float(np.max(np.abs(answer))) if self.cyclic else 0.0)
         return np.hypot(answer, floor)
 
     @property
     def cyclic(self) -> bool:
-        """Whether the driven quantity falls by more than half of its largest value and rises again: answers pass 0."""
+        """Whether the driven quantity falls by more than half of its largest value and rises again (answers pass 0)."""
         driven = np.abs(self.driven)
         half = 0.5 * driven.max()
         fallen = np.maximum.accumulate(driven) - driven > half
@@ -99,13 +98,13 @@ class TimeTest(NamedTuple):
 
     @property
     def resolved(self) -> tuple[float, float]:
-        """Shortest and longest relaxation time [s] that the test sees: from the first answer used to the last."""
+        """Shortest and longest relaxation time [s] that the test resolves: from the first answer used to the last."""
         time = self.time[self.used] - self.begun
         return float(time[0]), float(time[-1])
 
 
 class Sample(NamedTuple):
-    """Size of the sample [m], where the columns are of torque or force."""
+    """Size of the sample [m], needed if the columns are torque or force."""
 
     radius: float | None = None
     height: float | None = None
@@ -132,7 +131,7 @@ def read_time_test(
     form = next((f for f in FORMS if set(f) <= set(columns)), None)
     if form is None or (form[0] in ("modulus", "compliance") and form[0] != _own_table(kind)):
         raise InputError(
-            f"{path}: a {kind} test needs, beside time, {_own_table(kind)}, or strain and stress, angle and torque, or "
+            f"{path}: a {kind} test needs, with time, {_own_table(kind)}, or strain and stress, angle and torque, or "
             f"displacement and force; the file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
@@ -171,17 +170,17 @@ def of_columns(
     source: tuple[str, list[str]],
     start: float = 0.0,
 ) -> TimeTest:
-    """A test of strain and stress whose rows begin at 0 s, as those of `from_rest`.
+    """A test from columns of strain and stress whose rows begin at 0 s (see `from_rest`).
 
     Args:
         kind: "relaxation" or "creep".
         time: (n,) [s], rising from 0.
-        driven, answer: (n,) strain and stress [Pa], of creep stress and strain.
+        driven, answer: (n,) strain and stress [Pa]; in creep stress and strain.
         source: name of the file, and notes.
         start: answers before this time [s] are not fitted.
 
     Raises:
-        InputError: nothing driven, few answers, signs that do not go together.
+        InputError: the driven quantity is zero, there are too few answers, or their sign is opposite.
     """
     driven, told = _held_by_its_mean(time, driven, "strain" if kind == "relaxation" else "stress")
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
@@ -190,11 +189,11 @@ def of_columns(
 def from_rest(
     time: np.ndarray, driven: np.ndarray, answer: np.ndarray, at_once: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """The rows (n,), with one at 0 s if they begin later; then notes.
+    """The rows (n,), with a row added at 0 s if they begin later; then notes.
 
     Args:
         time, driven, answer: (n,) as in `of_columns`.
-        at_once: the first load was there from 0 s on; else it was raised from 0 until the first row.
+        at_once: whether the first load acted from 0 s on; else it was raised from 0 s until the first row.
     """
     if not time[0] > 0:
         return time, driven, answer, []
@@ -208,9 +207,9 @@ def from_rest(
 
 
 def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """A driven quantity that scatters while it is held, at its mean there; then notes.
+    """A driven quantity; if it scatters while it is constant, its mean replaces it there. Then notes.
 
-    Each reading counts as a step that was made, so the scatter of a sensor would be taken for motion.
+    The model treats each reading as a real step, so it would treat the scatter of a sensor as motion.
     """
     size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
     if not noise > QUIET * size:
@@ -219,14 +218,14 @@ def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[
     near = np.abs(driven - level) <= 5 * noise
     first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
     share = np.mean(near[first:])
-    if share < 0.5:  # cycles, which differences of a few rows do not tell from noise
+    if share < 0.5:  # cycles: differences of a few rows do not distinguish them from noise
         return driven, []
     if share < 0.99:
         return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
     held, rest = driven.copy(), int(np.argmax(np.abs(driven) > 5 * noise))
     held[first:] = np.mean(driven[first:])
     held[:rest] = np.mean(driven[:rest]) if rest else 0.0
-    return held, [f"{told}: from {time[first]:.3g} s on, where it is held, its mean is taken"]
+    return held, [f"{told}: from {time[first]:.3g} s on, where it is constant, its mean is taken"]
 
 
 def kind_of(path: str | os.PathLike) -> str:
@@ -262,7 +261,7 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
 
 
 def _told_of_tables(below: list[str]) -> list[str]:
-    """A note where further tables of tests are below the first one."""
+    """A note if further tables of tests are below the first one."""
     more = sum(map(_begins_a_table, below))
     if not more:
         return []
@@ -275,7 +274,7 @@ def _begins_a_table(line: str) -> bool:
 
 
 def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Quantity -> place and unit of the first cell that names it; of times the test's own is the first."""
+    """Quantity -> place and unit of the first cell that names it; a step time comes before other times."""
     found: dict[str, tuple[int, str | None]] = {}
     for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
         text = cell.strip().strip('"')
@@ -312,7 +311,7 @@ def _known_column(quantity: str, unit: str) -> bool:
 
 
 def _rows_in_time(path, lines, k, delimiter, found):
-    """Numbers below the header, the units that a line of their own gives, and notes. An empty cell is NaN."""
+    """Numbers below the header, the units of a unit line, and notes. An empty cell is NaN."""
     kept, numbers, units, notes = [], [], {}, []
     needed = {q: place for q, (place, _) in found.items()}
     while k < len(lines):
@@ -325,18 +324,18 @@ def _rows_in_time(path, lines, k, delimiter, found):
             numbers.append(k)
             continue
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
-        if not kept and named:  # units that are not known stay, and are refused
+        if not kept and named:  # unknown units are kept here, and refused later
             units = {q: cells[p].strip('[]() "') for q, p in needed.items() if p < len(cells) and cells[p].strip()}
         elif kept and any(c.strip().lower() not in EMPTY for c in own) and not line.lstrip().startswith("#"):
             if not _rows_follow(lines[k:], delimiter, list(needed.values())):
                 break
-            notes.append(f"line {k}, {line.strip()[:40]!r}, holds no numbers and is left out")
+            notes.append(f"line {k}, {line.strip()[:40]!r}, has no numbers and is left out")
     sign = decimal_sign(cell for own in kept for cell in own)
     rows = [[to_number(cell, delimiter, sign) for cell in own] for own in kept]
     for number, row in zip(numbers, rows, strict=True):
         if any(v is None for v in row):
             shown = lines[number - 1].strip()[:40]
-            raise InputError(f"{path}: line {number}: {shown!r} has a cell that is no number; mend or remove it")
+            raise InputError(f"{path}: line {number}: {shown!r} has a cell that is no number; correct or remove it")
     if len(rows) < 4:
         raise InputError(f"{path}: {len(rows)} rows of numbers are below the header; give four or more")
     return rows, units, notes
@@ -372,7 +371,7 @@ def _in_si(path, found, rows, units):
 
 
 def _as_a_step(path, time, modulus, ramp):
-    """A driven strain (or stress) of 1, reached at once or over a ramp."""
+    """Times, a driven strain (or stress) of 1 that is reached at once or over a ramp, and answers."""
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
     kept = time > 0
@@ -383,7 +382,7 @@ def _as_a_step(path, time, modulus, ramp):
 
 
 def _as_shear(path, form, columns, sample):
-    """Strain, stress [Pa] of shear, and notes."""
+    """Shear strain, shear stress [Pa], and notes."""
     if form == ("strain", "stress"):
         return columns["strain"], columns["stress"], []
     if sample.radius is None or sample.height is None:
@@ -408,7 +407,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         )
     if not np.median(answer[used]) > 0:
         raise InputError(
-            f"{test.source}: most answers have the opposite sign of the {test.kind} test's input; mend the signs"
+            f"{test.source}: most answers have the opposite sign of the {test.kind} test's input; correct the signs"
         )
     notes, before = test.notes, int(np.sum(test.time <= test.begun))
     if before > 2:

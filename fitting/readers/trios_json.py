@@ -1,6 +1,6 @@
 """TA TRIOS exports in JSON, turned into the text tables that the other readers know.
 
-Layout: TRIOSJSONExportSchema of TA Instruments. `Results` (or its part `Processed`, else `Raw`) holds `ColumnHeaders`,
+Layout: TRIOSJSONExportSchema of TA Instruments. `Results` (or its part `Processed`, else `Raw`) has `ColumnHeaders`,
 key -> name and unit, `Rows` of key -> value, and the steps of the test by their id.
 """
 
@@ -11,7 +11,7 @@ STEP = "Results Step Id"
 
 
 def tables(text: str) -> str | None:
-    """Tab-separated tables, one a step, with a row of names and a row of units; None where the text is no such JSON."""
+    """Tab-separated tables, one per step, with a row of names and a row of units; None if the text is not such JSON."""
     try:
         content = json.loads(text)
         results = content["Results"]
@@ -33,7 +33,7 @@ def tables(text: str) -> str | None:
 
 
 def _is_column(values: list) -> bool:
-    """Whether all are numbers, or empty where a point was aborted."""
+    """Whether all values are numbers, or empty because a point was aborted."""
     return all(v is None or _is_number(v) for v in values) and any(map(_is_number, values))
 
 

@@ -15,12 +15,12 @@ def is_one(data: bytes) -> bool:
 
 
 def text(path: Path, data: bytes, wanted: str) -> str:
-    """The sheets of a workbook, one after the other, as an instrument's text export has its steps.
+    """The sheets of a workbook, one after the other, in the form of an instrument's text export with several steps.
 
     Args:
-        path: named in errors.
+        path: path of the file, for error messages.
         data: content of the file.
-        wanted: what to export as CSV where the workbook cannot be read, e.g. "the sheet of the sweep".
+        wanted: what to export as CSV if the workbook cannot be read, e.g. "the sheet of the sweep".
 
     Raises:
         InputError: the reader of workbooks is not installed, or the workbook is damaged.
@@ -45,7 +45,7 @@ def text(path: Path, data: bytes, wanted: str) -> str:
 
 
 def refuse_workbook(path: Path, data: bytes, wanted: str) -> None:
-    """`InputError` where the bytes are a workbook and only text will do, saying to export `wanted` as CSV."""
+    """Raise `InputError` if the bytes are a workbook but text is needed; it says to export `wanted` as CSV."""
     if is_one(data):
         raise InputError(f"{path} is a spreadsheet workbook, not text: open it, export {wanted} as CSV, and give that")
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> Content:
-    """fit.json and fit.png in the folder `out`, which exists; the best fit comes first."""
+    """Write fit.json and fit.png into the existing folder `out`; the best fit comes first."""
     content = {
         "error_is": "root mean square of the relative misfit of G' and G''",
         "data": sweep.source,
@@ -45,7 +45,7 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> Content:
 
 
 def table(sweep: StrainSweep, fits: list[StrainFit]) -> str:
-    """The laws, the best first, and the third harmonic of the best at the largest strain."""
+    """Table of the laws, the best first, and the third harmonic of the best at the largest strain."""
     most, third = 100 * sweep.strain[-1], 100 * fits[0].third[-1]
     said = f"{fits[0].law.label}: at a strain of {most:.3g} % the third harmonic is {third:.2g} % of the first"
     return "\n".join([curves_report.table([f.law for f in fits]), said])
@@ -66,7 +66,7 @@ def figure(sweep: StrainSweep, fits: list[StrainFit]) -> "Figure":
         right.plot(percent, 100 * f.third, style, color=COLOURS[k % len(COLOURS)], lw=width, label=f.law.label)
     left.set(xscale="log", yscale="log", xlabel="strain at the rim [%]", ylabel="modulus of the first harmonic [Pa]")
     right.set(xscale="log", yscale="log", xlabel="strain at the rim [%]", ylabel="third harmonic over the first [%]")
-    right.set_ylim(bottom=1e-4)  # what is below is roundoff, or what no instrument sees
+    right.set_ylim(bottom=1e-4)  # smaller values are roundoff, or below any instrument's resolution
     for axes in (left, right):
         axes.legend(fontsize=8, frameon=False)
         axes.grid(alpha=0.3)

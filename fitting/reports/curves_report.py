@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Points of a drawn line.
 FINE = 200
-#: The same shapes for every law and figure: compiled once a law.
+#: The shapes are the same for every law and figure, so it is compiled once per law.
 _stress = jax.jit(partial(homogeneous.nominal_stress, constant=True))
 
 
@@ -56,7 +56,7 @@ def summary(fit: LawFit) -> Content:
 
 
 def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
-    """curves.json and curves.png in the folder `out`, which exists."""
+    """Write curves.json and curves.png into the existing folder `out`."""
     ordered = best_first(fits)
     content = {
         "best": ordered[0].label,
@@ -74,7 +74,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
 
 
 def figure(curves: list[Curve], ordered: list[LawFit]) -> "Figure":
-    """Every curve with the best laws, and below the error of each law beside its number of parameters."""
+    """Every curve with the best laws, and below them the error of each law with its number of parameters."""
     shown = ordered[: len(COLOURS)]
     columns = min(4, len(curves))
     rows = -(-len(curves) // columns)
@@ -133,7 +133,7 @@ def _curve(axis: Any, curve: Curve, dense: Curve, stresses: list[np.ndarray]) ->
 
 
 def table(fits: list[LawFit]) -> str:
-    """One line a law, the best first: error, time, criterion, parameters ± standard error."""
+    """One line per law, the best first: error, time, criterion, parameters ± standard error."""
     lines = [f"{'law':18s} {'error':>7s} {'run':>8s} {'compile':>8s} {'AICc':>8s}  G0 [Pa]    parameters"]
     for f in best_first(fits):
         parameters = ", ".join(

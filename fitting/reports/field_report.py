@@ -90,7 +90,7 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
 
 
 def map_figure(mesh: TetMesh, found: Field) -> "Figure":
-    """Sections through the place of the largest departure: the factor on the scene's number, and its uncertainty."""
+    """Sections through the node farthest from the median: the factor on the scene's number, and its uncertainty."""
     middle = np.asarray(mesh.points)[np.argmax(np.abs(found.log_factor - np.median(found.log_factor)))]
     figure, axes = pyplot().subplots(2, 3, figsize=(11, 5.5), layout="constrained")
     rows = (
@@ -121,7 +121,7 @@ def table_of_numbers(found: Estimate) -> str:
 
 
 def table_of_field(found: Field) -> str:
-    """The fits tried and the one chosen, for the terminal."""
+    """Table of the fits that were tried, and the result, for the terminal."""
     rows = ["prior sd  chi2/component  iterations  evaluations  seconds"]
     for h in found.history:
         rows.append(
@@ -129,7 +129,7 @@ def table_of_field(found: Field) -> str:
             f"{h['seconds']:7.1f}"
         )
     rows.append(
-        f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}; the data know "
+        f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}; the data determine "
         f"{int(np.sum(found.eigenvalues > 1))} directions of the map; {found.seconds:.1f} s"
     )
     return "\n".join(rows)

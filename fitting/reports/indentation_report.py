@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Contact over the radius of a sphere, and depth over the thickness, beyond which small strains are in doubt.
+#: Contact radius / radius of a sphere, and depth / thickness, above which small strains are in doubt.
 _WIDE, _DEEP = 0.4, 0.2
 
 
@@ -72,7 +72,7 @@ def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit
             if width > _WIDE
             else f"the indenter goes {deepest:.3g} m deep, {deepest / rig.thickness:.0%} of the thickness"
         )
-        told.append(f"{far}: the theory is of small strains; fit a part of the curve as well and compare")
+        told.append(f"{far}: the theory is for small strains; fit a part of the curve as well and compare")
     if fit.modulus <= 0:
         told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
     runs, chance = runs_probability(np.sign(fit.residuals))
@@ -82,7 +82,7 @@ def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit
             f"{chance:.1g}); standard errors are too small then"
         )
     if curve.force.min() < -5 * fit.noise:
-        told.append("forces are negative, which adhesion does; it is left out here")
+        told.append("forces are negative: this is adhesion, which the model does not have")
     return told
 
 
@@ -112,5 +112,5 @@ def figure(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> "Figure":
     above.legend()
     below.plot(depth, 1e3 * fit.residuals, ".", color=GREY)
     below.axhline(0.0, color=BLUE, lw=1)
-    below.set(xlabel="depth after contact [mm]", ylabel="left [mN]")
+    below.set(xlabel="depth after contact [mm]", ylabel="residual [mN]")
     return fig

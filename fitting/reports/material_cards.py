@@ -12,16 +12,16 @@ from fitting.methods.generalised_maxwell import Maxwell
 
 #: Poisson's ratio of the elastic law: nearly incompressible.
 POISSON = 0.49
-#: Terms that FEBio's viscoelastic material has, and the largest sum of ratios that Abaqus takes (it must be below 1).
+#: Terms that FEBio's viscoelastic material has, and the largest sum of ratios for Abaqus (it must be below 1).
 FEBIO_TERMS, ABAQUS_SUM = 6, 1 - 1e-6
 
 
 def write(folder: Path, model: Maxwell) -> list[str]:
-    """Write the four files; returns sentences on what a program cannot hold."""
+    """Write the four files; returns sentences on what a program cannot represent."""
     folder.mkdir(parents=True, exist_ok=True)
     told = []
     if len(model.ratios) > FEBIO_TERMS:
-        told.append(f"FEBio holds {FEBIO_TERMS} modes, the model has {len(model.ratios)}: no card for it")
+        told.append(f"FEBio has at most {FEBIO_TERMS} modes, the model has {len(model.ratios)}: no card for it")
         (folder / "febio.feb").unlink(missing_ok=True)
     else:
         (folder / "febio.feb").write_text(febio(model))
@@ -41,7 +41,7 @@ def _written_number(value: float) -> str:
 
 
 def febio(model: Maxwell) -> str:
-    """A viscoelastic material; g0 is the part that stays, so the elastic law is the instantaneous one."""
+    """A viscoelastic material; g0 is the equilibrium part, so the elastic law is the instantaneous law."""
     G0, ratios, times = model
     young = _written_number(2 * (1 + POISSON) * float(G0))
     terms = [f"      <t{k}>{_written_number(t)}</t{k}>" for k, t in enumerate(times, 1)]
@@ -88,7 +88,7 @@ def abaqus(model: Maxwell) -> str:
 
 
 def ansys(model: Maxwell) -> str:
-    """Mechanical APDL: neo-Hookean mu = G0, d = 2 / K; the same Prony pairs for shear and bulk, six numbers a line."""
+    """Mechanical APDL: neo-Hookean mu = G0, d = 2 / K; same Prony pairs for shear and bulk, six numbers per line."""
     G0, ratios, times = model
     pairs = [_written_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
     data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
@@ -100,7 +100,7 @@ def ansys(model: Maxwell) -> str:
 
 
 def sofa(model: Maxwell) -> str:
-    """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment holds it."""
+    """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment contains it."""
     G0, ratios, times = model
     rest = float(G0) * (1 - float(np.sum(ratios)))
     shear = rest if rest > 1e-6 * float(G0) else float(G0)

@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 #: A4 [inch], the part of its height that is text, and the margin.
 WIDTH, HEIGHT, TEXT, MARGIN = 8.27, 11.69, 0.56, 0.06
-#: Characters of a line, and the size [pt] at which so many fit; a longer text is smaller.
+#: Characters per line, and the font size [pt] at which they fit; a longer text gets a smaller font.
 CHARACTERS, SIZE = 104, 8.0
 
 
 def write(file: Path, sweep: Sweep, fits: list[Fit], content: Content) -> None:
-    """Write the page as PDF (or what else the name of the file says).
+    """Write the page as PDF, or in another format that the name of the file states.
 
     Args:
         sweep, fits: as in `sweep_report.write`.
-        content: of fit.json.
+        content: content of fit.json.
     """
     save(page(sweep, fits, content), file)
 

@@ -36,7 +36,7 @@ def summary(p: Posterior) -> Content:
 
 
 def write_draws(path: Path, p: Posterior) -> None:
-    """A row for each draw: the number of its chain, then the numbers in SI units, named as in fit.json."""
+    """Write a row for each draw: the number of its chain, then the numbers in SI units, named as in fit.json."""
     rows = np.column_stack([np.repeat(np.arange(len(p.draws)), p.draws.shape[1]), p.draws.reshape(-1, len(p.names))])
     header = ",".join(["chain", *p.names])
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt=["%d"] + ["%.9g"] * len(p.names))

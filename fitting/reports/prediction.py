@@ -16,20 +16,20 @@ from fitting.readers.time_tests import TimeTest
 
 
 class Prediction(NamedTuple):
-    """A test beside its prediction; numbers as `fitting.fits.together.Together.fitted` has them."""
+    """A test and its prediction; numbers in the order of `fitting.fits.together.Together.fitted`."""
 
     name: str  # sweep, dispersion, relaxation or creep
     source: str
     predicted: np.ndarray  # (m,)
     measured: np.ndarray  # (m,)
-    standard_errors: np.ndarray  # (m,) of the prediction, infinite where the fit leaves it free
-    scales: np.ndarray  # (m,) weights: deviations where the test has them
-    sizes: np.ndarray  # (m,) what errors are relative to
-    inside: np.ndarray  # (m,) whether the test is there in the band that the fit has seen
+    standard_errors: np.ndarray  # (m,) of the prediction, infinite if the fit does not determine it
+    scales: np.ndarray  # (m,) weights: deviations if the test has them
+    sizes: np.ndarray  # (m,) divisors of relative errors
+    inside: np.ndarray  # (m,) whether the point is in the band of the fitted sweep
 
     @property
     def relative_errors(self) -> np.ndarray:
-        """|predicted - measured| over the sizes (m,)."""
+        """|predicted - measured| divided by the sizes (m,)."""
         return np.abs(self.predicted - self.measured) / self.sizes
 
     @property
@@ -54,9 +54,9 @@ def predict(fit: Fit, resolved: tuple[float, float], test: Measured) -> Predicti
     """The prediction of a test.
 
     Args:
-        fit: of a sweep; its model is that of its Prony modes.
-        resolved: shortest and longest relaxation time [s] that the sweep has seen.
-        test: that was not fitted.
+        fit: fit of a sweep; its Prony modes are the model.
+        resolved: shortest and longest relaxation time [s] that the sweep resolves.
+        test: a test that was not fitted.
     """
     at, measured, scales = reported_numbers(test)
     vector, n = np.asarray(fit.uncertainty.values, float), fit.modes
@@ -89,7 +89,7 @@ def sentence(found: Prediction) -> str:
     off = 100 * found.relative_errors[found.inside].mean()
     told = (
         f"{name}: predicted within {off:.2g} % on average; {100 * found.covered:.0f} % of {inside} numbers within the "
-        f"95 % of the prediction"
+        f"95 % interval of the prediction"
     )
     if abs(found.factor - 1) > 0.005 * off:  # half of the error is one factor
         told += f"; {found.factor:.3g} times the prediction would fit it best"

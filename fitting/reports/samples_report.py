@@ -28,7 +28,7 @@ def write(out: Path, found: Samples) -> Content:
 
 
 def _json_content(found: Samples) -> Content:
-    """The sample in the middle of the population comes first; the population and all samples follow."""
+    """The content of fit.json: a typical sample comes first; the population and all samples follow."""
     typical, errors = found.typical, np.concatenate([f.relative_errors(s) for f, s in _pairs(found)])
     own = (
         {}
@@ -69,7 +69,7 @@ def _times_of_strengths(found: Samples) -> Content:
 
 
 def _labels(found: Samples) -> dict[str, str]:
-    """Names of the numbers for a reader: a strength is told by its time."""
+    """Names of the numbers for a reader: a strength is named by its time."""
     times = _times_of_strengths(found)["relaxation_times"] if found.kind.effective is not None else {}
     return {n: f"strength at {times[n]:.3g} s" if n in times else n for n in found.populations}
 
@@ -94,7 +94,7 @@ def _population(p: Any) -> Content | None:
 
 
 def _sample_entry(found: Samples, k: int) -> Content:
-    """The fit of one sample by itself, and its numbers drawn towards the population."""
+    """The fit of one sample by itself, and its numbers moved towards the population."""
     fit, sweep = found.fits[k], found.sweeps[k]
     pooled = {
         name: {"value": p.pooled[k], "standard_deviation_of_logarithm": p.pooled_errors[k]}
@@ -110,7 +110,7 @@ def warnings(found: Samples) -> list[str]:
     for name, p in found.populations.items():
         own = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
         if name.startswith("strengths["):
-            continue  # where the data are silent, or it is zero: many
+            continue  # no warning: many strengths are zero or not determined
         if p is None and "exponent" in name and np.all(np.abs(own - np.round(own[0])) < 1e-3):
             out.append(f"{name}: it is {np.round(own[0]):g} in all samples, the springpot is a pure spring or dashpot")
         elif p is None:
@@ -121,7 +121,7 @@ def warnings(found: Samples) -> list[str]:
     if failed:
         out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
     for words, told in (
-        ("mark of the instrument", "the last points are the instrument's"),
+        ("mark of the instrument", "the last points show the instrument"),
         ("Kramers-Kronig", "the data do not agree with themselves"),
         ("structured misfit", "the misfit has structure"),
         ("half decade", "the ends of the band decide some numbers"),
@@ -153,7 +153,7 @@ def table(found: Samples) -> str:
         middle, new = ends
         rows.append(f"{label:22s} {p.mean:10.4g} {100 * p.spread:5.0f} %   {middle:22s}   {new} {unit}".rstrip())
     every = [found.values(k) for k in range(len(found.fits))]
-    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # the first that most have
+    name = max(found.populations, key=lambda n: sum(own[n][0] > 0 for own in every))  # the first number that most have
     rows.append(f"{'sample':32s} {'mean error':>10s}   {labels[name]}")
     for (fit, sweep), own in zip(_pairs(found), every, strict=True):
         value, error = own[name]

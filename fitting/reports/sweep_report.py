@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Part of a standard error up to which closed form and simulation say the same.
+#: Part of a standard error up to which closed form and simulation count as equal.
 AGREED = 0.1
 STEMS = ("ratios", "relaxation_times")
 MARK = "* moves by more than its error without the first or the last half decade"
@@ -85,7 +85,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
 
 
 def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
-    """Moduli of a fit in closed form with their standard errors, the choice of the model among them."""
+    """Moduli of a fit in closed form with their standard errors, which contain the choice of the model."""
     found = moduli_errors.fitted_moduli(fit, sweep.angular_frequency, sweep.noise_given)
     storage, loss = np.split(found.values, 2)
     errors = np.split(found.standard_errors, 2)
@@ -100,7 +100,7 @@ def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
 
 
 def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | None:
-    """Bias by the names of `standard_errors`; null where it is not known."""
+    """Bias by the names of `standard_errors`; None if it is not known."""
     if moved is None:
         return None
     G0, ratios = u.values[0], u.values[1 : n + 1]
@@ -114,7 +114,7 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
 
 
 def band_sensitivity(fit: Fit) -> Content:
-    """Changes by the names of `standard_errors`; null where too few points were left."""
+    """Changes by the names of `standard_errors`; None if too few points were left."""
     changes = fit.details.get("band_sensitivity", {})
     return {part: None if found is None else by_stem(found) for part, found in changes.items()}
 
@@ -147,14 +147,14 @@ def spectrum_rows(details: Content) -> list[str]:
     times = found["relaxation_times"]
     return [
         f"{len(times)} strengths from {times[-1]:.2g} to {times[0]:.2g} s,",
-        f"on a grid of {found['times_per_decade']} times a decade;",
-        f"the data carry {found['decades_carried']:.2g} decades of them,",
-        f"{found['effective_parameters']:.2g} parameters in effect",
+        f"on a grid of {found['times_per_decade']} times per decade;",
+        f"the data determine {found['decades_carried']:.2g} decades of them,",
+        f"{found['effective_parameters']:.2g} effective parameters",
     ]
 
 
 def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = ()) -> list[str]:
-    """Lines with a model's parameters, and how near its Prony modes come; parameters in `marked` have a star."""
+    """Lines with a model's parameters, and the error of its Prony modes; parameters in `marked` have a star."""
     rows = []
     for name, value, error, unit in zip(p.names, p.values, p.standard_errors, kind.units, strict=True):
         if not name.startswith("strengths["):
@@ -169,7 +169,7 @@ def own_rows(p: Estimate, kind: Kind, details: Content, marked: Iterable[str] = 
 def write(
     out: Path, sweep: Sweep, fits: list[Fit], profile: Content | None, posterior: Posterior | None = None
 ) -> Content:
-    """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others stand beside it); returns the JSON.
+    """Write fit.json, fit.png and fit.h5 of the last of `fits` (the others are added); returns the JSON.
 
     If there is a posterior, its summary is in the JSON and its draws are in posterior.csv.
     """
@@ -183,7 +183,7 @@ def write(
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
         content["largest_shift_over_standard_error"] = largest_shift(*fits)
-    if profile is not None:  # of the closed form, whichever method leads
+    if profile is not None:  # it belongs to the closed form in all cases
         content.get("closed_form", content)["profile_intervals_95"] = profile
     if posterior is not None:
         content["posterior"] = posterior_report.summary(posterior)
@@ -291,7 +291,7 @@ def draw_moduli(top: Any, rest: Any, sweep: Sweep, fits: list[Fit]) -> None:
 
 
 def _bands(closed: Fit, sweep: Sweep) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Ends of the 95 % intervals of G' and G'' at the data; none of a compressed sample, which shows other moduli."""
+    """Ends of the 95 % intervals of G' and G'' at the data; empty for a compressed sample."""
     if "precompression" in closed.details:
         return {}
     found = moduli_errors.fitted_moduli(closed, sweep.angular_frequency, sweep.noise_given)
@@ -324,7 +324,7 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
     """Strength against time constant with 95 % intervals, and the band that the frequencies resolve.
 
     Args:
-        columns: of the legend.
+        columns: number of columns of the legend.
     """
     low, high = 1 / sweep.angular_frequency[-1], 1 / sweep.angular_frequency[0]
     axes.axvspan(low, high, color=GREY, alpha=0.12, label="resolved by the data")
@@ -348,7 +348,7 @@ def draw_time_constants(axes: Any, sweep: Sweep, fits: list[Fit], columns: int =
 
 
 def _parameter_rows(fit: Fit) -> list[str]:
-    """The moduli and one line a mode, or the numbers of another model."""
+    """The moduli and one line per mode, or the numbers of another model."""
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
@@ -420,7 +420,7 @@ def table(sweep: Sweep, fits: list[Fit]) -> str:
     )
 
 
-#: What a reader calls the sources of errors.
+#: Names of the sources of errors for a reader.
 SOURCES = {
     "noise": "noise",
     "geometry": "gap and radius",
@@ -431,14 +431,14 @@ SOURCES = {
 
 
 def _totals(fit: Fit) -> list[str]:
-    """The whole error of the moduli, and its shares."""
+    """The total error of the moduli, and its shares."""
     whole, parts, known = total_error.total_errors(fit), total_error.error_shares(fit), edges.values(fit)
     symbols = {"shear_modulus": "G0", "equilibrium_modulus": "G_inf"}
     out = []
     for name in (n for n in symbols if n in known and known[n][0] > 0 and np.isfinite(whole[n])):
         value = known[name][0]
         each = [f"{word} {100 * parts[s][name] / value:.2g} %" for s, word in SOURCES.items() if s in parts]
-        out.append(f"{symbols[name]} with all that is known: ± {whole[name]:.2g} Pa ({', '.join(each)})")
+        out.append(f"{symbols[name]} with all known errors: ± {whole[name]:.2g} Pa ({', '.join(each)})")
     return out
 
 
@@ -452,7 +452,7 @@ def _compression(fits: list[Fit]) -> list[str]:
     )
     one = found[0]
     return [
-        f"numbers are of the sample before it was compressed by {100 * one['strain']:.3g} % from "
+        f"numbers describe the sample before it was compressed by {100 * one['strain']:.3g} % from "
         f"{one['height_at_rest_m']:.4g} m (law {one['law']}, K / G {one['bulk_over_shear_modulus']:.3g})",
         f"axial force after relaxation, to be compared with the instrument's: {forces}",
     ]
@@ -467,5 +467,5 @@ def _agreement(fits: list[Fit]) -> list[str]:
         return [f"the simulation moves a number by {shift:.2g} standard errors, in {seconds:.2g} s"]
     return [
         f"closed form and simulation agree within {100 * max(shift, 1e-3):.1g} % of the standard errors: the "
-        f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form says the same"
+        f"simulation ({seconds:.2g} s) adds nothing here, and --method closed-form gives the same"
     ]

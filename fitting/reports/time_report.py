@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None = None) -> Content:
-    """Write both files, and the draws of a posterior. Return the JSON; its names are those of a sweep."""
+    """Write both files, and the draws of a posterior. Return the JSON; its names are the same as for a sweep."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = fit.uncertainty, fit.modes
     e, errors = u.standard_errors, fit.relative_errors

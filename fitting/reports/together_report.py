@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Curves of a test over frequency, and what its panel shows.
+#: Names of the curves of a test over frequency, and the axis label of each panel.
 CURVES = {"sweep": ("G'", "G''"), "dispersion": ("phase velocity [m/s]", "attenuation [1/m]")}
 QUANTITIES = {
     "sweep": "modulus [Pa]",
@@ -33,7 +33,7 @@ QUANTITIES = {
 
 
 def write(out: Path, found: Together) -> Content:
-    """Write both files. Return the JSON; its names are those of a sweep, and `tests` is added."""
+    """Write both files. Return the JSON; its names are the same as for a sweep, and `tests` is added."""
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
     errors = np.array([s.mean_relative_error for s in found.shares])
@@ -70,7 +70,7 @@ def write(out: Path, found: Together) -> Content:
 
 
 def _waves(found: Together) -> Content:
-    """Shear waves over the band of all tests, at four frequencies a decade."""
+    """Shear waves over the band of all tests, at four frequencies per decade."""
     high, low = 1 / min(t.resolved[0] for t in found.tests), 1 / max(t.resolved[1] for t in found.tests)
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
     density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
@@ -104,7 +104,7 @@ def _share_of_test(share: Share, found: Together) -> Content:
 
 
 def _measured(found: Together, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Abscissae [Hz or s] and measured numbers of test k, as `Together.fitted`."""
+    """Abscissae [Hz or s] and measured numbers of test k, in the order of `Together.fitted`."""
     test = found.tests[k]
     if isinstance(test, Sweep):
         return test.angular_frequency / (2 * np.pi), np.concatenate([test.storage, test.loss])
@@ -120,7 +120,7 @@ def _largest(found: Together) -> list[float]:
 
 
 def table(found: Together) -> str:
-    """Parameters ± standard error, and beside them the errors that would be left without each of the tests."""
+    """Parameters ± standard error, and the errors that remain without each of the tests."""
     u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
@@ -139,7 +139,7 @@ def table(found: Together) -> str:
     if found.kind.name == "prony":
         rows.append(f"G_inf {_equilibrium(found):11.5g} ± {_error(equilibrium_error(u))} Pa")
     if found.kind.effective is not None:
-        rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that stand for it")
+        rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that represent it")
     rows += spectrum_rows(found.details or {})
     for k, s in enumerate(found.shares, 1):
         rows.append(f"{k}: misfit {100 * s.misfit:.2g} %, by itself {100 * s.misfit_alone:.2g} %")
@@ -155,7 +155,7 @@ def _error(value: float) -> str:
 
 
 def figure(found: Together) -> "Figure":
-    """One panel a test, measured and fitted."""
+    """One panel per test, measured and fitted."""
     count = len(found.tests)
     fig = pyplot().figure(figsize=(max(6.0, 3.6 * count), 4.4), layout="constrained")
     axes = np.atleast_1d(fig.subplots(1, count))

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: chi^2 over the number of equations beyond which something is missing.
+#: chi^2 per equation above which there is a warning that the model misses something.
 TOO_FAR = 1.5
-#: Frequencies that make a sweep.
+#: Fewest frequencies of a sweep.
 FEWEST = 3
-#: Standard deviations beyond which a voxel of the map is told from the organ's mean.
+#: A node of the map counts as different from the organ's mean beyond this many standard deviations.
 TOLD = 3.0
 
 
@@ -35,7 +35,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 
     Args:
         out: folder.
-        organ, found, drawn: what was fitted; no map: None.
+        organ, found, drawn: the organ, its fitted regions, and its map (None: no map).
         usual: direct inversion (F, nx, ny, nz) [Pa].
     """
     content = {
@@ -65,8 +65,9 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
 
 
 def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[Content]:
-    """One dictionary a region, lists over the frequencies. Errors contain noise, what the place of the edges leaves
-    open, and the error of the elements."""
+    """One dictionary per region, with lists over the frequencies. Errors contain noise, the uncertainty of the edges'
+    places, and the error of the elements.
+    """
     omega, rows = organ.waves.omega, []
     for r in range(found.modulus.shape[1]):
         G, e = found.modulus[:, r], found.standard_errors[:, r]
@@ -96,7 +97,7 @@ def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[Content]
 
 
 def _springpots(sweeps: dict[str, Path]) -> Content | None:
-    """The springpot model that `models.best_of_models` chooses of each sweep, with its numbers; None without sweeps."""
+    """The springpot model that `models.best_of_models` chooses per sweep, with its numbers; None without sweeps."""
     if not sweeps:
         return None
     from fitting.fits.families import models
@@ -118,7 +119,7 @@ def _springpots(sweeps: dict[str, Path]) -> Content | None:
 
 
 def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
-    """A frequency sweep of the whole and of every region, for ``python -m fitting``, where frequencies are enough."""
+    """A frequency sweep of the whole and of every region, for ``python -m fitting``, if frequencies are enough."""
     if len(organ.field.frequencies) < FEWEST:
         return {}
     files = {}
@@ -147,7 +148,7 @@ def _by_label(organ: Organ, found: Found) -> Content | None:
 
 
 def _direct(organ: Organ, found: Found, usual: np.ndarray) -> Content:
-    """Medians of the direct inversion over the whole and over the regions; null where no voxel has one."""
+    """Medians of the direct inversion over the whole and over the regions; None if no voxel has a value."""
     labels = organ.field.labels
     places = {"whole": organ.field.mask}
     if found.labels is not None and labels is not None:
@@ -183,13 +184,13 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
         ratio = each.chi2[f] / each.components
         if ratio > TOO_FAR:
             told.append(
-                f"{hertz:g} Hz: chi2 is {ratio:.3g} an equation with uniform {'regions' if found.parts else 'moduli'}: "
+                f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {'regions' if found.parts else 'moduli'}: "
                 "the organ is less uniform, or the noise larger; the standard errors are enlarged by its root"
             )
         bias, error = np.abs(found.mesh_bias[f]), each.standard_errors[f].real / np.abs(each.modulus[f])
         if bias > error.min():
             told.append(
-                f"{hertz:g} Hz: the voxels themselves move the moduli by {100 * bias:.2g} % "
+                f"{hertz:g} Hz: the size of the voxels changes the moduli by {100 * bias:.2g} % "
                 f"(standard error {100 * error.min():.2g} %): subtract mesh_bias, or measure smaller voxels"
             )
     if found.parts is not None and found.labels is not None:
@@ -200,19 +201,19 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
         if far.any():
             names = ", ".join(str(label) for label, beyond in zip(found.labels, far, strict=True) if beyond)
             told.append(
-                f"regions {names}: the waves want their edges more than a voxel away from those of the labels "
+                f"regions {names}: the waves place their edges more than a voxel away from the edges of the labels "
                 "(edges_farther_out_voxels): look at the labels"
             )
     if drawn is not None and not drawn.reached and drawn.chi2 > TOO_FAR * drawn.components:
         told.append(
-            f"chi2 of the map stays at {drawn.chi2 / drawn.components:.3g} an equation: edges sharper than the map, or "
-            "a body that moves otherwise than a viscous solid"
+            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, or "
+            "a body that does not move like a viscous solid"
         )
     return told
 
 
 def _short(chi2: float) -> str:
-    """With two decimals; in scientific form from 1e4 on."""
+    """chi^2 as text with two decimals; in scientific form from 1e4 on."""
     return f"{chi2:.2f}" if chi2 < 1e4 else f"{chi2:.1e}"
 
 
@@ -221,7 +222,7 @@ def _error_cell(x: float | None) -> str:
 
 
 def table(content: Content) -> str:
-    """Moduli of the whole and of the regions at every frequency, with the direct inversion beside them."""
+    """Moduli of the whole and of the regions at every frequency, and the direct inversion for comparison."""
     rows = [f"{'':12s}{'Hz':>8s}{'G_storage [Pa]':>22s}{'G_loss [Pa]':>22s}{'c [m/s]':>9s}{'chi2':>9s}   direct [Pa]"]
     for name, own in {"whole": content["whole"], **(content["regions"] or {})}.items():
         direct = content["direct_inversion"][name]
@@ -244,15 +245,15 @@ def table(content: Content) -> str:
     if content["map"]:
         m = content["map"]
         rows.append(
-            f"map: chi2 {m['chi2_per_component']:.3g} an equation, "
+            f"map: chi2 {m['chi2_per_component']:.3g} per equation, "
             f"{100 * m['part_of_variance_left']:.2g} % of the prior's variance left, "
-            f"{100 * m['told_from_the_mean']:.2g} % of the nodes told from the mean, {m['run_time_s']:.3g} s"
+            f"{100 * m['told_from_the_mean']:.2g} % of the nodes differ from the mean, {m['run_time_s']:.3g} s"
         )
     return "\n".join(rows)
 
 
 def at_voxels(organ: Organ, corners: np.ndarray) -> np.ndarray:
-    """Values at the voxels (nx, ny, nz), NaN outside, from those of the corners (P,)."""
+    """Values at the voxels (nx, ny, nz), NaN outside, from values at the corners (P,)."""
     nothing = complex(np.nan, np.nan) if np.iscomplexobj(corners) else np.nan
     out = np.full(organ.field.mask.shape, nothing, corners.dtype)
     out[tuple(organ.body.voxel.T)] = voxels.on_all_nodes(organ.body, corners)

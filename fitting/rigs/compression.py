@@ -1,16 +1,16 @@
 """A sample that the plates compress before they turn it (`--precompression`).
 
-The sample has the plates' radius at rest and is not trimmed. It is held until its stress has relaxed. Moduli are those
-that the instrument shows: by the plates' radius and by the gap at which the test is made.
+The sample has the plates' radius at rest and is not trimmed. It is held until its stress has relaxed. Moduli here are
+those that the instrument shows: it computes them with the plates' radius and with the gap of the test.
 
-Where the plates let the sample slide sideways it stays a cylinder, of stretches a along the radius and l along the axis
-and of the axial stress s. An isotropic law gives a shear between both directions the modulus l^2 s / (l^2 - a^2). The
-standing stress contributes s to it (Ericksen's relation; Rivlin 1949 for the incompressible cylinder). The torque has
-the radius to the fourth power, and so the instrument shows
+If the plates let the sample slide sideways, it stays a cylinder, with the stretches a along the radius and l along the
+axis, and with the axial stress s. With an isotropic law, a shear between both directions has the modulus l^2 s / (l^2 -
+a^2). The stress of the compression contributes s to it (Ericksen's relation; Rivlin 1949 for the incompressible
+cylinder). The torque grows with the fourth power of the radius, and so the instrument shows
 
     G*(omega) = a^4 s [a^2 / (l^2 - a^2) (1 - sum_k g_k / (1 + i omega tau_k)) + (1 - sum_k g_k)]
 
-with s of the law before it relaxes. So the relaxing part and the equilibrium modulus have different factors.
+where s is the axial stress before it relaxes. So the relaxing part and the equilibrium modulus have different factors.
 """
 
 from typing import NamedTuple
@@ -27,19 +27,19 @@ from liverjax.laws import Law
 
 #: Largest part of the height that a sample may be compressed by.
 LARGEST = 0.5
-#: Strain of one load step.
+#: Largest strain of one load step.
 _STEP = 0.05
 
 
 class Shares(NamedTuple):
-    """Apparent moduli of a compressed cylinder that may slide sideways, over its moduli at rest [1]."""
+    """Apparent moduli of a compressed cylinder that may slide sideways, divided by its moduli at rest [1]."""
 
-    relaxing: float  # of what relaxes
+    relaxing: float  # of the relaxing moduli
     equilibrium: float  # of the equilibrium modulus
 
 
 def check_strain(strain: float) -> None:
-    """`InputError` for a strain that no sample has."""
+    """Raise `InputError` for a strain that is impossible for a sample."""
     if not 0 <= strain <= LARGEST:
         meant = f"{strain / 100:g}" if LARGEST < strain <= 100 * LARGEST else "0.05"
         raise InputError(
@@ -49,7 +49,7 @@ def check_strain(strain: float) -> None:
 
 
 def shares(law: Law, strain: float) -> Shares:
-    """Shares of a law compressed by `strain`, its plates smooth (module's formula).
+    """Shares for a law compressed by `strain` between smooth plates (formula of the module).
 
     Raises:
         InputError: a law that is not isotropic, or that pulls when it is compressed.
@@ -94,7 +94,7 @@ def _refuse_directions(law: Law) -> None:
     principal = [np.roll(np.diagonal(P), -k) for k, P in enumerate(turned)]
     if not np.allclose(principal, principal[0], rtol=1e-8):
         raise InputError(
-            f"--precompression needs a law without a direction, and {type(law).__name__} has one: choose another --law"
+            f"--precompression needs an isotropic law, and {type(law).__name__} is not isotropic: choose another --law"
         )
 
 
@@ -102,8 +102,8 @@ def compressed(rig: Rig, law: Law, strain: float, smooth: bool = False) -> Rig:
     """The rig with its sample compressed by `strain` and held, before it turns.
 
     Args:
-        rig: of the sample at rest; its height becomes that of the gap.
-        law: of the sample.
+        rig: rig of the sample at rest; the height of the result is that of the gap.
+        law: law of the sample.
         strain: part of the height at rest.
         smooth: let the sample slide sideways on the plates while it is compressed, so that it stays a cylinder; else
             it is glued and bulges.

@@ -1,13 +1,13 @@
 """A test in time through a rig, described by a small TOML file: force and displacement of a sample that is not sheared.
 
-The force that an elastic sample of unit shear modulus takes at a displacement d is f(d): of glued samples by finite
-elements, corrected by their estimated error, of indenters by the exact solution of a bonded layer. The viscous sample's
-force is that of linear viscoelasticity with f(d) in the place of the strain,
+f(d) is the force on an elastic sample of unit shear modulus at a displacement d. For glued samples it is computed by
+finite elements and corrected by their estimated error; for indenters it is the exact solution of a bonded layer. The
+force on the viscoelastic sample follows from linear viscoelasticity with f(d) in the place of the strain,
 
     F(t) = integral of G(t - s) d f(d(s)),
 
-exact while strains are small and bulk relaxes as shear does or is far stiffer; for an indenter, while its contact grows
-(Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain it is Fung's quasi-linear form.
+This is exact if strains are small and bulk relaxes as shear does or is far stiffer; for an indenter, also only while
+its contact grows (Lee and Radok 1960, J. Appl. Mech. 27:438). At large strain it is Fung's quasi-linear form.
 """
 
 import tomllib
@@ -34,15 +34,15 @@ TESTS: dict[str, tuple[str, ...]] = {
     "punch": ("radius", "thickness"),
 }
 _OTHER = ("test", "data", "drive", "poisson", "min_time", "ramp")
-#: What is driven -> kind of the test.
+#: Driven quantity -> kind of the test.
 _KINDS = {"displacement": "relaxation", "force": "creep"}
-#: Poisson's ratio without a word of it: glued samples have K/mu = 1000, layers keep their volume.
+#: Default Poisson's ratios: glued samples have K/mu = 1000, layers keep their volume.
 _GLUED, _LAYER = 0.4995, 0.5
-#: Displacements, over the largest one, at which glued samples are computed.
+#: Displacements, divided by the largest one, at which glued samples are computed.
 _GRID = (0.05, 0.5, 1.0)
-#: Rows that an indenter's test is filled up to.
+#: Most rows of an indenter's test, with the rows that are added between the measured ones.
 _MOST_ROWS = 2000
-#: Departure from a straight line that is worth a note.
+#: Deviation from a straight line above which there is a note.
 _CURVED = 0.02
 
 
@@ -55,16 +55,16 @@ class Described(NamedTuple):
     poisson: float
     drive: str  # displacement or force
     min_time: float
-    at_once: bool  # ramp = 0: the load of the first row was there from 0 s on
+    at_once: bool  # ramp = 0: the load of the first row acted from 0 s on
 
 
 def read_described(path: str | Path) -> TimeTest:
-    """The described test as a test of shear: strain f(d)/S and stress F/S. S is chosen so that small strains are d over
-    a length of the sample.
+    """The described test as a test of shear: strain f(d)/S and stress F/S. S is chosen so that small strains are d
+    divided by a length of the sample.
 
     Args:
         path: TOML with test, data (a table of time, displacement and force), the sizes that the test needs in metres,
-            and if wanted drive, poisson, min_time, ramp = 0.
+            and optionally drive, poisson, min_time, ramp = 0.
 
     Raises:
         InputError: one sentence naming file, key, value and remedy.
@@ -80,7 +80,7 @@ def read_described(path: str | Path) -> TimeTest:
             )
     d, force = columns["displacement"], columns["force"]
     if described.test == "compression":
-        notes.append("displacement and force are taken as positive where the sample is pressed")
+        notes.append("displacement and force count as positive in compression")
     sign = np.sign(d[np.argmax(np.abs(d))]) or 1.0
     largest = float(np.max(sign * d))
     if not largest > 0:
@@ -94,7 +94,7 @@ def read_described(path: str | Path) -> TimeTest:
     d, force = (first, then) if described.drive == "displacement" else (then, first)
     if described.test in ("sphere", "cone") and described.drive == "displacement":
         time, d, force = _with_more_between(time, d, force)
-    moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # nothing holds an indenter back
+    moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # no force without contact
     strain, stress = curve_of(curve, moved) / section, sign * force / section
     kind = _KINDS[described.drive]
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
@@ -113,7 +113,7 @@ def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tu
 
 
 def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
-    """f at displacements (n,) [m]; straight on below 0."""
+    """f at displacements (n,) [m], continued as a straight line below 0."""
     grid = np.linspace(0.0, max(float(d.max()), 0.0), 400)
     values = np.array([0.0, *(curve(each) for each in grid[1:])])
     below = curve(grid[1]) / grid[1] * np.minimum(d, 0.0)
@@ -126,7 +126,7 @@ def _description(path: Path) -> Described:
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); give a description of a test") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML ({error}); mend that line") from None
+        raise InputError(f"{path} is no TOML ({error}); correct that line") from None
     test = table.get("test")
     if test not in TESTS:
         raise InputError(f"{path}: test = {test!r} is not known: {hint(str(test), TESTS)}")
@@ -140,7 +140,7 @@ def _description(path: Path) -> Described:
     sizes = {key: _number_of(path, key, table[key]) for key in needed}
     bad = next((key for key, value in sizes.items() if not 0 < value < (90 if key == "half_angle" else 1)), None)
     if bad:
-        raise InputError(f"{path}: {bad} = {sizes[bad]:g} cannot be that of a sample: give metres (degrees of a cone)")
+        raise InputError(f"{path}: {bad} = {sizes[bad]:g} cannot be that of a sample: give metres (degrees for a cone)")
     own = _LAYER if "thickness" in needed else _GLUED
     poisson = _number_of(path, "poisson", table.get("poisson", own))
     if not 0 <= poisson <= own:
@@ -164,7 +164,7 @@ def _number_of(path: Path, key: str, value: Any) -> float:
 
 
 def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[[float], float], float, list[str]]:
-    """f(d) [m^2] per unit shear modulus, the length that makes d a strain, and notes."""
+    """f(d) [m^2] per unit shear modulus, the length that divides d to give a strain, and notes."""
     sizes = described.sizes
     if "thickness" not in sizes:
         return _glued_curve(described, largest, path)
@@ -187,7 +187,7 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     radius, height = sizes["radius"], sizes["height"]
     if largest >= 0.5 * height:
         raise InputError(
-            f"{path}: the displacement reaches {largest:g} m, more than half of the height {height:g} m: mend height "
+            f"{path}: the displacement reaches {largest:g} m, more than half of the height {height:g} m: change height "
             "or the displacement's unit"
         )
     at = largest * np.array(_GRID)
@@ -202,18 +202,18 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
         force, codes = glued.read(rig, law, None)
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
     if np.any(np.asarray(codes) != 0):
-        raise InputError(f"{path}: an elastic sample does not reach {largest:g} m: mend the sizes")
+        raise InputError(f"{path}: an elastic sample does not reach {largest:g} m: correct the sizes")
     found = np.asarray(force) / 1e3
     left_out = np.where(np.isfinite(left_out), left_out, 0.0)
     secant = np.abs(found + left_out) / at
     notes = [f"{w.message}" for w in said if issubclass(w.category, UserWarning)]
     notes.append(
         f"the sample's stiffness per shear modulus is {secant[0]:.4g} m, of which {100 * left_out[0] / found[0]:.2g} % "
-        "correct the error of the mesh"
+        "are a correction of the mesh's error"
     )
     if abs(secant[-1] / secant[0] - 1) > _CURVED:
         notes.append(
-            f"at the largest displacement an elastic sample takes {100 * (secant[-1] / secant[0] - 1):+.0f} % of a "
-            "straight line's force; the fit lets it relax as shear does (quasi-linear)"
+            f"at the largest displacement the elastic force is {100 * (secant[-1] / secant[0] - 1):+.0f} % off a "
+            "straight line; the fit lets it relax as shear does (quasi-linear)"
         )
     return (lambda d: d * float(np.interp(d, at, secant))), height, notes

@@ -1,7 +1,7 @@
 """Tension, indentation and creep of a cylinder as differentiable experiments.
 
-Each is a scene whose law and viscosity are filled in, and a reading of its run. The sample is glued to its plates: that
-is part of the simulation, so no factor of shape has to correct for it.
+Each experiment is a scene, into which law and viscosity are filled, and a reading from its run. The sample is glued to
+its plates: that is part of the simulation, so no factor of shape has to correct for it.
 
 By default the mesh is a narrow sector of the cylinder between two planes of symmetry, fine at the rims of the plates
 and at the punch's edge, where stresses are infinite. Its error is in experiments/TABLES.md.
@@ -26,33 +26,33 @@ from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.physics.viscosity import Prony
 from liverjax.simulation import automatic
 
-#: A punch narrower than this part of the sample, or a gap beside it, is below what the mesh is made for.
+#: Smallest width of the punch, and of the ring around it, over the sample's radius, for which the mesh is made.
 NARROWEST = 0.01
-#: Where a default mesh is known to be within 1 %: height over radius, and largest K/mu by the form for volume changes.
+#: A default mesh is known to be within 1 % for these height / radius, and up to these K/mu by form for volume changes.
 #: Mixed needs a law with bulk apart from shear, and a viscosity of `part = "isochoric"` or none.
 SHAPES, STIFFEST = (0.2, 5.0), {"mixed": 1e4, "element": 20.0}
 
 
 class Cells(NamedTuple):
-    """The mesh of a rig; the default is within 1 % of the converged answer (experiments/TABLES.md)."""
+    """The mesh of a rig; the default is within 1 % of the converged result (experiments/TABLES.md)."""
 
-    size: float | None = None  # [m] one for all cells, of the whole cylinder; None: a graded sector
-    rim: float = 0.04  # cells of a sector at the rim of a plate, over the shortest length there
+    size: float | None = None  # [m] of all cells, in a whole cylinder; None: a graded sector
+    rim: float = 0.04  # cells of a sector at the rim of a plate / shortest length there
     edge: float = 0.02  # the same at a punch's edge
-    largest: float = 0.34  # longest cells of a sector over the radius; along the axis twice as long
+    largest: float = 0.34  # longest cells of a sector / radius; along the axis twice as long
     growth: float = cylinders.GROWTH  # of cells away from rims and edge
-    corners: int = 24  # of the polygon that stands for the circle, of which a sector has one edge
+    corners: int = 24  # of the polygon in place of the circle; a sector has one of its edges
     order: int = 2  # of the elements
     volumetric: str = "auto"  # how volume changes are treated, as in `lj.Solve`
 
 
 @struct
 class Rig:
-    """A scene without its law, and the reading of it along z."""
+    """A scene without its law, and what is read from it along z."""
 
-    scene: lj.Scene = param("1", "with a law that `read` replaces")
-    nodes: Indices = param("1", "node numbers (n,) that are read")
-    weights: Array = param("1", "of each of these nodes (n,) in the reading")
+    scene: lj.Scene = param("1", "scene whose law `read` replaces")
+    nodes: Indices = param("1", "numbers (n,) of the nodes that are read")
+    weights: Array = param("1", "weights (n,) of these nodes in the reading")
     reading: str = static(default="force", about="force [N], or mean displacement [m], of the whole cylinder's nodes")
     whole: bool = static(default=False, about="the scene is the whole cylinder, not a sector of it")
 
@@ -63,8 +63,8 @@ class _Sample(NamedTuple):
     mesh: lj.TetMesh
     fixed: tuple
     physics: tuple
-    parts: float  # how many such meshes are a cylinder
-    under: np.ndarray  # nodes of the top within the punch, or of all of it
+    parts: float  # number of such meshes in a whole cylinder
+    under: np.ndarray  # nodes of the top under the punch, or of the whole top
     volumetric: str
 
 
@@ -72,17 +72,17 @@ def read(rig: Rig, law: Law, prony: Prony | None) -> tuple[jax.Array, jax.Array]
     """Readings of the rig at every step (T,) [N] or [m], and the codes of the steps (T,).
 
     Raises:
-        InputError: a law with directions of its own in a sector, where only what is alike all around the axis fits.
+        InputError: the law has directions of its own, and the mesh is a sector, which needs symmetry around the axis.
     """
     result = lj.simulate(_with(rig, law, prony))
     return _reading(rig, result.positions, result.reactions), result.status
 
 
 def mesh_error(rig: Rig, law: Law, prony: Prony | None) -> jax.Array:
-    """Estimate of what an infinitely fine mesh would add to each reading (T,) [N] or [m]; not for traced numbers.
+    """Estimate of the change of each reading (T,) [N] or [m] by an infinitely fine mesh; not for traced numbers.
 
-    It takes a run, and one linear solve in a richer space a step (`liverjax.simulation.mesh_error`). It is NaN where a
-    step has no estimate.
+    It needs a run, and one linear solve per step in elements of higher order (`liverjax.simulation.mesh_error`). It is
+    NaN if a step has no estimate.
     """
     result = lj.simulate(_with(rig, law, prony), mesh_error=True)
     assert result.mesh_error is not None
@@ -109,7 +109,7 @@ def _with(rig: Rig, law: Law, prony: Prony | None) -> lj.Scene:
 
 
 def _ratio(law: Law) -> float | None:
-    """Bulk over shear modulus; None where a law does not state them, or while they are traced."""
+    """Bulk over shear modulus; None if a law does not state them, or while they are traced."""
     try:
         moduli = law.bulk_modulus(), law.shear_modulus()
     except InputError:
@@ -152,7 +152,7 @@ def tension(radius: float, height: float, dt: float, strains: Numbers, cell_size
 def indentation(
     radius: float, height: float, punch: float, dt: float, depths: Numbers, cell_size: float | Cells | None = None
 ) -> Rig:
-    """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; the force on it.
+    """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; its force is read.
 
     Args:
         radius, height, dt, cell_size: as in `tension`; a ring of nodes is at the punch's edge.
@@ -164,7 +164,7 @@ def indentation(
     cells = _cells(radius, height, dt, cell_size)
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(
-            f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} of the radius {radius:g}: mend "
+            f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} of the radius {radius:g}: change "
             "one of them"
         )
     edge = cells.edge * min(punch, radius - punch, height)
@@ -176,7 +176,7 @@ def indentation(
 def creep(
     radius: float, height: float, dt: float, steps: int, stress: float, cell_size: float | Cells | None = None
 ) -> Rig:
-    """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the mean displacement of the top.
+    """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the top's mean displacement is read.
 
     The pull grows during the first step, as it does in a rheometer. The mean is taken over the area.
     """
@@ -196,7 +196,7 @@ def creep(
 def _finite_history(name: str, values: Numbers) -> np.ndarray:
     values = np.atleast_1d(np.asarray(values, float))
     if values.ndim != 1 or not len(values) or not np.all(np.isfinite(values)):
-        raise InputError(f"{name} must be finite numbers, one a step: mend the list")
+        raise InputError(f"{name} must be finite numbers, one per step: correct the list")
     return values
 
 
@@ -237,7 +237,7 @@ def _sample(rings: dict, layers: dict, cells: Cells, punch: float | None = None)
     bottom = lj.Fixed(nodes=jnp.asarray(sets["bottom"]))
     if normal is None:
         return _Sample(mesh, (bottom,), (), parts, sets["under"], cells.volumetric)
-    # The axis is in both planes: the nodes in the middle of its edges too.
+    # The axis lies in both planes, and so do the mid-edge nodes on it.
     axis = np.intersect1d(sets["start"], sets["end"])
     fixed = (
         bottom,
@@ -264,7 +264,7 @@ def _driven(sample: _Sample, dt: float, lift: np.ndarray) -> Rig:
     history[1:, 2] = lift
     times = dt * np.arange(len(lift) + 1)
     nodes = jnp.asarray(sample.under)
-    # Along z alone: the planes of symmetry hold some of these nodes already, and none is to be prescribed twice.
+    # Along z alone: the planes of symmetry fix some of these nodes already, and no node may be prescribed twice.
     moved = lj.Displaced(nodes=nodes, times=jnp.asarray(times), history=jnp.asarray(history), axes="z")
     sample = sample._replace(fixed=(*sample.fixed, lj.Fixed(nodes=nodes, axes="xy")))
     scene = _scene(sample, dt, len(lift), displaced=(moved,))

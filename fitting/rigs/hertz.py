@@ -11,7 +11,7 @@ SHAPES = ("sphere", "cone", "punch")
 
 
 class Indenter(NamedTuple):
-    """An indenter on a layer, or on a half-space, which is a layer without end."""
+    """An indenter on a layer, or on a half-space, which is a layer of infinite thickness."""
 
     shape: str  # one of `SHAPES`
     thickness: float  # [m]

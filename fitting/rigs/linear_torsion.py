@@ -43,14 +43,14 @@ def rest_stiffness(rig: Rig, law: Law) -> jax.Array:
 
 
 class Response(NamedTuple):
-    """The linear answer of the rig: coordinates per unit arc length (real or complex), and force per arc length."""
+    """The linear response of the rig: coordinates per unit arc length (real or complex), and force per arc length."""
 
     shape: jax.Array  # (n,), its last entry 1
     stiffness: jax.Array  # [N/m]
 
 
 def _response(column: jax.Array) -> Response:
-    """The answer, from the coordinates (n,) that a unit force on the last of them causes."""
+    """The response, from the coordinates (n,) that a unit force on the last of them causes."""
     return Response(column / column[-1], 1 / column[-1])
 
 
@@ -61,7 +61,7 @@ def exact_stiffness(rig: Rig, law: Law) -> Number:
 
 @jax.jit
 def geometry_factor(rig: Rig, law: Law) -> jax.Array:
-    """Elastic torsional stiffness of the mesh over pi r^4 G / (2 h): what the polygon and the stiff elements add.
+    """Elastic torsional stiffness of the mesh over pi r^4 G / (2 h): the effect of polygon and stiff elements.
 
     Moduli divided by it are free of that bias in the linear range.
     """
@@ -70,12 +70,12 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
 
 
 class Linearised(NamedTuple):
-    """The rig as it is held, before any frequency is known."""
+    """The linearised rig, before a frequency is given."""
 
-    inverse: jax.Array  # of the stiffness (n, n) against a motion too quick to relax
-    relaxing: jax.Array | None  # the part of the stiffness that relaxes and the part that stands, where they differ
+    inverse: jax.Array  # of the stiffness (n, n) in a motion too fast to relax
+    relaxing: jax.Array | None  # relaxing part of the stiffness; then its constant part; None: all relaxes
     standing: jax.Array | None
-    bias: jax.Array | None = None  # of the mesh, where the sample is compressed: `geometry_factor` of its rest
+    bias: jax.Array | None = None  # of the mesh of a compressed sample: `geometry_factor` at rest
 
 
 def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
@@ -91,9 +91,9 @@ def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
 
 
 def about_held(rig: Rig, law: Law) -> tuple[jax.Array, jax.Array]:
-    """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the stress that stands.
+    """Stiffness (n, n) [N/m] of a compressed sample in two parts: of changing stress, and of the constant stress.
 
-    A motion only turns a stress S that has stood for long. The second part is computed with the unrelaxed S.
+    A motion only rotates a stress S that has been constant for long. The second part is computed with the unrelaxed S.
     """
     mesh = rig.mesh
     rest = jnp.zeros(number_of_coordinates(rig), mesh.points.dtype)
@@ -122,7 +122,7 @@ def axial_force(rig: Rig, law: Law) -> jax.Array:
 
 
 def steady_response(rest: Linearised, modulus: Number) -> Response:
-    """Response on the steady cycle where the relaxing stress is `modulus` times the elastic one (complex)."""
+    """Response in a steady cycle in which the relaxing stress is `modulus` (complex) times the elastic stress."""
     if rest.relaxing is None or rest.standing is None:
         elastic = _response(rest.inverse[:, -1])
         return Response(elastic.shape, elastic.stiffness * modulus)
@@ -138,22 +138,22 @@ def torque_for_strain(rig: Rig, modulus: Number, strain: Number) -> Number:
 def linear_moduli(law: Law, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:
     """The limit of `moduli` as the strain goes to zero: complex moduli [Pa] (n,) of the recursion itself.
 
-    The rig is linear there and its bias is divided out. So the moduli depend neither on the mesh nor on the plates.
-    They give the derivatives of `moduli` by the parameters to the order of the strain, without a derivative of the
-    simulation. They have no inertia.
+    In this limit the rig is linear, and its bias is divided out. So the moduli depend neither on the mesh nor on the
+    plates. Their derivatives by the parameters are those of `moduli`, up to an error of the order of the strain, so the
+    simulation need not be differentiated. Inertia is not included.
 
     Args:
-        law: scaled to G0, its modulus at rest.
-        prony: how it relaxes.
+        law: the law, scaled to G0, its modulus at rest.
+        prony: its relaxation.
         omega: angular frequencies (n,) [rad/s].
-        steps: time steps a cycle; None: those of continuous time.
+        steps: time steps per cycle; None: continuous time.
     """
     ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
     return law.shear_modulus() * (1 - jnp.sum(ratios, axis=0))
 
 
 class Held(NamedTuple):
-    """A compressed sample of a law, before any relaxation is known."""
+    """A compressed sample of a law, before its relaxation is given."""
 
     relaxing: jax.Array  # (n, n) [N/m]: `about_held`
     standing: jax.Array
@@ -170,9 +170,9 @@ def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int |
 
     Args:
         of, rig: the sample.
-        prony: how it relaxes.
+        prony: its relaxation.
         omega: angular frequencies (n,) [rad/s].
-        steps: time steps a cycle; None: those of continuous time.
+        steps: time steps per cycle; None: continuous time.
     """
     ratios = viscosity.complex_ratios(prony, omega, None if steps is None else 2 * jnp.pi / (omega * steps))
     stands = 1 - jnp.sum(jnp.asarray(prony.ratios))

@@ -1,4 +1,4 @@
-"""The sample between the plates of a rheometer: its mesh, and the coordinates that its plates leave.
+"""The sample between the plates of a rheometer: its mesh, and the coordinates of its motion between them.
 
 Coordinates are the displacements u of the free nodes, the lift of the top plate, and arc = radius * angle.
 """
@@ -25,7 +25,7 @@ class Rig:
     mesh: TetMesh = param("m", "the sample")
     radius: Number = param("m", "plate radius")
     height: Number = param("m", "gap")
-    density: Number | None = param("kg/m^3", "None: no inertia, and no velocity is carried", default=None)
+    density: Number | None = param("kg/m^3", "None: no inertia, and no velocity in the state", default=None)
     bottom: int = static(about="number of nodes on the gripped plate")
     top: int = static(about="number of nodes on the turning plate")
     held: jax.Array | None = param(
@@ -40,7 +40,7 @@ def cell_size_for(radius: float, height: float) -> float:
 
 
 def linear_cell_for(radius: float, height: float) -> float:
-    """Cell [m] of about 100 nodes: enough for small strain without inertia, where `bias` holds all of the mesh's error.
+    """Cell [m] of about 100 nodes: enough for small strain without inertia, where `bias` is all of the mesh's error.
 
     The rest of the error is of the order of the strain: at 1e-3 the moduli differ by 1e-5 from those of `cell_size_for`
     (experiments/benchmarks/torsion_speed.py).
@@ -113,7 +113,7 @@ def work_conjugates(rig: Rig, x: jax.Array, f: jax.Array) -> tuple[jax.Array, ja
 
 
 def coordinates(rig: Rig, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(u, lift, angle) of the full vector of coordinates, angle last."""
+    """(u, lift, angle) from the full vector of coordinates, angle last."""
     if rig.free_height:
         return q[:-2], q[-2], q[-1] / rig.radius
     return q[:-1], jnp.zeros((), q.dtype), q[-1] / rig.radius

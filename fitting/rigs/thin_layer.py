@@ -1,8 +1,8 @@
 """A rigid indenter on an elastic layer that is bonded to a rigid base: small strains, no friction, no adhesion.
 
-A layer of any thickness under a punch, a sphere or a cone has an exact solution. Its surface moves by K(xi h) times
-what a half-space would do, for every wave number xi. This makes one integral equation on the contact circle, which is
-solved at Gauss points. The force is linear in the modulus, so one table of force over depth serves a whole fit.
+A layer of any thickness under a punch, a sphere or a cone has an exact solution. Its surface moves K(xi h) times as
+much as that of a half-space, for every wave number xi. This makes one integral equation on the contact circle, which is
+solved at Gauss points. The force is linear in the modulus, so one table of force over depth is enough for a whole fit.
 
 Sources: Lebedev and Ufliand 1958, J. Appl. Math. Mech. 22:442; Hayes et al. 1972, J. Biomech. 5:541 (the layer);
 Dimitriadis et al. 2002, Biophys. J. 82:2798 (the series).
@@ -16,7 +16,7 @@ import scipy.interpolate
 from fitting.rigs.hertz import SHAPES, Indenter, half_space
 from liverjax.core.errors import InputError
 
-#: Largest contact radius over thickness that a table goes to.
+#: Largest contact radius / thickness in a table.
 WIDEST = 8.0
 #: Beyond this, 1 - K(eta), which falls as eta^2 exp(-2 eta), is below 1e-13.
 _LAST_WAVE = 20.0
@@ -24,10 +24,10 @@ _WAVES, _POINTS, _ROWS = 160, 48, 48
 
 
 class Factors(NamedTuple):
-    """How much more force a layer takes than a half-space at the same depth."""
+    """Table of the force on a layer divided by the force on a half-space at the same depth."""
 
     reach: np.ndarray  # (n,) ascending from 0: size of the half-space's contact over the thickness, see `reach`
-    factor: np.ndarray  # (n,) force over that of the half-space
+    factor: np.ndarray  # (n,) force / force on the half-space
 
 
 def stiffening(eta: np.ndarray, poisson: float) -> np.ndarray:
@@ -122,7 +122,7 @@ class Layer:
         table = factors(rig.poisson, rig.shape)
         self._factor = scipy.interpolate.CubicSpline(table.reach, table.factor)
         unit = reach(rig, np.ones(1))[0]
-        #: Depth [m] that the table goes to.
+        #: Largest depth [m] in the table.
         self.deepest = float((table.reach[-1] / unit) ** (2 if rig.shape == "sphere" else 1))
 
     def force(self, depth: np.ndarray) -> np.ndarray:

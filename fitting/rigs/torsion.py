@@ -1,10 +1,10 @@
 """The rheometer as a differentiable simulation (chapter, sections 5.2 and 5.3).
 
-A cylinder of tetrahedra, its bottom gripped, its top turning rigidly about the axis by one angle. A sinusoidal torque
-(the stress-controlled AR2000) or angle drives it; every time step is solved by Newton's method and differentiated
-implicitly; the moduli come from demodulating the last cycle.
+The sample is a cylinder of tetrahedra. Its bottom is fixed, and its top turns rigidly about the axis by one angle. A
+sinusoidal torque (the stress-controlled AR2000) or angle drives it; every time step is solved by Newton's method and
+differentiated implicitly; the moduli come from demodulating the last cycle.
 
-The run starts on the steady cycle of the linearised discrete problem, so in the linear range no transient has to die.
+The run starts on the steady cycle of the linearised discrete problem, so in the linear range there is no transient.
 """
 
 import math
@@ -60,9 +60,9 @@ from liverjax.tensors.matrices import deformation_gradient
 
 
 class Drive(NamedTuple):
-    """How the rig is driven, and in how many steps; fixed when compiled.
+    """Drive of the rig and number of steps; static in compiled programs.
 
-    `steps` a cycle, `cycles` run (the last is demodulated), `by` "torque" or "angle", `start` "cycle" or "rest".
+    `steps` per cycle, `cycles` in a run (the last is demodulated), `by` "torque" or "angle", `start` "cycle" or "rest".
     """
 
     steps: int = 50
@@ -73,7 +73,7 @@ class Drive(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One oscillation: samples at times 0, dt, … (n + 1,), and what Newton did in each of the n steps."""
+    """One oscillation: samples at times 0, dt, … (n + 1,), and Newton's statistics of each of the n steps."""
 
     time: jax.Array  # [s]
     angle: jax.Array  # [rad]
@@ -83,22 +83,22 @@ class Run(NamedTuple):
 
 
 class Moduli(NamedTuple):
-    """Result of a sweep, one entry a frequency or amplitude."""
+    """Result of a sweep, one entry per frequency or amplitude."""
 
     storage: jax.Array  # G' [Pa]
     loss: jax.Array  # G'' [Pa]
     strain: jax.Array  # amplitude at the rim, radius * angle / height
-    defect: jax.Array  # |angle at the end - one period earlier| / amplitude: what is left of the transient
-    bias: jax.Array  # of the mesh, complex; `geometry_factor` where the whole stress relaxes
+    defect: jax.Array  # |angle at the end - one period earlier| / amplitude: the rest of the transient
+    bias: jax.Array  # of the mesh, complex; `geometry_factor` if the whole stress relaxes
     statistics: newton.NewtonStatistics  # worst over the steps
 
 
 def scene_of(
     rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude: Number, drive: Drive = Drive()
 ) -> Scene:
-    """The oscillation as a scene with a rigid plate, for `lj.simulate`, from rest. Arguments are those of `oscillate`.
+    """The oscillation as a scene with a rigid plate, for `lj.simulate`, from rest. Arguments as in `oscillate`.
 
-    `oscillate` with `start="rest"` has the same answer in a fraction of the time: it knows the inverse of the small
+    `oscillate` with `start="rest"` gives the same result in a fraction of the time: it uses the inverse of the small
     body's stiffness.
     """
     steps, n = drive.steps * drive.cycles, rig.mesh.number_of_nodes
@@ -154,7 +154,7 @@ class _Oscillation(NamedTuple):
         return jnp.append(q, self.rig.radius * self.amplitude * jnp.sin(self.omega * t))
 
     def solved_part(self, q: jax.Array) -> jax.Array:
-        """The unknown ones of all coordinates."""
+        """The unknown coordinates among all."""
         return q if self.by_torque else q[:-1]
 
 
@@ -163,9 +163,9 @@ class _Cycle(NamedTuple):
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
-    inverse: jax.Array  # of the elastic stiffness of what is solved for
+    inverse: jax.Array  # of the elastic stiffness of the unknowns
     twist: Number = (
-        0.0  # force [N] with which a compressed mesh, never quite symmetric, turns of itself: no part of a test
+        0.0  # force [N] that turns a compressed mesh, never quite symmetric, without a load: it is subtracted
     )
 
     def at(self, omega: Number, t: Number) -> jax.Array:
@@ -174,7 +174,7 @@ class _Cycle(NamedTuple):
 
 
 def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
-    """The run, and the bias of the mesh at this frequency (complex where only the isochoric part relaxes)."""
+    """The run, and the bias of the mesh at this frequency (complex if only the isochoric part relaxes)."""
     rig, drive = o.rig, o.drive
     modulus = 1.0 if o.prony is None else 1 - jnp.sum(viscosity.complex_ratios(o.prony, o.omega, o.dt), axis=0)
     steady = steady_response(rest, modulus)
@@ -200,14 +200,14 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
 
 
 def _twist(o: _Oscillation) -> jax.Array:
-    """Torque of the held sample over the radius [N], relaxed."""
+    """Torque of the compressed sample without a load, divided by the radius [N], after relaxation."""
     standing = 1.0 if o.prony is None else 1 - jnp.sum(jnp.asarray(o.prony.ratios))
     x = o.positions(jnp.zeros(number_of_coordinates(o.rig), o.rig.mesh.points.dtype))
     return standing * work_conjugates(o.rig, x, mjed.internal_force(o.rig.mesh, o.law, x))[2]
 
 
 def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
-    """One time step: coordinates and memories, then angle, torque, lift and what Newton did."""
+    """One time step: coordinates and memories, then angle, torque, lift and Newton's statistics."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
     physics, free = _sample_physics(rig, o.law, o.prony), Free(jnp.ones_like(mesh.points))
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
@@ -223,7 +223,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
     load = jnp.zeros_like(q_old)
     if o.by_torque:
         load = load.at[-1].set(o.amplitude * jnp.sin(o.omega * t) / rig.radius)
-    # The linear solution moves on; what the last step deviated from it is kept.
+    # The linear solution at this time, plus the deviation of the last step from it.
     guess = cycle.at(o.omega, t) + (q_old - cycle.at(o.omega, t - o.dt))
     q, statistics = newton.newton_root(
         lambda v: o.solved_part(forces(o.full(v, t)) - load),
@@ -248,13 +248,13 @@ def _without_last(inverse: jax.Array) -> jax.Array:
 
 
 def _sample_physics(rig: Rig, law: Law, prony: Prony | None) -> tuple[Physics, ...]:
-    """The sample: its solid, and its mass where the rig has a density."""
+    """The physics of the sample: its solid, and its mass if the rig has a density."""
     solid = Elasticity(law=law) if prony is None else Viscoelasticity(law=law, prony=prony)
     return (solid,) if rig.density is None else (solid, Inertia(density=rig.density, integrator="newmark"))
 
 
 def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[jax.Array, tuple]:
-    """Coordinates at time 0, and what the physics remember: at rest, or on the cycle of the linearised problem."""
+    """Coordinates at time 0, and the memories of the physics: at rest, or on the cycle of the linearised problem."""
     rig, prony, on_cycle, mesh = o.rig, o.prony, o.drive.start == "cycle", o.rig.mesh
     q = jnp.real(shape * arc) if on_cycle else jnp.zeros(shape.shape, mesh.points.dtype)
     history = None if prony is None else viscosity.initial_history(prony, mesh.volumes.shape[0], q.dtype)
@@ -262,7 +262,7 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
     def S(q):
         return viscosity.relaxing_stress(prony, o.law, deformation_gradient(mesh, o.positions(q)))
 
-    if prony is not None and rig.held is not None:  # it has been held until nothing relaxes any more
+    if prony is not None and rig.held is not None:  # it was held until its stress had relaxed
         stands = S(jnp.zeros_like(q))
         history = viscosity.relaxed_history(prony, stands)
     if prony is not None and on_cycle:
@@ -286,12 +286,12 @@ def oscillate(rig: Rig, law: Law, prony: Prony | None, omega: Number, amplitude:
     """Drive the rig by amplitude * sin(omega t).
 
     Args:
-        rig: `make_rig`.
+        rig: the rig, from `make_rig`.
         law: any law: the instantaneous response.
         prony: its relaxation, or `None`.
         omega: angular frequency [rad/s].
         amplitude: [N m] if driven by torque, [rad] if by angle.
-        drive: static.
+        drive: see `Drive`; static.
     """
     return _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), linearised_rig(rig, law, prony))[0]
 
@@ -316,9 +316,9 @@ def moduli(
 
     Args:
         omega, amplitude: (n,) or numbers, broadcast; see `oscillate`.
-        corrected: divide by the bias of the mesh, `geometry_factor` (at each frequency its own where only the
-            isochoric part relaxes, since the bulk then weighs more as the modulus falls). With a density the
-            inertial part is divided as well: refine the mesh there instead.
+        corrected: divide by the bias of the mesh, `geometry_factor` (if only the isochoric part relaxes, each frequency
+            has its own bias, because the bulk has more effect as the modulus falls). With a density the inertial part
+            is divided as well: refine the mesh instead.
     """
     rest = linearised_rig(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
@@ -332,7 +332,7 @@ def moduli(
         return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, bias, worst)
 
     lanes = jnp.atleast_1d(omega), jnp.atleast_1d(amplitude)
-    # One lane after another stays in a CPU's cache (1.7 times faster for the Jacobian); a GPU wants them side by side.
+    # On a CPU one lane after another stays in the cache (1.7 times faster for the Jacobian); a GPU runs all at once.
     return jax.lax.map(lambda lane: one(*lane), lanes) if jax.default_backend() == "cpu" else jax.vmap(one)(*lanes)
 
 

@@ -2,15 +2,15 @@
 
 At the inner nodes of a body no force acts from outside, so C(G) u + B p = 0. C has the rows of K(G) - omega^2 M at
 these nodes, where K contains the shear stress alone. B p are the forces of a pressure p (linear in the elements,
-continuous), which is whatever it must be: no bulk modulus is needed. What is measured is d = u + noise, at all nodes.
+continuous), which is unknown, so that no bulk modulus is needed. The measured motion is d = u + noise, at all nodes.
 If the pressure has a large prior variance g sd^2, the likeliest motion that obeys this is
 
     u = d - C^H q,   S q = C d,   S = C C^H + g B B^H,   chi^2 = (C d)^H q / sd^2:
 
-no condition is set at the body's surface, whose motion is measured with noise like all other motion. By the
-modulus, chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2
-(variable projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on u, not on d, noise does
-not pull the modulus down, as it does in the direct inversion of second derivatives.
+no condition is set at the body's surface, whose motion is measured with noise like all other motion. By the modulus,
+chi^2 / 2 has the gradient Re(q^H C' u) / sd^2 and the Gauss-Newton Hessian (C' u)^H S^-1 C' u / sd^2 (variable
+projection: Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, 413). Since C' acts on u, not on d, noise does not lower
+the modulus, as it does in the direct inversion of second derivatives.
 """
 
 from typing import NamedTuple
@@ -32,17 +32,17 @@ class Matrices(NamedTuple):
 
     shear: np.ndarray  # (n, 3, n, 3, E) of a shear modulus of 1 Pa [N/m/Pa]
     mass: np.ndarray  # (n, n, E) of one component [kg]
-    unknowns: np.ndarray  # (n, 3, E) number of each in 3 V, x, y, z of a node together
-    rows: np.ndarray  # (n, 3, E) number among the inner unknowns, -1 where there is none
+    unknowns: np.ndarray  # (n, 3, E) index of each in 3 V, x, y, z of a node together
+    rows: np.ndarray  # (n, 3, E) index among the inner unknowns, -1: none
     pattern: scipy.sparse.csr_array  # of C
-    places: np.ndarray  # of the entries of all elements with an inner row, in pattern.data
-    entries: np.ndarray  # these, among all entries
+    places: np.ndarray  # places in pattern.data of the elements' entries with an inner row
+    entries: np.ndarray  # indices of these entries among all
     pressure: np.ndarray  # g B B^H (bandwidth + 1, I), by diagonals
     balances: int  # real equations that chi^2 sums over
 
 
-#: Part of S that the pressures have over the part of the shear stress of `TYPICAL` [Pa]: what is left of them is its
-#: inverse. It is the same for every modulus, so that chi^2 of two moduli can be compared.
+#: Ratio of the part of the pressures in S to the part of the shear stress at the modulus `TYPICAL` [Pa]; the error of
+#: a finite ratio is about its inverse. It is the same for every modulus, so that chi^2 of two moduli can be compared.
 FREE, TYPICAL = 1e4, 3000.0
 
 
@@ -78,7 +78,7 @@ class Balanced(NamedTuple):
 
 
 def matrices(body: VoxelBody, density: float) -> Matrices:
-    """The parts of a body of this density [kg/m^3]."""
+    """The matrices of a body with this density [kg/m^3]."""
     scene = lj.Scene(
         mesh=body.mesh,
         law=lj.laws.NeoHookean(mu=1.0, bulk=1.0),
@@ -108,7 +108,7 @@ def matrices(body: VoxelBody, density: float) -> Matrices:
 
 
 def freely(B: scipy.sparse.csr_array, shear: np.ndarray) -> scipy.sparse.csr_array:
-    """Forces of pressures with prior variance `FREE`, from forces B of 1 Pa and the C of modulus `TYPICAL`."""
+    """Forces of pressures with prior variance `FREE`, from forces B of 1 Pa and entries of C at modulus `TYPICAL`."""
     part = np.sum(shear**2) / B.shape[0]  # mean of the diagonal of C C^H
     return np.sqrt(FREE * part / B.power(2).sum(axis=1).mean()) * B
 
@@ -153,7 +153,7 @@ def balanced(m: Matrices, G: np.ndarray, omega: float, d: np.ndarray, sd: float)
     """The likeliest motion.
 
     Args:
-        m: `matrices`.
+        m: from `matrices`.
         G: complex moduli of the elements (E,) [Pa].
         omega: angular frequency [rad/s].
         d: measured motion (3 V,) complex [m], x, y, z of a node together.
@@ -170,7 +170,7 @@ def likeliest(
     Args:
         C: rows of balance.
         B: covariance of the forces of pressures, by diagonals.
-        d: what was measured (U,) [m]; 0 where nothing was.
+        d: measured motion (U,) [m]; 0 where it was not measured.
         sd: standard deviation of real and imaginary part of one component [m].
         spread: variance of each unknown's difference from d (U,), over sd^2; None: 1.
     """
@@ -181,7 +181,7 @@ def likeliest(
     if len(S) < len(B):
         S = np.pad(S, ((0, len(B) - len(S)), (0, 0)))
     S[: len(B)] += B
-    # Banded: faster here than sparse factors, whose fill is the band's.
+    # Banded: faster here than sparse factors, which would fill the band too.
     factor = scipy.linalg.cholesky_banded(S, overwrite_ab=True, lower=True, check_finite=False)
     r = C @ d
     q = scipy.linalg.cho_solve_banded((factor, True), r, check_finite=False)
@@ -189,7 +189,7 @@ def likeliest(
 
 
 def by_diagonals(S: scipy.sparse.csr_array) -> np.ndarray:
-    """The lower triangle of a Hermitian matrix as LAPACK has it, (bandwidth + 1, n)."""
+    """The lower triangle of a Hermitian matrix as LAPACK stores it, (bandwidth + 1, n)."""
     at = S.tocoo()
     below = at.row >= at.col
     row, column = at.row[below], at.col[below]

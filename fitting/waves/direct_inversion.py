@@ -1,7 +1,7 @@
-"""The usual direct inversion of waves (algebraic Helmholtz), as the baseline beside the balance of forces.
+"""The usual direct inversion of waves (algebraic Helmholtz), as a baseline for the balance of forces.
 
-The curl q of the displacement obeys G laplace(q) = - density omega^2 q where G is uniform, since it holds no pressure.
-By least squares over the three components and a window of voxels
+The curl q of the displacement obeys G laplace(q) = - density omega^2 q where G is uniform, since the curl contains no
+pressure. By least squares over the three components and a window of voxels
 
     G = - density omega^2 sum(conj(laplace q) q) / sum(|laplace q|^2)
 
@@ -20,7 +20,7 @@ from liverjax.core.errors import InputError
 
 #: Standard deviation of the Gaussian that smooths displacements before they are differentiated [voxels].
 SMOOTHING = 1.0
-#: Voxels along an axis of the window of least squares.
+#: Side of the window of least squares [voxels].
 WINDOW = 3
 
 
@@ -28,7 +28,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
     """Complex modulus (F, nx, ny, nz) [Pa]; NaN outside, and where derivatives or smoothing reach the mask's edge.
 
     Args:
-        field: three components are needed; NaN everywhere without.
+        field: measured waves; without all three components the result is NaN everywhere.
         density: [kg/m^3].
         smoothing: [voxels] standard deviation of the Gaussian; 0 along an axis that is too short for it.
         window: [voxels] an odd number.
@@ -45,7 +45,7 @@ def invert(field: WaveField, density: float, smoothing: float = SMOOTHING, windo
 
 def _one(field: WaveField, U: np.ndarray, smoothing: float, window: int) -> np.ndarray:
     inside = field.mask & np.all(np.isfinite(U), axis=-1)
-    # A derivative and a second difference look one voxel further each, the Gaussian three of its deviations.
+    # A derivative and a second difference reach one voxel further each, the Gaussian three of its deviations.
     reach = [2 + math.ceil(3 * smoothing)] * 3
     ends = [np.flatnonzero(inside.any(axis=tuple(b for b in range(3) if b != a))) for a in range(3)]
     widths = [0.0] * 3

@@ -1,4 +1,4 @@
-"""Phase velocities of shear waves over frequency, with or without attenuation, from files: as ultrasound gives them."""
+"""Phase velocities of shear waves over frequency, with or without attenuation, from files, as ultrasound gives them."""
 
 import os
 import re
@@ -22,7 +22,7 @@ WORDS = (
     ("speed", "velocity"),
     ("attenuation", "attenuation"),
 )
-#: Frequencies that a file must have.
+#: Fewest frequencies of a file.
 FEWEST = 3
 
 
@@ -43,7 +43,7 @@ class Dispersion(NamedTuple):
 
     @property
     def measured(self) -> np.ndarray:
-        """Velocities, then attenuations where there are."""
+        """Velocities, then attenuations if they were measured."""
         return self.velocity if self.attenuation is None else np.concatenate([self.velocity, self.attenuation])
 
 
@@ -57,7 +57,7 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
 
     Args:
         path: text.
-        density: of the material [kg/m^3]; None takes `DENSITY`, with a note.
+        density: density of the material [kg/m^3]; None: `DENSITY`, with a note.
 
     Raises:
         InputError: one sentence naming file, line or column, value and remedy.
@@ -66,14 +66,14 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
     header = _header(lines)
     if header is None:
         raise InputError(f"{path}: no header names frequency_Hz and phase_velocity_m/s; add that header")
-    notes = [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is taken; --density gives another"]
+    notes = [] if density is not None else [f"a density of {DENSITY:g} kg/m^3 is assumed; --density gives another"]
     columns = _columns(str(path), lines, header)
     order = np.argsort(columns["frequency"], kind="stable")
     columns = {q: v[order] for q, v in columns.items()}
     for quantity, values in columns.items():
         bad = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
         if bad.size:
-            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be a number above 0: mend or remove its row")
+            raise InputError(f"{path}: {quantity} {values[bad[0]]:g} must be above 0: correct or remove its row")
     if len(np.unique(columns["frequency"])) < FEWEST:
         raise InputError(
             f"{path}: {len(order)} rows of numbers are below the header; give {FEWEST} frequencies or more"
@@ -131,7 +131,7 @@ def _columns(path: str, lines: list[str], header: tuple) -> dict[str, np.ndarray
         _, cells = split_line(line, delimiter)
         values = [to_number(cells[p], delimiter) if p < len(cells) else None for p, _ in found.values()]
         if not all(v is not None and np.isfinite(v) for v in values):
-            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is no number; mend it")
+            raise InputError(f"{path}: line {number}: {line.strip()[:40]!r} has a cell that is no number; correct it")
         rows.append(values)
     table = np.array(rows, float).reshape(-1, len(found))
     return {q: table[:, j] * factors[q] for j, q in enumerate(found)}

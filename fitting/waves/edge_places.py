@@ -1,10 +1,10 @@
-"""Where the edges of labels are, between the voxels, and how sure that is.
+"""Places of the edges of labels between the voxels, and their uncertainty.
 
-Labels are steps of voxels. Smoothed, they give the volume of a region, but the shape of its edge only to a part of a
-voxel: circles of 2.5 to 8 voxels come out with a mean radius that is 0.05 to 0.1 voxels off, and with edges that are
-another 0.13 voxels off from place to place, alike over 1.6 voxels. This shape changes the modulus of a stiff cylinder
-of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges are cut into patches, and how far outwards each of
-them lies is unknown.
+Labels change in steps of a voxel. Smoothed labels give the volume of a region, but the shape of its edge only to a part
+of a voxel: for circles of 2.5 to 8 voxels the mean radius is off by 0.05 to 0.1 voxels, and the edge by another 0.13
+voxels from place to place, with a correlation length of 1.6 voxels. This shape changes the modulus of a stiff cylinder
+of 5 voxels by 3 to 4 % (`tests/test_wave_edges.py`). So the edges are cut into patches, and the shift of each patch
+outwards is an unknown of the fit.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from fitting.waves.voxels import VoxelBody
 
 #: Standard deviation of the Gaussian that smooths the steps of labels [voxels].
 SMOOTHING = 1.4
-#: Parts of a voxel's side by which volumes are counted.
+#: Number of parts of a voxel's side for counting volumes.
 FINE = 4
-#: How far edges are moved to see what their place does [voxels].
+#: Shift of the edges by which the effect of their place is computed [voxels].
 FARTHER = 0.1
-#: Side of a patch, and how far from a cut element's node its edge is looked for [voxels].
+#: Side of a patch, and largest distance of an edge from a cut element's node [voxels].
 SIDE, REACH = 2.0, 2.0
-#: Standard deviation of the place of a whole edge, as far as a voxel's rounding, and of its patches; how far patches
-#: are alike [voxels].
+#: Standard deviations of the place of a whole edge (rounding to a voxel) and of its patches; correlation length of the
+#: patches [voxels].
 WHOLE, PATCH, ALIKE = 1 / np.sqrt(12), 0.13, 1.6
 
 
@@ -35,13 +35,13 @@ class Patches(NamedTuple):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (P, P) [voxels^2] of how far outwards the patches lie, from the labels alone."""
+        """Covariance (P, P) [voxels^2] of the shifts of the patches outwards, from the labels alone."""
         apart = np.sum((self.centre[:, None] - self.centre[None]) ** 2, axis=-1)
         same = self.region[:, None] == self.region[None]
         return np.asarray(same * (WHOLE**2 + PATCH**2 * np.exp(-0.5 * apart / ALIKE**2)))
 
     def means(self, values: np.ndarray, regions: int) -> np.ndarray:
-        """Means (regions,) of values (P,) over the patches of each region, 0 where there is none."""
+        """Means (regions,) of values (P,) over the patches of each region, 0 if it has none."""
         count = np.bincount(self.region, minlength=regions)
         return np.asarray(np.bincount(self.region, values, regions) / np.maximum(count, 1))
 
@@ -50,13 +50,14 @@ NO_PATCHES = Patches(np.zeros(0, int), np.zeros((0, 3)))
 
 
 def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: float = 0.0) -> np.ndarray:
-    """Smoothed places s_k (R, V) of the labels `known` (R,) at the nodes.
+    """Smoothed indicator functions s_k (R, V) of the labels `known` (R,) at the nodes.
 
-    Smoothed twice, so that curved edges stay nearly where they are, and shifted to the volume that the labels have.
+    They are smoothed twice, so that curved edges stay nearly where they are, and shifted so that each region keeps the
+    volume of its label.
 
     Args:
         labels: (nx, ny, nz).
-        body: labels count at its voxels; every other voxel takes the nearest label.
+        body: labels count at its voxels; every other voxel gets the nearest label.
         known: (R,).
         farther: how far [voxels] the edges of all regions but the largest are moved outwards.
     """
@@ -70,7 +71,7 @@ def places(labels: np.ndarray, body: VoxelBody, known: np.ndarray, farther: floa
     for k in range(len(known)):
         if k != largest:
             others = np.delete(s, k, axis=0).max(axis=0)
-            # Near the label alone: what a small one needs would win over all others at their edges.
+            # Only near the label: a small label needs a large constant, which would move the edges of the others.
             apart = ndimage.distance_transform_edt(whole != known[k])
             out[k] += _level(s[k] - others, whole == known[k], counts[k]) * np.clip(2 - 0.5 * apart, 0, 1)
             if farther:
@@ -123,7 +124,7 @@ def patches_of(s: np.ndarray, body: VoxelBody, nodes: np.ndarray) -> tuple[Patch
 
 
 def _feet(above: np.ndarray, body: VoxelBody) -> np.ndarray:
-    """The nearest point (V, 3) [voxels] to each node where a field (V,) is zero, by its slope, `REACH` off at most."""
+    """The nearest point (V, 3) [voxels] to each node where a field (V,) is zero, by its slope, at most `REACH` away."""
     first = body.voxel.min(axis=0)
     at = tuple((body.voxel - first).T)
     grid, known = np.zeros(np.ptp(body.voxel, axis=0) + 1), np.zeros(np.ptp(body.voxel, axis=0) + 1, bool)

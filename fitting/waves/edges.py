@@ -1,14 +1,15 @@
-"""Regions with edges inside the elements: there the motion kinks and the pressure jumps.
+"""Regions with edges inside the elements: at an edge the motion has a kink and the pressure a jump.
 
 Across an edge between two materials displacement and traction are continuous, strain and pressure are not. A quadratic
-element cannot kink. So it is too stiff, and the modulus of a region of few voxels comes out too low. Elements that an
-edge cuts have one more function L_i psi for each of their corners i, where L_i is the corner's linear function and
+element cannot have a kink inside. So it is too stiff, and the modulus of a region of few voxels comes out too low.
+Elements that an edge cuts have one more function L_i psi for each of their corners i, where L_i is the corner's linear
+function and
 
     psi = sum_a N_a max_k s_k(x_a) - max_k sum_a N_a s_k(x_a).
 
-s_k is the smoothed place of region k. Psi is continuous, kinks at the edges and is zero at all nodes (extended finite
-elements: Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). Nodes keep the motion of their voxels; the
-amplitudes of the kinks are not measured. Every point has the modulus and the pressure of its own side.
+s_k is the smoothed indicator function of region k. Psi is continuous, has a kink at the edges and is zero at all nodes
+(extended finite elements: Moes et al. 2003, Comput. Methods Appl. Mech. Eng. 192, 3163). Nodes keep the motion of their
+voxels; the amplitudes of the kinks are not measured. Every point has the modulus and the pressure of its own side.
 """
 
 from typing import NamedTuple
@@ -22,16 +23,16 @@ from fitting.waves.edge_places import NO_PATCHES, Patches, patches_of
 from fitting.waves.voxels import VoxelBody
 from liverjax.mesh.adjacency import PAIRS
 
-#: Levels of halving of cut elements, in whose parts edges are planes; and elements at a time.
+#: Number of halvings of cut elements, in whose parts edges are planes; number of elements computed at a time.
 HALVINGS, CHUNK = 3, 60
 
 
 class RegionMatrices(NamedTuple):
     """Parts of the balance of R regions, with U unknowns: 3 V of the nodes, then those of kinks."""
 
-    stiffness: np.ndarray  # (R, N) entries of C by a shear modulus of 1 Pa of each region
-    mass: np.ndarray  # (N,) entries of C by -omega^2
-    pattern: scipy.sparse.csr_array  # (I, U): their places
+    stiffness: np.ndarray  # (R, N) entries of C for a shear modulus of 1 Pa in each region
+    mass: np.ndarray  # (N,) entries of C that are multiplied by -omega^2
+    pattern: scipy.sparse.csr_array  # (I, U): places of these entries
     forces: scipy.sparse.csr_array  # (I, P) of pressures, each with the same large variance
     pressure: np.ndarray  # their covariance, as in `Matrices`
     kinks: int  # unknowns that are not measured
@@ -53,7 +54,7 @@ class RegionMatrices(NamedTuple):
         return np.stack([self._filled(own) @ u for own in self.stiffness], axis=1)
 
     def by_edges(self, here: balance.Balanced, G: np.ndarray, omega: float) -> np.ndarray:
-        """Derivatives (I, P) of C u - B p by how far each patch of the edges lies outwards [voxels]."""
+        """Derivatives (I, P) of C u - B p by the shift of each patch of the edges outwards [voxels]."""
         out = np.zeros((len(self.patch), len(self.patches.region)), complex)
         if self.farther is not None:
             p = self.forces.T @ here.multipliers
@@ -68,7 +69,7 @@ class RegionMatrices(NamedTuple):
 
 
 class _CutElements(NamedTuple):
-    """Some elements with n functions, or what of them lies in one region."""
+    """Some elements with n functions, or the parts of them that lie in one region."""
 
     region: np.ndarray  # (K,)
     functions: np.ndarray  # (K, n) numbers of the functions
@@ -84,10 +85,10 @@ def region_matrices(
     """The parts of the balance of regions.
 
     Args:
-        m, body: `balance.matrices` and its elements.
+        m, body: from `balance.matrices`, and its elements.
         density: [kg/m^3].
         s: `places` (R, V).
-        farther: the same with edges that are `edge_places.FARTHER` out.
+        farther: `places` with edges that are `edge_places.FARTHER` farther out.
     """
     nodes, tets = _nodes_of_elements(body), np.asarray(body.linear.tetrahedra)
     both = [s] if farther is None else [s, farther]
@@ -117,7 +118,7 @@ def _nodes_of_elements(body: VoxelBody) -> np.ndarray:
 
 
 def _numbers_of_rows(body: VoxelBody, kinked: np.ndarray) -> np.ndarray:
-    """Number of each unknown's row, -1 where there is none; slices of the longest side follow each other."""
+    """Number of each unknown's row, -1 if it has none; slices of the longest side follow each other."""
     inner, hidden = np.flatnonzero(body.inner), np.flatnonzero(body.inner[kinked])
     voxel = np.concatenate([body.voxel[inner], body.voxel[kinked[hidden]]])
     functions = np.concatenate([inner, len(body.inner) + hidden])
@@ -144,7 +145,7 @@ def _whole_parts(m: Matrices, body: VoxelBody, region: np.ndarray, chosen: np.nd
 
 
 def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarray) -> list[_CutElements]:
-    """What of every cut element lies in each region."""
+    """The part of every cut element that lies in each region."""
     corners = _equal_parts(HALVINGS)  # (Q, 4, 4)
     lam = corners.mean(axis=1)
     N, dN = _quadratic_functions(lam)
@@ -162,7 +163,7 @@ def _cut_parts(body: VoxelBody, s: np.ndarray, cut: np.ndarray, kinked: np.ndarr
         functions = np.concatenate([nodes[:, chunk].T, hidden[tets[chunk]]], axis=1)
         weights = _parts_by_region(at) * np.asarray(body.linear.volumes)[chunk, None] / len(lam)
         for region, weight in zip(there, weights, strict=True):
-            # On its side psi is what the interpolation has too much.
+            # In this region psi is the interpolated maximum minus the region's own function.
             above = highest - own[region]  # (10, K)
             psi = np.einsum("ak,qa->kq", above, N)
             slope = np.einsum("ak,kqaj->kqj", above, plain)
@@ -180,7 +181,7 @@ def _parts_by_region(at: np.ndarray) -> np.ndarray:
     out = []
     for k in range(len(at)):
         g = at[k] - np.delete(at, k, axis=0).max(axis=0)
-        # The formula has no value where two corners have the same; so far apart they are all alike to 1e-3.
+        # The formula fails if two corners have equal values: this moves them apart, by about 1e-3.
         g = g + 1e-3 * np.abs(g).max(axis=-1, keepdims=True) * np.array([0.0, 1.0, -1.5, 2.5]) + 1e-30
         apart = g[..., :, None] - g[..., None, :] + np.where(np.eye(4, dtype=bool), 1.0, 0.0)
         out.append(np.sum(np.maximum(g, 0) ** 3 / np.prod(apart, axis=-1), axis=-1))
@@ -240,7 +241,7 @@ def _all_together(parts: list[_CutElements], rows: np.ndarray, R: int, density: 
 def _pattern(
     parts: list[_CutElements], rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-    """Keys of the entries in order, ends of the rows, and for each part which entries are there, and where."""
+    """Keys of the entries in order, ends of the rows, and for each part the entries that exist, and their places."""
     keys, insides, U = [], [], len(rows)
     for p in parts:
         unknowns, lines = _unknowns_and_rows(p, rows)
@@ -254,7 +255,7 @@ def _pattern(
 
 
 def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (K, n, 3) of the unknowns of functions, and of their rows; -1 where there is none."""
+    """Numbers (K, n, 3) of the unknowns of functions, and of their rows; -1 if there is none."""
     unknowns = np.where(p.functions[..., None] < 0, -1, 3 * p.functions[..., None] + np.arange(3))
     return unknowns, np.where(unknowns < 0, -1, rows[unknowns])
 
@@ -262,7 +263,7 @@ def _unknowns_and_rows(p: _CutElements, rows: np.ndarray) -> tuple[np.ndarray, n
 def _pressure_columns(
     parts: list[_CutElements], rows: np.ndarray, shape: tuple[int, int], corners: int
 ) -> scipy.sparse.csr_array:
-    """Forces (I, P R) of the pressures at corners, in each region by itself."""
+    """Forces (I, P R) of the pressures at corners, separately for each region."""
     lines, columns, values = [], [], []
     for p in parts:
         own = p.corners + corners * p.region[:, None]
@@ -305,7 +306,7 @@ def _equal_parts(halvings: int) -> np.ndarray:
 
 
 def _split_in_eight(t: np.ndarray) -> list[np.ndarray]:
-    """The eight halves (4, 4) of a tetrahedron by its corners (4, 4)."""
+    """The eight parts (4, 4) of a tetrahedron with corners (4, 4)."""
     middle = {pair: 0.5 * (t[pair[0]] + t[pair[1]]) for pair in PAIRS}
     ab, ac, ad, bc, bd, cd = (middle[pair] for pair in PAIRS)
     a, b, c, d = t

@@ -13,7 +13,7 @@ from fitting.waves.wave_field import WaveField
 from liverjax.core.errors import InputError
 
 __all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_bias", "problem_of_map", "regions_of"]
-#: Directions and polarisations of plane waves, and how many of 26 neighbours lie that way.
+#: Directions and polarisations of plane waves, and how many of a voxel's 26 neighbours lie in such directions.
 DIRECTIONS = (((0, 0, 1), (1, 0, 0), 6), ((1, 0, 1), (1, 0, -1), 12), ((1, 1, 1), (1, -1, 0), 8))
 
 
@@ -33,7 +33,7 @@ class Found(NamedTuple):
     whole: Regions  # of one region
     labels: np.ndarray | None  # (R,) of the regions
     parts: Regions | None
-    mesh_bias: np.ndarray  # (F,) complex: relative, of plane waves of the whole's modulus
+    mesh_bias: np.ndarray  # (F,) complex, relative: from plane waves with the modulus of the whole
 
 
 def body_of(field: WaveField) -> VoxelBody:
@@ -59,7 +59,7 @@ def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
 
 
 def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, cost: None) -> Found:
-    """Moduli of the whole organ, and of its regions where labels are given."""
+    """Moduli of the whole organ, and of its regions if labels are given."""
     m, waves, body = organ.matrices, organ.waves, organ.body
     start = regions.first_modulus(m, waves)
     whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress)

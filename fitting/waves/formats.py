@@ -74,7 +74,7 @@ def single(path: Path, name: str) -> tuple[np.ndarray, object]:
         return np.asarray(found[name]), found.get("spacing")
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
     if len(own) != 1:
-        raise InputError(f"{path}: holds no {name}: name the array {name}")
+        raise InputError(f"{path}: has no {name}: name the array {name}")
     a = np.asarray(own[0])
     a = a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
     return a, found.get("spacing")
@@ -86,13 +86,13 @@ def _numpy(path: Path) -> Content:
             return {"displacement": np.load(path, allow_pickle=False)}
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file}
-    except ValueError:  # NumPy speaks of pickled objects then, of text too
-        raise InputError(f"{path}: holds no arrays of numbers: write it again with numpy.save or numpy.savez") from None
+    except ValueError:  # NumPy's message is about pickled objects then, even for text
+        raise InputError(f"{path}: has no arrays of numbers: write it again with numpy.save or numpy.savez") from None
     return _with_plain_unit(found)
 
 
 def _matlab(path: Path) -> Content:
-    """A .mat file, in the shapes that MATLAB shows: version 7.3 is HDF5 with the axes the other way round."""
+    """A .mat file, in the shapes that MATLAB shows: version 7.3 is HDF5 with the axes in reverse order."""
     import h5py
 
     if h5py.is_hdf5(path):
@@ -122,7 +122,7 @@ def _hdf5(path: Path) -> Content:
 
 
 def _values(dataset: "h5py.Dataset") -> object:
-    """The content of a dataset; of one that MATLAB wrote, as MATLAB shows it."""
+    """The content of a dataset; if MATLAB wrote it, as MATLAB shows it."""
     kind, values = dataset.attrs.get("MATLAB_class"), dataset[()]
     if kind == b"char":
         return "".join(map(chr, np.ravel(values)))
@@ -131,7 +131,7 @@ def _values(dataset: "h5py.Dataset") -> object:
     return values if kind is None else np.asarray(values).T
 
 
-#: Columns of a table, all of them but the frequency needed.
+#: Columns that a table needs; frequency and label are optional.
 COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_im_z")
 
 
@@ -143,12 +143,12 @@ def _voxel_table(path: Path) -> Content:
     head = [cell.lower() for cell in split_cells(lines[0][1], between)] if lines else []
     missing = [name for name in COLUMNS if name not in head]
     if missing:
-        raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, of several, frequency")
+        raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, for several, frequency")
     rows = np.full((len(lines) - 1, len(head)), np.nan)
     for k, (number, line) in enumerate(lines[1:]):
         cells = [_quick_number(cell, between) for cell in split_cells(line, between)[: len(head)]]
         if None in cells:
-            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is no number: mend it")
+            raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is no number: correct it")
         rows[k, : len(cells)] = cells
     column = dict(zip(head, rows.T, strict=True))
     at, spacing, origin, shape = _grid(path, np.stack([column[a] for a in "xyz"], axis=1))
@@ -172,7 +172,7 @@ def _voxel_table(path: Path) -> Content:
 
 
 def _quick_number(text: str, between: str) -> float | None:
-    """A number; quick for those that Python reads, for there are millions."""
+    """A number; fast for texts that Python can read, because there are millions."""
     try:
         return float(text)
     except ValueError:
@@ -205,7 +205,7 @@ def _nifti(path: Path) -> Content:
         raise InputError(f"{path}: NIfTI needs nibabel: pip install '.[nifti]', or give .npz") from None
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
-    unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm where it is not said
+    unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if it is not stated
     size = np.asarray(image.header.get_zooms()[:3], float) * unit
     if not np.iscomplexobj(data):
         return {"labels": data, "spacing": size}

@@ -12,7 +12,7 @@ from fitting.waves.edges import RegionMatrices
 
 #: Moduli [Pa] at which a search begins, and the loss over storage there.
 STARTS, LOSS = np.geomspace(500.0, 40500.0, 5), 0.3
-#: Iterations, and the step of a modulus over its standard error that is not worth to be made.
+#: Most iterations, and step of a modulus over its standard error below which the iteration ends.
 ITERATIONS, ENOUGH = 20, 0.1
 
 
@@ -29,7 +29,7 @@ class Regions(NamedTuple):
 
     modulus: np.ndarray  # (F, R) complex [Pa]
     covariance: np.ndarray  # (F, 2 R, 2 R) [Pa^2]: storage of all regions, then loss
-    farther: np.ndarray  # (F, R) how far the edges lie outside those of the labels [voxels]
+    farther: np.ndarray  # (F, R) mean shift of the edges outwards, from those of the labels [voxels]
     chi2: np.ndarray  # (F,)
     components: int  # of one frequency
     iterations: np.ndarray  # (F,)
@@ -37,7 +37,7 @@ class Regions(NamedTuple):
 
     @property
     def noise_factor(self) -> np.ndarray:
-        """How much larger the residuals are than the noise (F,), at least 1; errors are enlarged by it."""
+        """Ratio (F,) of the residuals to the noise, at least 1; errors are enlarged by it."""
         return np.maximum(1.0, np.sqrt(self.chi2 / self.components))
 
     @property
@@ -79,10 +79,10 @@ def moduli_of_regions(
     The places of the edges are unknown too (`edge_places`).
 
     Args:
-        m: `edges.region_matrices`.
-        waves: what was measured.
-        start: complex modulus of each region (R,) [Pa], of the lowest frequency.
-        progress: told of every iteration: its number, and chi^2 over the number of components.
+        m: from `edges.region_matrices`.
+        waves: the measured waves.
+        start: complex modulus of each region (R,) [Pa] at the lowest frequency.
+        progress: called after every iteration with its number, and with chi^2 per component.
     """
     found, G = [], np.asarray(start, complex)
     for f in range(len(waves.omega)):
@@ -100,9 +100,9 @@ def _one_frequency(m, waves, f, G, progress):
     step, covariance = _gauss_newton(now, labels)
     for k in range(1, ITERATIONS + 1):
         both = step[:R] + 1j * step[R : 2 * R]
-        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # by half of itself at most
+        part = min(1.0, 0.5 / max(np.max(np.abs(both / now.G)), 1e-300))  # at most by half of its value
         new = None
-        # The likeliest edges change with the moduli, and chi^2 by this; within a standard error that is no guide.
+        # The likeliest edges change with the moduli, and so does chi^2: within a standard error it cannot judge a step.
         close = _in_errors(step, covariance, R) < 1
         for _ in range(8):
             if np.all((now.G + part * both).real > 0):
@@ -131,8 +131,9 @@ def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:
 def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Step (2 R + P,) of storage, loss and edges, and their covariance.
 
-    Edges begin each time where the labels have them: by their place the equations are nearly linear. The derivatives by
-        the moduli are taken with these edges too. With the likeliest edges, they would count the errors of the edges
+    In every step the edges start from the labels, because the equations are nearly linear in the places of the edges.
+    The derivatives by the moduli are taken with these edges too. With the likeliest edges, they would count the errors
+    of the edges
         twice: cylinders of 2.5 voxels come out a percent stiffer.
     """
     H = now.hessian + labels
@@ -144,7 +145,7 @@ def _gauss_newton(now: _State, labels: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _of_labels(m: RegionMatrices, R: int) -> np.ndarray:
-    """What the labels say of moduli and of edges: nothing, and the inverse covariance of their patches."""
+    """Inverse covariance that the labels give: 0 for the moduli, and that of the patches for the edges."""
     P = len(m.patches.region)
     out = np.zeros((2 * R + P, 2 * R + P))
     out[2 * R :, 2 * R :] = np.linalg.inv(m.patches.covariance)

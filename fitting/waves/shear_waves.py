@@ -8,12 +8,12 @@ import numpy as np
 
 from liverjax.core.struct import Array, Content, Number
 
-#: Of soft tissue [kg/m^3], where none is given.
+#: Default density [kg/m^3]: that of soft tissue.
 DENSITY = 1060.0
 
 
 def velocity_and_attenuation(storage: Number, loss: Number, omega: Number, density: Number) -> tuple[Array, Array]:
-    """Phase velocity c [m/s] and attenuation alpha [1/m] of the amplitude, of moduli (n,) [Pa]; NumPy or JAX.
+    """Phase velocity c [m/s] and attenuation alpha [1/m] of the amplitude, from moduli (n,) [Pa]; NumPy or JAX.
 
     Args:
         storage, loss: G', G'' [Pa].

@@ -8,9 +8,9 @@ ends when chi^2 is down to the number of equations (discrepancy principle; Moroz
 whitened z is sought by Gauss-Newton.
 
 The uncertainty has two parts. One comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value. The
-other comes from the place of a change in modulus, which is not known exactly. The prior shows a step as a slope over
-its correlation length, or over a brick where that is longer, wherever within the slope the step is. So a place is known
-to this length w, with the variance w^2/12, and c has |w dc/dx|^2/12 of it.
+other comes from the place of a change in modulus, which is not known exactly. The prior turns a step into a slope over
+its correlation length, or over a brick if that is longer. The step may lie anywhere within the slope. So a place is
+known only to this length w, with the variance w^2/12, which adds |w dc/dx|^2/12 to the variance of c.
 """
 
 import time
@@ -34,7 +34,7 @@ from liverjax.core.struct import Content
 
 #: Standard deviations of c to try, from a nearly uniform organ to a free one.
 DEVIATIONS = (0.2, 0.4, 0.8)
-#: Steps of Gauss-Newton for each, and the part of the cost below which one is the last.
+#: Most steps of Gauss-Newton for each, and relative decrease of the cost below which a step is the last.
 STEPS, LAST = 8, 3e-4
 
 
@@ -43,11 +43,11 @@ class WaveMap(NamedTuple):
 
     exponent: np.ndarray  # c (P,) complex at the corners
     sd: np.ndarray  # (P,) complex: of its real part (logarithm of the size), and of its imaginary part (loss angle)
-    posterior_sd: np.ndarray  # (P,) of both, without the place of what varies
+    posterior_sd: np.ndarray  # (P,) of both parts, without the uncertainty of places
     prior_sd: np.ndarray  # (P,)
-    draws: np.ndarray  # (D, P) complex: samples of the posterior, each displaced by what a place is known to
+    draws: np.ndarray  # (D, P) complex: samples of the posterior, displaced within the length w
     modulus: np.ndarray  # (F, P) complex [Pa]
-    deviation: float  # the prior's, chosen
+    deviation: float  # standard deviation of the prior that was chosen
     length: float  # [m]
     chi2: float
     components: int
@@ -63,7 +63,7 @@ class Course(NamedTuple):
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex
     mean: scipy.sparse.csr_array  # (E, P): the corners' mean
-    slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over what a place is known to, along x, y, z
+    slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over the length w along x, y, z
     p: smooth.Prior
     length: float  # [m]
 
@@ -77,7 +77,7 @@ class Course(NamedTuple):
         ]
 
     def jacobians(self, c: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
-        """Derivatives (I, P) by c of the forces out of balance, over the noise."""
+        """Derivatives (I, P) by c of the forces out of balance, divided by the noise."""
         factor = np.exp(self.mean @ c)
         return [
             (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(g * factor) @ self.mean).tocsc() / sd
@@ -93,7 +93,7 @@ class Course(NamedTuple):
         return smooth.to_whitened(self.p, g.real) + 1j * smooth.to_whitened(self.p, g.imag)
 
     def marks(self) -> dict[str, object]:
-        """What another problem would not have, by its name."""
+        """Marks that identify the problem, by name."""
         m, w = self.m, self.waves
         return {
             "length": self.length,
@@ -114,11 +114,11 @@ class _Reached(NamedTuple):
 
 
 class _Begun(NamedTuple):
-    """Where a search stands."""
+    """State of a search."""
 
-    start: _Reached  # of the deviation at hand
+    start: _Reached  # of the current deviation
     point: _Reached  # reached from there
-    visited: list[tuple[_Reached, np.ndarray]]  # ends of the deviations before, with the information of their starts
+    visited: list[tuple[_Reached, np.ndarray]]  # end of each earlier deviation, with `_information` at its start
     history: list[Content]
 
 
@@ -127,7 +127,7 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
 
     Args:
         body, m: the elements and their matrices.
-        waves: what was measured.
+        waves: the measured waves.
         whole: modulus of the whole organ at each frequency (F,) complex [Pa].
         length: correlation length of the prior [m].
     """
@@ -145,11 +145,11 @@ def map_of(
     """The map that explains the waves.
 
     Args:
-        course: `course_of`.
-        file: HDF5 file to which the point of every step is written; None: nowhere.
-        resume: begin from that file if it is there.
+        course: from `course_of`.
+        file: HDF5 file to which the point of every step is written; None: no file.
+        resume: begin from that file if it exists.
         draws: samples of the posterior.
-        progress: told of every step: number of the deviation, chi^2 over the number of equations.
+        progress: called after every step with the index of the deviation, and with chi^2 per equation.
 
     Raises:
         InputError: `file` belongs to another fit.
@@ -185,12 +185,12 @@ def map_of(
 
 
 def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Standard deviations [Pa] of storage (real part) and loss (imaginary part) of moduli G, by those of `WaveMap`."""
+    """Standard deviations [Pa] of storage (real part) and loss (imaginary part) of moduli G, from `WaveMap.sd`."""
     return np.hypot(G.real * sd.real, G.imag * sd.imag) + 1j * np.hypot(G.imag * sd.real, G.real * sd.imag)
 
 
 def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations (P,) with a place that is known to a length; slopes (3, P) are changes over it."""
+    """Standard deviations (P,) with the uncertainty of places; slopes (3, P) are changes over the length w."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
 
 
@@ -204,7 +204,7 @@ def _mean_of_corners(body: VoxelBody) -> scipy.sparse.csr_array:
 def _changes_over_slopes(
     body: VoxelBody, mean: scipy.sparse.csr_array, length: float
 ) -> tuple[scipy.sparse.csr_array, ...]:
-    """Change (P, P) of a field over a length [m], or over a brick's side where that is longer.
+    """Change (P, P) of a field over a length [m], or over a brick's side if that is longer.
 
     At each corner it is the mean of its elements' slopes, by volume.
     """
@@ -241,12 +241,12 @@ def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
 
 
 def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
-    """Try one deviation after another, each from the last field, until chi^2 is that of the noise or stops falling."""
+    """Try one deviation after another, each from the last field, until chi^2 is down to the noise or evidence falls."""
     components = course.m.balances * len(course.waves.omega)
     start, point, visited, history = begun
     while True:
         begin, steps = time.perf_counter(), 0
-        information = _information(course, start)  # the other steps make do with the first one's
+        information = _information(course, start)  # the later steps use it too
         while steps < STEPS:
             steps += 1
             new = _stepped(course, point, information)
@@ -272,7 +272,7 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
-    """The same field as one of the next deviation."""
+    """The same field, written with the next deviation."""
     return _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
 
 
@@ -281,7 +281,7 @@ def _information(course: Course, point: _Reached) -> np.ndarray:
     c = DEVIATIONS[point.k] * course.field(point.z)
     H = np.zeros((len(c), len(c)), complex)
     for J, b in zip(course.jacobians(c, point.here), point.here, strict=True):
-        X = b.whitened(J, np.complex64)  # a Hessian that steers needs no more digits
+        X = b.whitened(J, np.complex64)  # the Hessian only directs steps: it needs no more digits
         H += X.conj().T @ X
     # T^T H T, with T the real matrix of `field`, from both sides.
     half = course.whitened(H)
@@ -322,7 +322,7 @@ _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")
 
 
 def _write(file: Path | None, course: Course, begun: _Begun) -> None:
-    """Write the point reached to a file that is there whole or not at all."""
+    """Write the current point; the file is never left half written."""
     if file is None:
         return
     with whole(file) as new, h5py.File(new, "w") as f:
@@ -342,8 +342,8 @@ def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
             refuse_other(file, f.attrs, course.marks())
             history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
             z, ends = f["z"][:], f["visited"][:]
-    except (OSError, KeyError):  # no HDF5, or of another program
-        raise InputError(f"{file} is of another fit: leave out --resume or name another --out") from None
+    except (OSError, KeyError):  # not HDF5, or from another program
+        raise InputError(f"{file} belongs to another fit: leave out --resume or name another --out") from None
     visited = []
     for end in ends:
         visited.append((_reached(course, end, start.k), _information(course, start)))

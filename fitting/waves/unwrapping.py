@@ -8,11 +8,12 @@ from liverjax.core.errors import InputError
 def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Phases without jumps, NaN where they are not measured; then a note if jumps are left.
 
-    In space by sorting of reliable edges (Herraez et al. 2002, Appl. Opt. 41, 7437). The level of each volume is then
-    known up to multiples of 2 pi. From one instant of the period to the next it is taken to move by less than pi.
+    In space, edges between voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl. Opt. 41,
+    7437). The level of each volume is then known up to multiples of 2 pi. From one instant of the period to the next it
+    is assumed to change by less than pi.
 
     Args:
-        name: of the file, for the sentence.
+        name: name of the file, for the messages.
         phases: (F, T, nx, ny, nz, 3) [rad], T instants of a period.
 
     Raises:

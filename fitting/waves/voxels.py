@@ -28,7 +28,7 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
         origin: centre of the first voxel (3,) [m]; None: 0.
 
     Raises:
-        InputError: a mask that has no room for a brick, or for a node within bricks.
+        InputError: the mask has no room for a brick, or for a node within bricks.
     """
     first = _corner(mask)
     cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
@@ -69,7 +69,7 @@ def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
 def _corner(mask: np.ndarray) -> np.ndarray:
     """First voxel (3,) of the smallest box around the mask."""
     if not mask.any():
-        raise InputError("the mask holds no voxel: give one that is true within the organ")
+        raise InputError("the mask contains no voxel: give one that is true within the organ")
     return np.array([np.flatnonzero(mask.any(axis=tuple(b for b in range(3) if b != a)))[0] for a in range(3)])
 
 

@@ -41,10 +41,10 @@ def read_waves(
 
     Args:
         path: of the displacements.
-        frequencies: [Hz], where the file does not hold them.
-        mask, labels: files of whole numbers on the same voxels, where the file does not hold them.
+        frequencies: [Hz], if the file does not contain them.
+        mask, labels: files of whole numbers on the same voxels, if the file does not contain them.
         unit: of the displacements, one of `UNITS`; default: that of the file, or m.
-        spacing: of the voxels (3,) [m], where the file does not hold it.
+        spacing: of the voxels (3,) [m], if the file does not contain it.
 
     Raises:
         InputError: one sentence naming file, field, value and remedy.
@@ -64,7 +64,7 @@ def read_waves(
     hertz = _hertz(name, frequencies, found.get("frequencies"), len(U))
     origin = np.zeros(3) if found.get("origin") is None else _plain(name, "origin", found["origin"])
     if origin.shape != (3,) or not np.all(np.isfinite(origin)):
-        raise InputError(f"{name}: origin {origin.tolist()} must be three coordinates in metres: mend it")
+        raise InputError(f"{name}: origin {origin.tolist()} must be three coordinates in metres: correct it")
     shape = U.shape[1:4]
     measured = np.asarray(np.isfinite(U).any(axis=(0, 4)))
     chosen = _whole_numbers(name, "mask", found.get("mask"), shape)
@@ -78,7 +78,7 @@ def read_waves(
 
 
 def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray) -> np.ndarray:
-    """The mask or labels of a file of its own, whose voxels have to be those of the waves."""
+    """The mask or labels from a separate file, whose voxels must be those of the waves."""
     values, own = formats.single(file, key)
     if own is not None:
         size = _lengths(str(file), "spacing", own, "its spacing")
@@ -96,8 +96,8 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
     still = np.all(nothing, axis=(0, 4))
     if np.any(still & np.any(U == 0, axis=(0, 4))):
         U[:, still] = np.nan
-        notes.append(f"{still.sum()} voxels that do not move at all are taken as not measured")
-    # A wave may have one direction only, so a component is not taken away.
+        notes.append(f"{still.sum()} voxels that do not move at all count as not measured")
+    # A wave may have one direction only, so a component of zeros is kept.
     resting = np.all(nothing, axis=(0, 1, 2, 3)) & np.any(U == 0, axis=(0, 1, 2, 3))
     for axis in np.array(list("xyz"))[resting]:
         notes.append(f"component {axis} is zero everywhere: write NaN where it was not measured")
@@ -105,17 +105,17 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
 
 
 def with_noise(field: WaveField, noise: float | None) -> WaveField:
-    """The field with this noise [m], or with its own where that is above 0."""
+    """The field with this noise [m], or with its own noise, which must be above 0."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
     if not np.all(field.noise > 0):
-        raise InputError(f"{field.source}: its noise cannot be told from the data: give --noise, in metres")
+        raise InputError(f"{field.source}: its noise cannot be estimated from the data: give --noise, in metres")
     return field
 
 
 def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
     """Complex displacements (F, nx, ny, nz, 3) in the file's unit, and notes."""
-    if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, evenly apart
+    if found.get("phases") is not None:  # (F, T, nx, ny, nz, 3): instants of one period, equally spaced
         u = _instants(name, "phases", found["phases"])
         U = 2 * np.fft.fft(u, axis=-5)[..., 1, :, :, :, :] / u.shape[-5]
     elif found.get("displacement") is not None:
@@ -164,7 +164,7 @@ def _instants(name: str, field: str, values: Numbers) -> np.ndarray:
 def _array_of_numbers(name: str, field: str, values: Numbers) -> np.ndarray:
     a = np.asarray(values)
     if a.dtype.kind not in "fciu":
-        raise InputError(f"{name}: {field} holds {a.dtype}, not numbers: store complex numbers")
+        raise InputError(f"{name}: {field} contains {a.dtype}, not numbers: store complex numbers")
     return a
 
 
@@ -173,7 +173,7 @@ def _plain(name: str, field: str, values: object) -> np.ndarray:
     try:
         return np.asarray(values, float).ravel()
     except (TypeError, ValueError):
-        raise InputError(f"{name}: {field} holds {str(values)[:40]!r}, no numbers: mend it") from None
+        raise InputError(f"{name}: {field} holds {str(values)[:40]!r}, no numbers: correct it") from None
 
 
 def _factor(name: str, unit: str) -> float:
@@ -184,15 +184,15 @@ def _factor(name: str, unit: str) -> float:
 
 def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.ndarray:
     if asked is None and held is None:
-        raise InputError(f"{name}: holds no frequencies: give --frequencies with {number} in Hz, e.g. --frequencies 60")
+        raise InputError(f"{name}: has no frequencies: give --frequencies with {number} in Hz, e.g. --frequencies 60")
     hertz = _plain(name, "frequencies", held if asked is None else asked)
     own = hertz if held is None else _plain(name, "frequencies", held)
     if asked is not None and (len(own) != len(hertz) or not np.allclose(hertz, own)):
-        raise InputError(f"{name}: holds the frequencies {np.ravel(held).tolist()} Hz: leave out --frequencies")
+        raise InputError(f"{name}: has the frequencies {np.ravel(held).tolist()} Hz: leave out --frequencies")
     if len(hertz) != number:
         raise InputError(f"{name}: {len(hertz)} frequencies for {number} fields of displacements: give {number}")
     if not np.all(np.isfinite(hertz) & (hertz > 0)):
-        raise InputError(f"{name}: frequencies {hertz.tolist()} must be above 0 Hz: mend them")
+        raise InputError(f"{name}: frequencies {hertz.tolist()} must be above 0 Hz: correct them")
     if len(np.unique(hertz)) < number:
         raise InputError(f"{name}: frequencies {hertz.tolist()} are not all different: give each field its own")
     return hertz
@@ -200,13 +200,11 @@ def _hertz(name: str, asked: list[float] | None, held: Any, number: int) -> np.n
 
 def _lengths(name: str, field: str, given: object, option: str) -> np.ndarray:
     if given is None:
-        raise InputError(
-            f"{name}: holds no {field}: give {option} with three lengths in metres, e.g. 0.002 0.002 0.002"
-        )
+        raise InputError(f"{name}: has no {field}: give {option} with three lengths in metres, e.g. 0.002 0.002 0.002")
     values = _plain(name, field, given)
     values = np.repeat(values, 3) if len(values) == 1 else values
     if len(values) != 3 or not np.all(np.isfinite(values) & (values > 0)):
-        raise InputError(f"{name}: {field} {values.tolist()} must be three lengths above 0 m: mend them")
+        raise InputError(f"{name}: {field} {values.tolist()} must be three lengths above 0 m: correct them")
     if np.any(values > 0.1):
         raise InputError(f"{name}: {field} {values.tolist()} m is larger than an organ's voxel: give metres, not mm")
     return values
@@ -219,7 +217,7 @@ def _whole_numbers(name: str, field: str, values: object, shape: tuple[int, ...]
     if a.shape != shape:
         raise InputError(f"{name}: {field} has shape {a.shape} and the voxels {shape}: give it on the same voxels")
     if a.dtype.kind not in "biuf" or not np.all(np.isfinite(a)) or np.any(a != np.rint(a)):
-        raise InputError(f"{name}: {field} must hold whole numbers: mend it")
+        raise InputError(f"{name}: {field} must be whole numbers: correct it")
     return a.astype(int)
 
 
@@ -231,8 +229,8 @@ def noise_of(field: WaveField) -> np.ndarray:
     """Standard deviation (F,) [m] of real and imaginary part of one component, from the data themselves.
 
     It is found from fourth differences along the axis on which they are smallest. A smooth wave adds little to them,
-    and a few bad voxels do not change their median. A wave adds (k h)^4 / 8 of its motion: 0.12 % at 20 voxels a wave,
-    4 % at 8. NaN where no five voxels stand in a row.
+    and a few bad voxels do not change their median. A wave adds (k h)^4 / 8 of its motion: 0.12 % at 20 voxels per
+    wavelength, 4 % at 8. It is NaN if no five voxels lie in a row.
     """
     out = np.full(len(field.frequencies), np.nan)
     for f, U in enumerate(field.displacement):
@@ -248,7 +246,7 @@ def noise_of(field: WaveField) -> np.ndarray:
             if d.size >= 30:
                 parts = np.abs(np.concatenate([d.real, d.imag]))
                 own = np.median(parts) / 0.6745 / np.sqrt(np.sum(_FOURTH**2))
-                best = own if np.isnan(best) else min(best, own)  # the axis that sees the least of the wave
+                best = own if np.isnan(best) else min(best, own)  # the axis on which the wave adds least
         out[f] = best
     return out
 
@@ -278,7 +276,7 @@ def coarsened(field: WaveField, stride: int) -> WaveField:
 
 
 def _most_frequent(labels: np.ndarray, stride: int, blocks: tuple[int, ...]) -> np.ndarray:
-    """The label that most voxels of a block have; where two are as frequent, lower and higher ones in turn."""
+    """The label that most voxels of a block have; if two are equally frequent, lower and higher ones in turn."""
     known = np.unique(labels)
     turn = np.where(np.indices(blocks[::2]).sum(axis=0) % 2, 1.0, -1.0)
     counts = [

@@ -1,4 +1,4 @@
-"""How a command ends: its exit code, and one sentence for what stopped it."""
+"""How a command ends: its exit code, and one sentence on the error that stopped it."""
 
 import argparse
 import os
@@ -47,7 +47,7 @@ def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:
     names = [name for name in getattr(options, "optional_files", ()) if _older(options.out / name, begin)]
     if names:
         verb = "is" if len(names) == 1 else "are"
-        print(f"note: {', '.join(names)} in {options.out} {verb} of an earlier run", file=sys.stderr)
+        print(f"note: {', '.join(names)} in {options.out} {verb} from an earlier run", file=sys.stderr)
 
 
 def _older(path: Path, begin: float) -> bool:

@@ -16,14 +16,14 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command = parsers.add_parser(
         "play",
         help="pull a body by the mouse in a browser",
-        description="Serve a page on this machine that shows the body of a scene, moves it a time step a picture, and "
+        description="Serve a page on this machine that shows the body of a scene, moves it a step per picture, and "
         "lets the mouse pull at it.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument("--port", type=int, default=8765, metavar="N", help="of the page (8765; 0: any free one)")
     command.add_argument("--no-browser", action="store_true", help="do not open the page")
     command.add_argument(
-        "--steps", type=int, metavar="N", help="no page: pull at the body for N steps and print steps a second"
+        "--steps", type=int, metavar="N", help="no page: pull at the body for N steps and print steps per second"
     )
     command.set_defaults(run=run)
 

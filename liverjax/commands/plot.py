@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
 
     low, high = options.stretch
     if not 0 < low < 1 < high <= 20:
-        raise InputError(f"--stretch {low:g} {high:g} is no range about 1: give e.g. --stretch 0.6 1.6")
+        raise InputError(f"--stretch {low:g} {high:g} is not a range about 1: give e.g. --stretch 0.6 1.6")
     names = [n for name in options.law for n in (laws.LAWS if name == "all" else [name])]
     labels = [name.rpartition(":")[2] for name in names]
     named = {n if labels.count(k) > 1 else k: gradient_check.load(n) for k, n in zip(labels, names, strict=True)}

@@ -12,7 +12,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         description="Run a scene for every row of a table, and make a reduced model from these runs.",
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
-    command.add_argument("rows", type=Path, metavar="ROWS.csv", help="a header of dotted names, one row a run")
+    command.add_argument("rows", type=Path, metavar="ROWS.csv", help="a header of dotted names, one row per run")
     command.add_argument("--out", type=Path, default=Path("model.h5"), metavar="MODEL.h5", help="the model (model.h5)")
     command.add_argument(
         "--tolerance", type=float, default=1e-4, metavar="X", help="part of the motions that may be left out (1e-4)"
@@ -22,7 +22,7 @@ def add(parsers: argparse._SubParsersAction) -> None:
         "--runs",
         type=int,
         metavar="N",
-        help="of the full model: two thirds are the first rows, then those of the largest stated error (all rows)",
+        help="full runs: two thirds are the first rows, then those of the largest stated error (all rows)",
     )
     command.set_defaults(run=run)
 

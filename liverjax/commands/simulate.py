@@ -26,9 +26,9 @@ def add(parsers: argparse._SubParsersAction) -> None:
     command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
     command.add_argument("--fields", metavar="NAMES", help="fields to write, with commas: cauchy_stress,volume_ratio,…")
     command.add_argument("--reactions", action="store_true", help="write the forces of held parts over time as CSV")
-    command.add_argument("--mesh-error", action="store_true", help="estimate what the mesh leaves out of the result")
+    command.add_argument("--mesh-error", action="store_true", help="estimate the mesh's error in the result")
     command.add_argument(
-        "--about", type=Path, metavar="RESULT.h5", help="of a harmonic scene: the run whose last state moves"
+        "--about", type=Path, metavar="RESULT.h5", help="for a harmonic scene: the run about whose last state it moves"
     )
     add_out(command)
     command.set_defaults(run=run, optional_files=("reactions.csv", "result.png", "vtu"))
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[list[str], bool]:
-    """Names of fields and whether reactions are written: of the command line and of [output] together."""
+    """Names of fields and whether reactions are written, from the command line and from [output] together."""
     import tomllib
 
     from liverjax.jobs import fields
@@ -100,7 +100,7 @@ def _asked_for(options: argparse.Namespace, scene: "Scene", text: str) -> tuple[
 
 
 def _reduced(scene: "Scene") -> tuple["Ran | None", "Scene"]:
-    """The run of a scene that names a reduced model, or None where the full model has to run; and the scene without."""
+    """The run of a scene that names a reduced model, or None if the full model has to run; and the scene without it."""
     if not scene.solve.reduced:
         return None, scene
     from liverjax.core.struct import replace

@@ -19,13 +19,13 @@ def add(parsers: argparse._SubParsersAction) -> None:
     )
     command.add_argument("scene", type=Path, metavar="SCENE.toml")
     command.add_argument(
-        "parameters", type=Path, metavar="PARAMETERS.csv", help="a header of dotted names, one row a run"
+        "parameters", type=Path, metavar="PARAMETERS.csv", help="a header of dotted names, one row per run"
     )
     command.add_argument("--out", type=Path, metavar="FILE.h5", help="the results (PARAMETERS.h5)")
     command.add_argument("--resume", action="store_true", help="go on where a run was stopped")
     command.add_argument("--store", nargs="+", default=["final_positions"], metavar="WHAT", help="|".join(OUTPUTS))
     command.add_argument("--probe", nargs="+", type=int, default=[], metavar="NODE", help="nodes to keep over time")
-    command.add_argument("--rows", nargs="+", type=int, default=[], metavar="N", help="these rows alone, from 1")
+    command.add_argument("--rows", nargs="+", type=int, default=[], metavar="N", help="only these rows, from 1")
     command.add_argument("--chunk", type=int, default=16, metavar="N", help="rows between two writes (16)")
     command.add_argument("--devices", type=int, metavar="N", help="spread the rows over N CPU devices (1)")
     where = "one of several processes; without HOST:PORT N I as the cluster (SLURM) says"
@@ -86,7 +86,7 @@ def _share(given: list[str]) -> tuple[int, int]:
         else:
             jax.distributed.initialize()
         process = (jax.process_index(), jax.process_count())
-        # Rows need no communication: left at once, so that a process that dies stops no other.
+        # Rows need no communication: leave at once, so that a process that dies stops no other.
         jax.distributed.shutdown()
     except (RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

@@ -51,7 +51,7 @@ MOVED = {
 
 
 def keep_loaded(package: str) -> None:
-    """Let `from PACKAGE.MODULE import …` find those moved modules that are loaded already."""
+    """Make moved modules that are loaded importable from their old addresses (`from PACKAGE.MODULE import …`)."""
     for old, new in MOVED.items():
         if old.startswith(f"{package}.") and new in sys.modules:
             sys.modules.setdefault(old, sys.modules[new])
@@ -61,7 +61,7 @@ def moved_module(package: str, name: str) -> ModuleType:
     """The module that was at PACKAGE.NAME.
 
     Raises:
-        AttributeError: there was none.
+        AttributeError: there was no such module.
     """
     if f"{package}.{name}" not in MOVED:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")

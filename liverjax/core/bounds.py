@@ -1,5 +1,6 @@
-"""Check numbers against the bounds that stand beside the fields of a struct, whether they come from files or from
-Python."""
+"""Check the numbers of a struct against the bounds that its fields declare, whether they come from files or from
+Python.
+"""
 
 import dataclasses
 import math
@@ -11,21 +12,21 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 
-#: Fields of regions that may be dictionaries of numbers, which are checked with those of the scene.
+#: Fields of regions that may be dictionaries of numbers; they are checked together with the numbers of the scene.
 _DICTIONARIES = ("law", "viscosity", "porosity")
-#: A list of more numbers is not written out in a sentence: the first bad one is named by its place.
+#: A message lists at most so many numbers; if there are more, it names only the first wrong one and its place.
 _FEW = 8
-#: Of whole numbers, as those of a program are stored.
+#: The largest whole number: compiled programs store 32-bit integers.
 _LARGEST = 2**31 - 1
 
 
 def check(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
-    """Refuse a struct with a number that is out of bounds, not finite or no number; host side, compiles nothing.
+    """Refuse a struct with a value that is out of bounds, not finite or not a number; host side, compiles nothing.
 
     Args:
-        thing: any struct; structs inside it are looked into. What is None or traced is left alone.
-        name: of the struct, put before the names of its fields: ``law`` gives ``law.mu``.
-        leave: fields that have checks of their own.
+        thing: any struct; structs inside it are checked too. Values that are None or traced are skipped.
+        name: name of the struct. It is put before the names of its fields: ``law`` gives ``law.mu``.
+        leave: fields to skip, because they have checks of their own.
 
     Raises:
         InputError: one sentence with dotted name, value, bound and remedy.
@@ -56,12 +57,12 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
     """Refuse a value that a field's `metadata` does not allow, in one sentence that begins with `where`.
 
     Args:
-        where: how the value is called.
-        metadata: of `liverjax.core.struct.param` or `liverjax.core.struct.static`.
-        value: a number, an array, or a sequence of such; a traced one passes.
+        where: name of the value, for the message.
+        metadata: metadata of the field, as `param` or `static` of `liverjax.core.struct` makes it.
+        value: a number, an array, or a sequence of these; traced values pass.
 
     Raises:
-        InputError: not a number, not finite, out of bounds, none of the words that a static field may be.
+        InputError: not a number, not finite, out of bounds, or not one of the words that a static field allows.
     """
     lower = metadata.get("lower")
     if metadata.get("static"):
@@ -77,17 +78,17 @@ def check_bound(where: str, metadata: Mapping, value: object) -> None:
         return
     if type(value) is int and not finite(value):
         raise InputError(f"{where} is a whole number with hundreds of digits: give a smaller one")
-    if type(value) is float or type(value) is int:  # most are: quick, since every run asks
+    if type(value) is float or type(value) is int:  # most values: quick, since every run checks them
         leaves, numbers = [value], None
         least = most = value
     else:
         leaves = jax.tree.leaves(value, is_leaf=lambda v: v is None or isinstance(v, dict))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # a number only under jit or grad
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):  # under jit or grad the value is not known
             return
         numbers = _numbers_of(where, metadata, value, leaves)
         if not numbers.size:
             return
-        least, most = numbers.min(), numbers.max()  # NaN where one number is
+        least, most = numbers.min(), numbers.max()  # NaN if one number is NaN
     above, upper = metadata.get("above"), metadata.get("upper")
     inside = (above is None or least > above) and (lower is None or least >= lower) and (upper is None or most <= upper)
     if not (inside and math.isfinite(least) and math.isfinite(most)) or metadata.get("nonzero"):
@@ -127,7 +128,7 @@ def _numbers_of(where: str, metadata: Mapping, value: object, leaves: list) -> n
 
 
 def _in(unit: str) -> str:
-    """The unit in words; nothing for a number without one."""
+    """The unit in words; an empty text for a number without a unit."""
     return "" if unit == "1" else f" in {unit}"
 
 
@@ -142,7 +143,7 @@ def _shown(where: str, value: Any, numbers: np.ndarray, wrong: np.ndarray) -> st
 
 
 def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
-    """Refuse an array of another shape than one of those allowed, in one sentence; None passes.
+    """Refuse an array whose shape is not one of `allowed`, in one sentence; None passes.
 
     Raises:
         InputError: another shape.
@@ -153,7 +154,7 @@ def check_shape(where: str, value: Any, *allowed: tuple[int, ...]) -> None:
 
 
 def finite(value: float) -> bool:
-    """Whether a number, which may be a whole one of any length, is finite as a float."""
+    """Whether a number is finite as a float; it may be a whole number with any count of digits."""
     try:
         return math.isfinite(value)
     except OverflowError:

@@ -24,23 +24,24 @@ import numpy as np
 from liverjax.core import program_cache
 from liverjax.core.files import whole
 
-#: Packages whose sources the folder's name holds: nothing of another may decide what a program is.
+#: Packages whose sources are part of the folder's name: a program must not depend on code of other packages.
 OWN = ("liverjax.", "fitting.")
 
 
 class _Unknown(Exception):
-    """Something that the key cannot hold: a law of the user's own, a program that calls back."""
+    """Something that the key cannot describe, such as a law of the user's own or a function inside another one."""
 
 
 def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """Compile `function` for arguments like these, on one device. A call with such arguments then only runs it.
 
     Args:
-        function: at the top of a module, or `functools.partial` of one whose keywords are fixed when compiled.
-        arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept.
+        function: defined at the top of a module, or `functools.partial` of such a function; its keywords become
+            constants of the program.
+        arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept on disk.
     """
     folder = program_cache.folder()
-    if folder is None or jax.default_backend() != "cpu":  # elsewhere JAX's own cache serves, until it is measured
+    if folder is None or jax.default_backend() != "cpu":  # other devices use only JAX's own cache so far
         return jax.jit(function).lower(*arguments).compile()
     try:
         file = folder / f"whole_{_function_name(function)}-{_key(function, arguments)}-cache"
@@ -50,7 +51,7 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any
 
 
 def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
-    """Compile on flat lists, whose structure can be written down, and keep the program if that is possible."""
+    """Compile the function for flat lists of arrays, whose structure can be saved, and save the program if possible."""
     structure = jax.tree.structure(arguments)
     shape: list[Any] = []
 
@@ -59,7 +60,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callabl
         shape[:] = [jax.tree.structure(out)]
         return jax.tree.leaves(out)
 
-    # JAX's own cache must not find it nor keep it: a program that was read from disk cannot be written again.
+    # JAX's own cache must not find or store this program: one that was read from disk cannot be written again.
     flat.__name__ = f"program_{uuid.uuid4().hex}"
     keep_from = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", math.inf)
@@ -74,19 +75,19 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callabl
         content = zlib.compress(pickle.dumps((*serialize_executable.serialize(program), example)), 1)
         with whole(file, f".{os.getpid()}.part") as beside:
             beside.write_bytes(content)
-    except Exception:  # calls back, a full disk, another release of JAX: it is compiled, and that is what is needed
+    except Exception:  # callbacks in it, a full disk, another JAX: it is not saved, but it can run
         pass
     return partial(_called, program, shape[0])
 
 
 def _found(file: Path) -> Callable[..., Any] | None:
-    """The program in a file; `None` where there is none that can be read."""
+    """The program in a file; `None` if there is no program that can be read."""
     if not file.exists():
         return None
     try:
         from jax.experimental import serialize_executable
 
-        # XLA finds LAPACK where SciPy has it, and JAX tells it where at the first factorisation that is lowered.
+        # XLA uses SciPy's LAPACK, which JAX registers only when a factorisation is lowered for the first time.
         jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.result_type(float)))
         kept, given, taken, example = pickle.loads(zlib.decompress(file.read_bytes()))
         program = serialize_executable.deserialize_and_load(kept, given, taken, execution_devices=jax.devices()[:1])
@@ -104,7 +105,7 @@ def _function_name(function: Callable[..., Any]) -> str:
 
 
 def _top(function: Any) -> str:
-    """Name of a function at the top of a module, which the sources define. One inside another function is unknown."""
+    """Name of a function at the top of a module, which the sources define; one inside another raises `_Unknown`."""
     module, name = function.__module__, function.__qualname__
     if not module.startswith(OWN) or not name.isidentifier():
         raise _Unknown
@@ -112,7 +113,7 @@ def _top(function: Any) -> str:
 
 
 def _key(function: Callable[..., Any], arguments: tuple) -> str:
-    """Digest of all that decides what the program is, except the sources."""
+    """Digest of everything that the program depends on, except the sources."""
     fixed = function.keywords if isinstance(function, partial) else {}
     if isinstance(function, partial) and function.args:
         raise _Unknown
@@ -122,7 +123,7 @@ def _key(function: Callable[..., Any], arguments: tuple) -> str:
 
 
 def _said(thing: Any, static: bool = False) -> Any:
-    """The text of all that a program depends on: types, static values, and the shapes of all other numbers."""
+    """Describe, for the key, what a program depends on: types, static values, and the shapes of all other numbers."""
     if thing is None or isinstance(thing, (str, bool)):
         return repr(thing)
     if isinstance(thing, FunctionType) and static:

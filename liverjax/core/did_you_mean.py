@@ -1,4 +1,4 @@
-"""Words of users: what is no word, and the hint at the end of a sentence that refuses an unknown one."""
+"""Check words that users write, and end the message about an unknown word with a hint."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from liverjax.core.errors import InputError
 
 
 def hint(word: str, known: Iterable[str]) -> str:
-    """The end of a sentence about an unknown word: the nearest known word, or all where none is near."""
+    """The end of a sentence about an unknown word: the nearest known word, or all known words if none is near."""
     words = list(known)
     longer = [name for name in words if len(word) > 2 and name.startswith(word)]
     near = longer or difflib.get_close_matches(word, words, n=1, cutoff=0.5 if len(word) < 4 else 0.6)
@@ -18,12 +18,12 @@ def as_word(value: object, where: str) -> str:
     """Return the value if it is text; call this before a word is looked up.
 
     Args:
-        value: of a scene file.
-        where: how it is called.
+        value: a value of a scene file.
+        where: its name, for the message.
 
     Raises:
-        InputError: anything else.
+        InputError: the value is not text.
     """
     if not isinstance(value, str):
-        raise InputError(f"{where} = {value!r} is no text: write one word in quotes")
+        raise InputError(f"{where} = {value!r} is not text: write one word in quotes")
     return value

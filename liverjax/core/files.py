@@ -1,6 +1,6 @@
-"""Folders for results, tried before anything is computed; files that are there whole or not at all.
+"""Folders for results, tested before anything is computed; files that are written completely or not at all.
 
-Marks of a problem in the file of its progress let a run go on from a file of its own problem alone.
+A file of progress stores marks (digests) of its problem, so that a run continues only from a file of the same problem.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ from liverjax.core.errors import InputError
 
 
 def writable(out: Path, files: tuple[str, ...]) -> None:
-    """Make the folder `out` and try to write into it, where `files` are going to be.
+    """Make the folder `out` for the results `files`, and test whether it can be written.
 
     Raises:
         InputError: `out` is a file or cannot be written, or one of `files` is a folder.
@@ -37,11 +37,11 @@ def writable(out: Path, files: tuple[str, ...]) -> None:
 def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
     """Give a temporary path beside `file` to write to; at the end it is renamed to `file`.
 
-    A kill leaves `file` as it was. An error leaves it as well, and removes the new file.
+    If the process is killed, `file` stays as it was. After an error it stays too, and the temporary file is removed.
 
     Args:
-        file: what is to be there whole or not at all.
-        ending: of the path beside; one of its own for each process where several may write `file`.
+        file: the file to be written completely or not at all.
+        ending: suffix of the temporary path. If several processes may write `file`, each needs a suffix of its own.
     """
     beside = file.with_suffix(ending)
     try:
@@ -53,7 +53,7 @@ def whole(file: Path, ending: str = ".part") -> Iterator[Path]:
 
 
 def mark_of(*arrays: object) -> str:
-    """A text that is the same for equal arrays only (SHA-256 of kind, shape and bytes)."""
+    """A text that is equal for equal arrays only (SHA-256 of type, shape and bytes)."""
     found = hashlib.sha256()
     for a in map(np.asarray, arrays):
         found.update(f"{a.dtype} {a.shape}".encode() + np.ascontiguousarray(a).tobytes())
@@ -61,10 +61,10 @@ def mark_of(*arrays: object) -> str:
 
 
 def refuse_other(file: Path, held: Mapping[str, object], marks: Mapping[str, object]) -> None:
-    """`InputError` where the marks that `file` holds are not these; it names the ones that differ."""
+    """Raise `InputError` if the marks `held`, read from `file`, differ from `marks`; it names those that differ."""
     other = [name for name, own in marks.items() if held.get(name) != own]
     if other:
         raise InputError(
-            f"{file} is of another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): leave out --resume or "
-            "name another --out"
+            f"{file} belongs to another fit ({', '.join(other)} differ{'s' * (len(other) == 1)}): leave out --resume "
+            "or name another --out"
         )

@@ -22,8 +22,8 @@ def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> t
 
     Args:
         value: rows `[[t, factor], …]` or `[[t, x, y, z], …]`; or a CSV file with columns time,factor or time,x,y,z.
-        name: of what has the history, for messages.
-        forms: how many numbers a time it may have.
+        name: name of the load or motion with this history, for messages.
+        forms: the allowed counts of numbers for each time.
 
     Raises:
         InputError: a file that cannot be read, wrong columns, numbers that are not finite, times that do not increase.
@@ -40,7 +40,7 @@ def read_history(value: object, name: str, forms: tuple[int, ...] = (1, 3)) -> t
         except (TypeError, ValueError, OverflowError):
             data = np.empty(0)
         if data.ndim != 2 or data.shape[1] - 1 not in forms:
-            raise InputError(f"{where} is no table of numbers: write {wanted}, or name a CSV file")
+            raise InputError(f"{where} is not a table of numbers: write {wanted}, or name a CSV file")
     if not len(data) or not np.all(np.isfinite(data)) or not np.all(np.diff(data[:, 0]) > 0):
         raise InputError(f"{where} must hold finite numbers at increasing times: sort and fill it")
     numbers = data[:, 1] if data.shape[1] == 2 else data[:, 1:]
@@ -51,12 +51,12 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     kinds = [_FACTOR if n == 1 else _VECTOR for n in forms]
     wanted = " or ".join(",".join(kind) for kind in kinds)
     try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a mark before the first name
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark first
     except OSError as error:
         raise InputError(f"{name} history {path} cannot be read ({error.strerror}): give columns {wanted}") from None
     except UnicodeDecodeError:
         raise InputError(f"{name} history {path} is not text: give columns {wanted}") from None
-    # NumPy takes a comment on the first line for the names.
+    # NumPy would read a comment on the first line as the names of the columns.
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         raise InputError(f"{name} history {path} is empty: give columns {wanted}")
@@ -64,7 +64,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     if len(commas) > 1 or commas == {0}:
         why = "has rows of different lengths" if len(commas) > 1 else "has one column"
         raise InputError(
-            f"{name} history {path} {why}: give columns {wanted}, with commas between them and points in numbers"
+            f"{name} history {path} {why}: give columns {wanted}, separated by commas, with decimal points"
         )
     data = np.atleast_1d(np.genfromtxt(lines, delimiter=",", names=True))
     found = next((kind for kind in kinds if set(kind) <= set(data.dtype.names or ())), None)
@@ -77,7 +77,7 @@ def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) 
     """Refuse a history made in Python that cannot be used; traced numbers pass.
 
     Raises:
-        InputError: one of times and history without the other, shapes that do not go together, times that fall.
+        InputError: times without history or the reverse, shapes that do not match, times that do not increase.
     """
     if (times is None) != (history is None):
         raise InputError(f"{name} needs both times and history, or none of them: give the other")

@@ -35,7 +35,7 @@ class PathStep(NamedTuple):
 
 
 def get(thing: Any, name: str, refusal: str) -> Any:
-    """Return what stands at a dotted name. `walk` explains arguments and errors."""
+    """Return the value at a dotted name. `walk` explains arguments and errors."""
     return walk(thing, name, refusal)[-1].inside()
 
 
@@ -53,10 +53,10 @@ def metadata(thing: Any, name: str, refusal: str) -> dict[str, object]:
 
 
 def walk(thing: Any, name: str, refusal: str) -> list[PathStep]:
-    """All steps from `thing` to what a dotted name means.
+    """All steps from `thing` to the value at a dotted name.
 
     Args:
-        thing: a struct. Static fields and those that are None have no name.
+        thing: a struct. Static fields, and fields that are None, cannot be named.
         name: fields, places in tuples and arrays, entries of dictionaries; fields declared `unnamed` are left out.
         refusal: the beginning of the sentence that refuses a name.
 

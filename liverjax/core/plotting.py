@@ -4,13 +4,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
-#: Okabe and Ito's, distinct for every kind of colour vision.
+#: The colours of Okabe and Ito, distinct for every kind of colour vision.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
 def pyplot() -> Any:
-    """Matplotlib's `pyplot`, which needs no screen here; imported only where a picture is drawn, as that takes long."""
+    """Matplotlib's `pyplot`, set to work without a screen; imported only for a picture, because the import is slow."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -25,6 +25,6 @@ def import_meanwhile() -> None:
 
 
 def save(figure: Any, file: Path) -> None:
-    """Write a figure to a file and forget it."""
+    """Write a figure to a file and close it."""
     figure.savefig(file, dpi=150)
     pyplot().close(figure)

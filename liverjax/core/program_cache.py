@@ -1,6 +1,6 @@
 """Compiled programs kept on disk, so that a machine compiles a program once: JAX's own cache, in a folder of its own.
 
-The folder is one of the user's cache directory. Its name has the releases, the sources and the processor, so no other
+The folder is in the user's cache directory. Its name states the releases, the sources and the processor, so no other
 release, checkout or machine uses its programs. `LIVERJAX_CACHE` names another folder, or is "off".
 """
 
@@ -15,9 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 SWITCH = "LIVERJAX_CACHE"
-#: Bytes on disk above which the next command removes what was longest not used; one program takes 10 kB to 1 MB.
+#: Bytes on disk; above, the next command removes programs that were not used for longest. One takes 10 kB to 1 MB.
 LIMIT = 500_000_000
-#: Seconds: what compiles faster is not kept. Finding a program takes a few milliseconds.
+#: Programs that compile in fewer seconds are not kept. Finding a program takes a few milliseconds.
 WORTH_KEEPING = 0.05
 
 
@@ -25,7 +25,7 @@ _in_use: list[Path] = []
 
 
 def folder() -> Path | None:
-    """Where programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
+    """The folder where programs are kept now; `None` outside of `kept_on_disk`, or without a cache."""
     return _in_use[-1] if _in_use else None
 
 
@@ -63,15 +63,15 @@ def _switch_on(folder: Path) -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
-    # JAX itself sets the second to 1.
+    # JAX itself sets TF_CPP_MIN_LOG_LEVEL to 1.
     if "JAX_LOGGING_LEVEL" not in os.environ and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
-        # XLA writes an error for every CPU program that it reads: it takes two of its own tuning flags for features
-        # that the processor lacks. The folder is this processor's own.
+        # XLA writes an error for every CPU program that it reads: it mistakes two of its own tuning flags for features
+        # that the processor lacks. The folder is only for this processor, so the error has no meaning here.
         jax.config.update("jax_logging_level", "CRITICAL")
 
 
 def _folder() -> Path | None:
-    """The folder for these releases, sources and this processor, made where it was not; `None` without a cache."""
+    """The folder for these releases, sources and this processor, made if missing; `None` without a cache."""
     chosen = os.environ.get(SWITCH, "")
     if chosen.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return None
@@ -94,11 +94,11 @@ def _user_cache() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # a relative one counts for nothing: XDG's rule
+    return given if given.is_absolute() else Path.home() / ".cache"  # XDG's rule: ignore relative paths
 
 
 def _name() -> str:
-    """Releases in words; sources and processor as a digest."""
+    """Name of the folder: the releases in words, and a digest of sources and processor."""
     import liverjax
 
     package = Path(liverjax.__file__).parent
@@ -139,7 +139,7 @@ def bound(root: Path, limit: int = LIMIT) -> None:
             found = entry.stat()
         except OSError:  # another process was faster
             continue
-        # When a file was last read is not noted everywhere: then it counts when it was written.
+        # Not every file system records when a file was last read: then the time of writing counts.
         entries.append((max(found.st_atime, found.st_mtime), found.st_size, entry))
     left = sum(size for _, size, _ in entries)
     for _, size, entry in sorted(entries):

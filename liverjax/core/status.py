@@ -13,7 +13,7 @@ ONE_STEP = 8
 ADVICE = {
     CONVERGED: "converged",
     STALLED: "the residual stopped falling above the tolerance: take a looser one (in float32, or with very stiff "
-    "springs, digits may allow no less), float64, or smaller steps",
+    "springs, rounding may allow no smaller residual), float64, or smaller steps",
     NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
     "continued_below",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles or collapses): "
@@ -21,8 +21,8 @@ ADVICE = {
     INVERTED: "in equilibrium, but with inverted elements, which no body has: take smaller loads, a stiffer volumetric "
     "energy or a finer mesh",
     STEP_CUT: "the step was halved as often as allowed and still failed: take smaller steps, robust = 'projected', "
-    "kind = 'dynamic' where the body buckles or topples, or a softer obstacle where one has a stiffness of its own",
-    GRADIENT_UNCONVERGED: "the derivative was taken through a step that did not converge, so it is not that of a "
+    "kind = 'dynamic' where the body buckles or topples, or a lower stiffness of an obstacle that sets its own",
+    GRADIENT_UNCONVERGED: "the derivative passes through a step that did not converge, so it is not the one of a "
     "solution: mend the run first (Result.status)",
     ADJOINT_FAILED: "the linear solves of the derivative did not converge and it is not finite: take "
     "linear_solver = 'direct' or smaller steps",

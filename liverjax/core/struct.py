@@ -1,4 +1,4 @@
-"""Frozen dataclasses that are JAX pytrees, with unit and bounds beside each parameter."""
+"""Frozen dataclasses that are JAX pytrees, with unit and bounds for each parameter."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,24 +9,25 @@ import jax
 import numpy as np
 
 T = TypeVar("T")
-#: One number, or an array of one for each element or sample; it may be traced.
+#: One number, or an array with one number per element or sample; it may be traced.
 Number = float | np.ndarray | jax.Array
 #: Numbers as a user writes them: one, a sequence of them, or an array.
 Numbers = Number | Sequence[float] | Sequence[Sequence[float]]
-#: An array of the host or of the program.
+#: An array on the host (NumPy) or of a program (JAX).
 Array = np.ndarray | jax.Array
 #: Numbers of nodes, elements or triangles.
 Indices = Array
-#: What a TOML file has under a heading, or what goes into a JSON file: values are checked where they are read.
+#: The table under a heading of a TOML file, or the content of a JSON file; values are checked where they are read.
 Content = dict[str, Any]
 
 
 def static(
     default: Any = dataclasses.MISSING, about: str = "", *, lower: int | None = None, words: Sequence[str] = ()
 ) -> Any:
-    """A field that is part of the structure (a tag, a count): changing it compiles anew, it has no gradient.
+    """A field that is part of the structure (a tag, a count): a change compiles anew, and there is no gradient.
 
-    With `lower` it is a whole number, at least that; with `words` it is one of them (see `liverjax.core.bounds`).
+    With `lower` it must be a whole number, `lower` or more; with `words` it must be one of them (see
+    `liverjax.core.bounds`).
     """
     metadata = {"static": True, "about": about, "lower": lower, "words": tuple(words)}
     return dataclasses.field(default=default, metadata=metadata)
@@ -52,10 +53,11 @@ def param(
         about: one line for ``python -m liverjax laws``.
         lower, upper: inclusive bounds; ``above``: strict lower bound.
         nonzero: 0 is refused. `liverjax.core.bounds.check` reads all of these.
-        each: a sequence, one number a term (or the components of a direction).
-        unnamed: structs inside it; the dotted names of scene files leave this field out. A text is the method that
-            gives the places in this field of what a word names: `support.0` is the first of ``named("support")``.
-        typical: value for a soft tissue of about 1 kPa shear modulus, used where a law is asked for by name alone.
+        each: a sequence with one number per term (or the components of a direction).
+        unnamed: the field contains structs, and the dotted names of scene files leave out the field itself. A text
+            names a method that returns the places in this field for a word: `support.0` is the first of
+            ``named("support")``.
+        typical: value for a soft tissue of about 1 kPa shear modulus, used if a law is given by its name alone.
         default: as in `dataclasses.field`.
     """
     metadata = {

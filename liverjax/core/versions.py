@@ -1,11 +1,11 @@
-"""Releases of what computed a result."""
+"""Versions of the software that computed a result."""
 
 import platform
 from importlib.metadata import version
 
 
 def versions() -> dict[str, str]:
-    """Python, liverjax, jax, jaxlib, numpy and scipy."""
+    """Versions of Python, liverjax, jax, jaxlib, numpy and scipy."""
     import liverjax
 
     own = {"python": platform.python_version(), "liverjax": liverjax.__version__}

@@ -1,4 +1,4 @@
-"""How the volume of an element changes with its nodes, and its smallest value."""
+"""Volume ratios J of elements, and their derivatives with respect to the positions of nodes."""
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +10,14 @@ from liverjax.tensors.matrices import Matrix, Vector, cofactor, deformation_grad
 
 
 def volume_gradients(mesh: TetMesh, F: Matrix) -> list[Vector]:
-    """cof(F) D_a = dJ/dx_a of the four corners of every point."""
+    """dJ/dx_a = cof(F) D_a for the four corners at every point."""
     cof = cofactor(F)
     g = [matvec(cof, tuple(mesh.gradients[a])) for a in range(3)]
     return [tuple(-(x + y + z) for x, y, z in zip(*g, strict=True)), *g]
 
 
 def volume_ratios(mesh: TetMesh, x: jax.Array) -> jax.Array:
-    """J of every element at positions x (V, 3) [m]: (1, E), or (Q + 4, E) at points and vertices of quadratic ones.
+    """J of every element at positions x (V, 3) [m]: (1, E), or if quadratic (Q + 4, E) at points and vertices.
 
     A quadratic element may be folded between its points, although it is not folded at them. The vertices show it first.
     """

@@ -5,7 +5,7 @@ Chapter, section 4.1.2, with J treated as one more invariant and the scalars sum
     f_i  = V0 sum_a W_a v_a,i                                             v_a,i = dI_a/dx_i
     K_ij = V0 [ sum_ab W_ab v_a,i (x) v_b,j + sum_a W_a d2I_a/dx_i dx_j ]
 
-so the cost does not grow with the number of terms g^k h^k. No matrix is inverted. All functions take the force as the
+so the cost does not grow with the number of terms g^k h^k. No matrix is inverted. In all functions the force is the
 gradient of the energy, f = + dW/dx (the chapter's nodal force is its negative).
 
 A linear element has one point. At each point of a quadratic element the same terms hold, for the corners that
@@ -64,9 +64,9 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
 def element_stiffness(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:
-    """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 of every point, 45 different numbers each.
+    """Blocks {(a, b): K_ab} [N/m] of corners 1 <= a <= b <= 3 at every point: 45 different numbers per point.
 
-    `terms` is "contracted", or "chapter" for its six terms a product (`liverjax.laws.terms.chapter_terms`).
+    `terms` is "contracted", or "chapter" for the chapter's six terms per product (`liverjax.laws.terms.chapter_terms`).
     The other blocks follow from symmetry, K_ba = K_ab^T, and from K_0b = -(K_1b + K_2b + K_3b).
     """
     F, pairs = stored(deformation_gradient(mesh, x)), tuple((a - 1, b - 1) for a, b in _PAIRS)
@@ -104,7 +104,7 @@ _ENTRIES = [(a, b, r, c) for a, b in _PAIRS for r in range(3) for c in range(r i
 
 
 def _expansion() -> np.ndarray:
-    """(45, 144): the element matrix as sums of its 45 different entries, signs and all."""
+    """Matrix (45, 144) that expands the 45 different entries, with their signs, to the element matrix."""
     basis = dict(zip(_ENTRIES, np.eye(45), strict=True))
     blocks = {
         (a, b): tuple(
@@ -141,7 +141,7 @@ def of_nodes(order: int, corners: jax.Array) -> jax.Array:
 
 def sparse(mesh: TetMesh, entries: np.ndarray) -> "scipy.sparse.csr_array":
     """Global matrix (3V, 3V) of element matrices (E, 9 n^2) of n nodes, degree of freedom 3 * node + component."""
-    import scipy.sparse  # a fifth of the time that importing the package takes
+    import scipy.sparse  # here, since it takes a fifth of the package's import time
 
     nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)
     dofs = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
@@ -157,7 +157,8 @@ def stiffness_matrix(
 
     Args:
         mesh, law, x: as in `internal_force`.
-        regularised: section 4.1.2 iii, trace kept; changes the path of a Newton iteration, never its root.
-        terms: "contracted", or "chapter": its six terms for every product g(I1, I2) h(J), the same to roundoff.
+        regularised: use the regularisation of section 4.1.2 iii, with the trace kept. It changes the path of a Newton
+            iteration, never its root.
+        terms: "contracted", or "chapter" for the chapter's six terms per product g(I1, I2) h(J), equal to roundoff.
     """
     return sparse(mesh, np.asarray(element_matrices(mesh, law, x, regularised, terms)))

@@ -48,7 +48,7 @@ class Frame(NamedTuple):
 
 
 def frame(F: Matrix) -> Frame:
-    """Signed singular values of a tuple matrix F, largest first; any axes where some are 0."""
+    """Signed singular values of a tuple matrix F, largest first; the axes of values that are 0 are arbitrary."""
     _, axes = principal(F)
     n = list(transpose(axes))
     f = [matvec(F, a) for a in n]
@@ -58,7 +58,7 @@ def frame(F: Matrix) -> Frame:
         f[i], f[j] = _chosen(swap, f[j], f[i]), _chosen(swap, scale(-1.0, f[i]), f[j])
     one, zero = jnp.ones_like(f[0][0]), jnp.zeros_like(f[0][0])
     u1 = _unit(f[0], (one, zero, zero))
-    # Least along the axis that u1 has least of.
+    # Perpendicular to u1, from a coordinate axis that is not near u1.
     small = abs(u1[0]) < 0.8
     aside = cross(u1, (jnp.where(small, one, zero), jnp.where(small, zero, one), zero))
     rest = add(f[1], scale(-dot(f[1], u1), u1))
@@ -89,11 +89,11 @@ def blocks(
 
     Args:
         parts: weights and laws that add up.
-        S: constant second Piola-Kirchhoff stress beside them, or None.
+        S: constant second Piola-Kirchhoff stress that is added, or None.
         F: tuple matrix.
         D: shape vectors of the nodes.
         pairs: which blocks, as indices into D.
-        volume: derivatives of a volumetric energy beside them, or None.
+        volume: derivatives of a volumetric energy that is added, or None.
     """
     if any(law.subsets is not None for _, law in parts):
         return _by_subset(parts, S, F, D, pairs, volume)
@@ -149,7 +149,7 @@ def regularised(
     pairs: tuple[tuple[int, int], ...],
     volume: Scalars | None = None,
 ) -> list[Matrix]:
-    """The same with the chapter's regularisation in place of the projection. Eigenvalues may still be negative."""
+    """`blocks` with the chapter's regularisation instead of the projection. Eigenvalues may still be negative."""
     result = [_diagonal_matrix(jnp.zeros_like(F[0][0]) if S is None else dot(D[i], matvec(S, D[j]))) for i, j in pairs]
 
     def with_more(weight: Number, state: invariant_terms.State | invariant_terms.Pieces) -> list[Matrix]:

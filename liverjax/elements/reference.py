@@ -1,6 +1,7 @@
-"""The oracle: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
+"""The reference: force and stiffness by automatic differentiation of the energy, and by standard finite elements.
 
-Independent of the hand-derived terms: everything here starts from `law.strain_energy` alone. Slow on purpose.
+Independent of the hand-derived terms: everything here starts from `law.strain_energy` alone. Speed does not matter
+here.
 """
 
 from typing import TYPE_CHECKING

@@ -14,7 +14,7 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
     """``law.mu=500:1000`` as {name: (low, high)}.
 
     Raises:
-        InputError: no range, not of numbers, from high to low, a name twice.
+        InputError: a text that is not a range of numbers, a range that does not rise, a name given twice.
     """
     ranges: dict[str, tuple[float, float]] = {}
     for text in given:
@@ -22,7 +22,7 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
         try:
             low, high = (float(v) for v in span.split(":"))
         except ValueError:
-            raise InputError(f"{text!r} is no range: write name=low:high, e.g. law.mu=500:1000") from None
+            raise InputError(f"{text!r} is not a range: write name=low:high, e.g. law.mu=500:1000") from None
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"{text!r} does not rise: write name=low:high, e.g. law.mu=500:1000")
         if not name.strip():
@@ -38,9 +38,9 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
 
     Args:
         ranges: low and high of every parameter.
-        rows: how many; of a grid as many along each parameter as fit into that, two at least.
-        kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2), scipy's.
-        seed: of the random ones.
+        rows: number of rows; a grid has as many values of each parameter as fit into it, at least two.
+        kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2), from SciPy.
+        seed: seed of "latin" and "sobol".
 
     Raises:
         InputError: an unknown kind, no rows.

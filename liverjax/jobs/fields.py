@@ -52,8 +52,8 @@ def fields(scene: Scene, result: Result, names: list[str]) -> dict[str, np.ndarr
     largest, volume_ratio J, energy [Pa] of the law per reference volume, fluid_velocity (3,) [m/s] through the body.
 
     Args:
-        scene: of the run.
-        result: of the run.
+        scene: the scene of the run.
+        result: the result of the run.
         names: some of `FIELDS`.
 
     Raises:
@@ -79,7 +79,7 @@ def _put_again(scene: Scene, sizes: Sizes, state: State, given: Any) -> tuple[St
     k, x, pressure = given
     mesh, e = scene.mesh, equations(scene, state, k, sizes)
     F = deformation_gradient(mesh, x)
-    if e.mixed is not None:  # no result keeps them, but at a solution they follow from the volumes
+    if e.mixed is not None:  # not in the result, but at a solution they follow from the volumes
         pressure = e.mixed.settled(mesh, determinant(F))
     P = _whole_stress(e, F, pressure)
     law = law_at_rest(scene)
@@ -105,7 +105,7 @@ def _whole_stress(e: Equations, F: Matrix, pressure: jax.Array) -> Matrix:
 
 
 def _velocity(scene: Scene, F: Matrix, pressure: jax.Array) -> jax.Array:
-    """Darcy's: minus permeability times the gradient of the pressure in space, (3, Q, E) [m/s]."""
+    """Darcy's velocity: minus permeability times the gradient of the pressure in space, (3, Q, E) [m/s]."""
     mesh: TetMesh = scene.mesh
     corner, g, J = pressure[mesh.tetrahedra.T], volume_gradients(mesh, F), determinant(F)
     of = corner if mesh.order == 1 else corner[:, None]

@@ -1,7 +1,7 @@
 """A run in parts of some steps: finished parts stay on disk, and a killed run goes on from there.
 
-Beside the output stands a folder with one file a part: its rows, and the state after its last step. A part begins with
-a tangent of its own, whether the run was stopped before it or not, so a resumed run ends with the same numbers.
+A folder beside the output has one file per part: its rows, and the state after its last step. Every part begins with a
+new tangent, whether or not the run was stopped before it, so a resumed run ends with the same numbers.
 """
 
 import time
@@ -28,7 +28,7 @@ _ROWS = ("times", "positions", "reactions", "pressure", "status")
 
 
 class Ran(NamedTuple):
-    """A finished run and the time it took. Parts found on disk cost nothing."""
+    """A finished run and the time it took. Parts found on disk take no time."""
 
     result: Result  # numpy arrays
     steps: int  # computed now
@@ -48,15 +48,15 @@ def run(
 
     Args:
         scene: `Scene`.
-        text: the scene file; results of another file are not continued.
+        text: content of the scene file; results of another scene file are not continued.
         out: file of the results, which the caller writes before it removes `resumable_parts.beside(out)`.
-        every: steps a part.
-        resume: go on with the parts that are there.
+        every: steps per part.
+        resume: continue from the parts on disk.
         report: called with the number of every finished step, those found on disk too, at the end of each part: JAX
             keeps no program on disk that calls back while it runs.
 
     Raises:
-        InputError: parts that are there without `resume`, of another scene, or in use by another process.
+        InputError: parts on disk without `resume`, parts of another scene, or parts in use by another process.
         OSError: the disk is full; finished parts are kept.
     """
     steps, folder = scene.solve.steps, resumable_parts.beside(out)
@@ -69,7 +69,7 @@ def run(
         return _run_parts(scene, steps, None, report)
     resumable_parts.make_folder(folder)
     with resumable_parts.locked(folder / "lock_0"):
-        # The text names files, of a mesh or a history, that may change behind it: so all numbers count as well.
+        # The text names files (mesh, history) whose content may change, so all numbers are compared too.
         numbers = resumable_parts.digest(*jax.tree.leaves(scene))
         resumable_parts.same(
             {"scene": text, "numbers": numbers, "every": every, "versions": versions()}, folder / "run.json"

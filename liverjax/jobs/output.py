@@ -20,9 +20,9 @@ from liverjax.simulation.run import Result
 if TYPE_CHECKING:
     import h5py
 
-#: What a result has one number a step of.
+#: Parts of a result with one number per step.
 BY_STEP = ("status", "iterations", "linear_iterations", "cuts", "residual")
-#: HDF5 takes 64 kB in an attribute, with its name and shape.
+#: HDF5 allows 64 kB for an attribute, with its name and shape.
 _MOST_IN_ATTRIBUTE = 65_000
 
 
@@ -35,8 +35,8 @@ def write_hdf5(
 ) -> None:
     """Rows, mesh and `fields` (T, E, …) as datasets; status, iterations and `attributes` as attributes.
 
-    What is one number a step becomes a dataset where it is too long for an attribute: `read_by_step` finds both. The
-    nodes of quadratic tetrahedra (E, 10) stand in the order of VTK.
+    An array with one number per step becomes a dataset if it is too long for an attribute: `read_by_step` finds both.
+    The nodes of quadratic tetrahedra (E, 10) are in the order of VTK.
     """
     import h5py
 
@@ -82,7 +82,7 @@ def write_reactions(file: Path, scene: Scene, result: Result) -> None:
 
 
 def write_vtu(folder: Path, scene: Scene, result: Result, fields: dict[str, np.ndarray] | None = None) -> Path:
-    """One VTU file a step with displacements, reactions and fields, and the series that ParaView opens."""
+    """One VTU file per step with displacements, reactions and fields, and the series that ParaView opens."""
     import meshio
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,7 @@ class Surface(NamedTuple):
     title: str
 
 
-#: Of each field: the number that is drawn, and its name.
+#: Field -> name of the number that is drawn.
 DRAWN = {
     "cauchy_stress": "von Mises stress [Pa]",
     "green_strain": "largest principal strain [1]",
@@ -95,7 +95,7 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
             if name == "pressure":
                 values = data["pressure"][step - 1]
     except (OSError, KeyError) as error:
-        raise InputError(f"{file} is no result of liverjax simulate ({error}): give its result.h5") from None
+        raise InputError(f"{file} is not a result of liverjax simulate ({error}): give its result.h5") from None
     V = int(tets.max()) + 1
     if name == "displacement":
         values, label = np.linalg.norm(after - before, axis=1), "displacement [m]"
@@ -106,7 +106,7 @@ def of_result(file: Path, name: str, step: int | None = None) -> Surface:
 
 
 def _drawn_number(name: str, values: np.ndarray) -> np.ndarray:
-    """One number a vertex (V,) of a field (V, …)."""
+    """One number per vertex (V,) of a field (V, …)."""
     if name == "cauchy_stress":
         deviator = values - np.trace(values, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
         return np.sqrt(1.5 * np.sum(deviator**2, axis=(1, 2)))

@@ -19,7 +19,7 @@ from liverjax.simulation.run import Result, prepared
 def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]:
     """Time, and the force of each part that holds the body over time: column names and rows.
 
-    Of obstacles also their displacement and the largest depth of the surface in them.
+    For obstacles also their displacement, and the largest depth of the surface in them.
     """
     names, columns = ["time"], [np.asarray(result.times)]
 
@@ -68,7 +68,7 @@ def _held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
         if physics.axis:
             found[f"support.{k}"] = along(nodes, [AXES.index(physics.axis)])
             continue
-        # An oblique normal counts where it is free to act: elsewhere all of its axes are held already.
+        # An oblique normal counts at nodes where it acts: at others all of its axes are held already.
         normal = np.asarray(physics.normal)
         loose = nodes[~held[nodes][:, np.abs(normal) > 1e-12].all(axis=1)]
         found[f"support.{k}"] = (reactions[:, loose] @ normal).sum(axis=1)[:, None] * normal
@@ -79,7 +79,7 @@ def spring_forces(scene: Scene, result: Result) -> dict[str, jax.Array]:
     """Forces (T, 3) [N] on the body of every support with springs and every ligament that ends outside, by name.
 
     Args:
-        scene: as it was run.
+        scene: the scene that was run.
         result: `Result` of `liverjax.simulate`, all steps stored.
     """
 

@@ -36,7 +36,7 @@ class Tried(NamedTuple):
     """A run of a scene by its reduced model."""
 
     ran: Ran | None  # None: the estimated error is above the tolerance, or a step failed
-    sentence: str  # what came out
+    sentence: str  # on the outcome
 
 
 def make(
@@ -66,7 +66,7 @@ def tried(scene: Scene) -> Tried:
     """The run of a scene that names a reduced model in [solve], with its estimated error.
 
     Raises:
-        InputError: no such model, or one of another scene.
+        InputError: no such model, or a model of another scene.
     """
     solve = scene.solve
     model, plain = load_reduced(solve.reduced), replace(scene, solve=replace(solve, reduced=""))
@@ -76,7 +76,7 @@ def tried(scene: Scene) -> Tried:
         again = time.perf_counter()
         found = jax.block_until_ready(simulate_reduced(model, plain))
         run_time = time.perf_counter() - again
-    compile_time = max(again - begin - run_time, 0.0)  # of a program found on disk nothing is left
+    compile_time = max(again - begin - run_time, 0.0)  # 0 for a program found on disk
     x, found = reduced_positions(model, plain, found), reduced_error(model, plain, found)
     error = np.asarray(found.error)
     moved = float(np.linalg.norm(np.asarray(x) - np.asarray(scene.mesh.points), axis=-1).max())

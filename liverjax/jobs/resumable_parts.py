@@ -28,12 +28,12 @@ def part(folder: Path, k: int) -> Path:
 
 
 def write(file: Path, content: dict[str, np.ndarray]) -> None:
-    """Write datasets to an HDF5 file that is there whole or not at all.
+    """Write datasets to an HDF5 file, completely or not at all.
 
     Raises:
         OSError: the disk is full.
     """
-    # Made in memory: where a disk is full HDF5 takes the process down, a plain write raises OSError.
+    # Made in memory: on a full disk HDF5 ends the process, while a plain write raises OSError.
     memory = io.BytesIO()
     with h5py.File(memory, "w") as datasets:
         for name, value in content.items():
@@ -57,7 +57,7 @@ def finished(file: Path) -> bool:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder and try it.
+    """Make the folder and test whether it can be written.
 
     Raises:
         InputError: it cannot be written.
@@ -92,7 +92,7 @@ def same(identity: Mapping[str, object], file: Path) -> None:
     """Write down the input that decides the results; refuse to go on if the parts on disk were made with other input.
 
     Raises:
-        InputError: the parts beside `file` are of something else.
+        InputError: the parts beside `file` belong to other input.
     """
     identity = json.loads(json.dumps(identity))
     if not file.exists():

@@ -1,8 +1,8 @@
 """Sweeps: one scene and many rows of parameters. A kill at any moment cannot spoil the results.
 
 Rows are run chunk by chunk. A finished chunk is a file of its own in FILE.h5.parts, written beside and renamed; when
-all are there they become FILE.h5. So whatever stops a run, finished chunks stay, and `--resume` computes the others.
-Several processes may work on one sweep: each takes every n-th chunk, and the last to finish joins the parts.
+all are finished they are joined to FILE.h5. So whatever stops a run, finished chunks stay, and `--resume` computes the
+others. Several processes may work on one sweep: each takes every n-th chunk, and the last to finish joins the parts.
 """
 
 import csv
@@ -38,7 +38,7 @@ from liverjax.scenes.scene_checks import (
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import simulate_batch
 
-#: What may be stored of every row, from its result and its reference positions (V, 3).
+#: Outputs that may be stored for every row, from its result and its reference positions (V, 3).
 OUTPUTS: dict[str, Callable] = {
     "final_positions": lambda result, reference: result.positions[-1],
     "positions": lambda result, reference: result.positions,
@@ -52,12 +52,12 @@ _UNITS = {"final_reactions": "N", "largest_pressure": "Pa"}
 
 
 class Sweep(NamedTuple):
-    """The runs to make; `identity` has everything that decides the results."""
+    """The runs to make; `identity` contains everything that the results depend on."""
 
     scene: Scene
     names: tuple[str, ...]
     rows: np.ndarray  # (N, P) numbers
-    numbers: np.ndarray  # (N,) of the rows in the file, from 1
+    numbers: np.ndarray  # (N,) numbers of the rows in the file, from 1
     outputs: tuple[str, ...]
     probes: tuple[int, ...]  # nodes whose positions are kept over time
     chunk: int
@@ -89,7 +89,7 @@ def read_sweep(
     names, rows = read_table(parameters)
     for name in names:
         if np.shape(numbers_at(scene, name)):
-            raise InputError(f"parameter {name!r} is no number of the scene file: it is a list, name one number of it")
+            raise InputError(f"parameter {name!r} is a list in the scene file: name one number of it")
     parts = {".".join(name.split(".")[:2]) for name in names}
     held = holding(scene, parts)
     for k, row in enumerate(rows.tolist()):
@@ -110,7 +110,7 @@ def read_sweep(
             raise InputError("--store largest_pressure needs [porosity] in the scene: leave it out")
     for node in probes:
         if not 0 <= node < scene.mesh.number_of_nodes:
-            raise InputError(f"--probe {node} is no node of the mesh: give 0 to {scene.mesh.number_of_nodes - 1}")
+            raise InputError(f"--probe {node} is not a node of the mesh: give 0 to {scene.mesh.number_of_nodes - 1}")
     if chunk < 1:
         raise InputError(f"--chunk {chunk} must be above 0: give e.g. 16")
     numbers = np.arange(1, len(rows) + 1)
@@ -137,7 +137,8 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
     """Header and numbers (N, P) of a CSV file; # begins a comment.
 
     Raises:
-        InputError: unreadable or empty, a name twice, a row of another length, a value that is no finite number.
+        InputError: unreadable or empty, a name given twice, a row of another length, a value that is not a finite
+            number.
     """
     try:
         text = file.read_text(encoding="utf-8-sig")
@@ -146,10 +147,10 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
         raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and ";" in lines[0] and "," not in lines[0]:
-        raise InputError(f"{file} has semicolons between its cells: write commas, and points in numbers")
+        raise InputError(f"{file} has semicolons between its cells: write commas, and decimal points")
     table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
     if len(table) < 2:
-        raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row a run")
+        raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")
     names = tuple(table[0])
     if len(set(names)) < len(names):
         raise InputError(f"{file} names {max(names, key=names.count)} twice: leave one column out")
@@ -163,7 +164,7 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
             except ValueError:
                 finite = False
             if not finite:
-                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is no finite number: mend it")
+                raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is not a finite number: mend it")
         rows.append([float(cell) for cell in row])
     return names, np.array(rows)
 
@@ -182,13 +183,13 @@ def run(
 
     Args:
         sweep: `Sweep`.
-        out: file for the results; its parts stand beside it until all are done.
-        resume: go on with what is there.
+        out: file for the results; its parts are beside it until all are done.
+        resume: continue from the parts on disk.
         process: number of this process and of all that share the work.
         report: called with the number of rows finished.
 
     Raises:
-        InputError: results that are there already, of another sweep, or in use by another process.
+        InputError: results that exist already, that belong to another sweep, or that another process uses.
         OSError: the disk is full; finished chunks are kept.
     """
     folder = resumable_parts.beside(out)
@@ -253,7 +254,7 @@ def _already(sweep: Sweep, out: Path, resume: bool) -> Done:
     except (OSError, KeyError):
         raise InputError(f"{out} holds no sweep: name another --out, or remove it") from None
     if identity != json.loads(json.dumps(sweep.identity)):
-        raise InputError(f"{out} is of another sweep: name another --out, or remove it")
+        raise InputError(f"{out} belongs to another sweep: name another --out, or remove it")
     return Done(out, _failures(sweep, codes), 0)
 
 
@@ -273,7 +274,7 @@ def _joined(sweep: Sweep, out: Path, folder: Path, computed: int) -> Done:
     return Done(out, _failures(sweep, codes), computed)
 
 
-#: Bytes that HDF5 needs beside the datasets.
+#: Bytes that HDF5 needs in addition to the datasets.
 _HEADERS = 100_000
 
 
@@ -297,7 +298,7 @@ def _join(sweep: Sweep, out: Path, files: list[Path]) -> np.ndarray:
         joined["parameters"].attrs["names"] = list(sweep.names)
         if sweep.probes:
             joined["probe_nodes"] = np.array(sweep.probes, dtype=int)
-        if "reference" not in joined:  # of a loaded mesh every row has its own
+        if "reference" not in joined:  # with a loaded mesh every row has its own
             joined["reference"] = np.asarray(sweep.scene.mesh.points)
         joined["reference"].attrs["unit"] = "m"
         joined["tetrahedra"] = meshio_cells(sweep.scene.mesh)[1]

@@ -39,12 +39,12 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
     Args:
         scene: `Scene`.
-        about: result.h5 of a run of the same mesh, whose last positions are the state that moves; None: the state of
-            rest under gravity, where there is gravity.
-        mesh_error: estimate what the mesh leaves out.
+        about: result.h5 of a run of the same mesh, whose last positions are the state about which the body moves; None:
+            the state of rest under gravity, if there is gravity.
+        mesh_error: whether to estimate the error of the mesh.
 
     Raises:
-        InputError: as `harmonic`; a file that is no result of this mesh.
+        InputError: as `harmonic`; a file that is not a result of this mesh.
     """
     x = _under_its_weight(scene) if about is None else _last_positions(about, scene)
     begin = time.perf_counter()
@@ -54,11 +54,11 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
 
 
 def _under_its_weight(scene: Scene) -> jax.Array | None:
-    """Positions at rest under gravity, with stresses that have relaxed; None where there is none."""
+    """Positions at rest under gravity, with stresses that have relaxed; None without gravity."""
     if scene.body is None or not np.any(np.asarray(scene.body.gravity)):
         return None
     still = resting(replace(scene, traction=(), body=replace(scene.body, times=None, history=None)))
-    # Of a sponge the steps are so long that its fluid has flowed.
+    # With a sponge the steps are so long that its fluid has flowed.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
     try:
@@ -85,7 +85,7 @@ def _last_positions(file: Path, scene: Scene) -> jax.Array:
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
-    """Frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh; `attributes` as such."""
+    """Frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh; and `attributes`."""
     import h5py
 
     arrays = {name: (getattr(waves.found, name), unit) for name, unit in _UNITS.items()}
@@ -107,7 +107,7 @@ _UNITS = {"frequencies_Hz": "Hz", "displacement": "m", "reactions": "N", "residu
 
 
 def write_waves_vtu(folder: Path, scene: Scene, found: Harmonic) -> Path:
-    """One VTU file a frequency with the real and imaginary part of the displacement; the series that ParaView opens."""
+    """One VTU file per frequency with real and imaginary part of the displacement; the series that ParaView opens."""
     import meshio
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Material laws: what one is (`base`), the families, and how to make one by name (`registry`)."""
+"""Material laws: their base class (`base`), the families, and how to make a law by name (`registry`)."""
 
 from liverjax.laws.base import Law, Sum, Volumetric, isochoric_part, summands, volumetric_part
 from liverjax.laws.by_region import ByRegion

@@ -1,4 +1,4 @@
-"""Stress and tangent of a law by automatic differentiation of its energy: the oracle of the hand-derived terms."""
+"""Stress and tangent of a law by automatic differentiation of its energy: the reference for the hand-derived terms."""
 
 from collections.abc import Callable
 

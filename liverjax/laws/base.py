@@ -1,4 +1,4 @@
-"""What a material law is: a strain energy and its derivatives.
+"""The base class of material laws: a strain energy and its derivatives.
 
 A law is a frozen pytree made with `liverjax.core.struct.struct`. It states one or more of
 
@@ -8,7 +8,7 @@ A law is a frozen pytree made with `liverjax.core.struct.struct`. It states one 
 * the volumetric energy U(J): fields `bulk` and `volumetric`;
 
 which add up, or overrides `strain_energy(I)`, the whole energy of the `invariants` it names (I1, I2, I4, J;
-I4 = a . C a needs a field `fibre`). Only what is named is computed. Derivatives come from scalar automatic
+I4 = a . C a needs a field `fibre`). Only the named invariants are computed. Derivatives come from scalar automatic
 differentiation unless `isochoric_derivatives`, `stretch_derivatives`, `green_derivatives` or `energy_derivatives` are
 written by hand.
 """
@@ -42,10 +42,10 @@ from liverjax.tensors.principal import power_sum, stretches
 
 
 class Law:
-    """A hyperelastic law per reference volume [Pa]; see the module for what to override."""
+    """A hyperelastic law: energy per reference volume [Pa]. The module's docstring says which methods to override."""
 
     invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
-    #: Every law is a struct, so `dataclasses.replace` takes it.
+    #: Every law is a struct, so `dataclasses.replace` works on it.
     __dataclass_fields__: ClassVar[Content]
     #: The energies of a law; None: it has none of that kind.
     isochoric_energy: Any = None
@@ -96,7 +96,7 @@ class Law:
         raise InputError(f"law {type(self).__name__} states no ground-state shear modulus: define shear_modulus(self)")
 
     def bulk_modulus(self) -> Any:
-        """Ground-state bulk modulus [Pa]: `bulk` of a law whose other energies are isochoric."""
+        """Ground-state bulk modulus [Pa]: `bulk`, if all other energies of the law are isochoric."""
         if type(self).strain_energy is not Law.strain_energy or self.green_energy is not None:
             raise InputError(
                 f"law {type(self).__name__} states no ground-state bulk modulus: define bulk_modulus(self)"
@@ -104,7 +104,7 @@ class Law:
         return 0.0 if self.bulk is None else self.bulk
 
     def check(self) -> None:
-        """Raise `InputError` where the values of two fields contradict each other."""
+        """Raise `InputError` if the values of two fields contradict each other."""
 
     # -- what a law is made of ----------------------------------------------------------------------------------------
 
@@ -125,17 +125,17 @@ class Law:
         return change(self)
 
     def isochoric_part(self) -> Any:
-        """The law without U(J), or `None` where its energy has no such split (or is only volumetric)."""
+        """The law without U(J); `None` if its energy has no such split (or is only volumetric)."""
         if self.isochoric_energy is None and self.stretch_energy is None:
             return None
         return self if self.bulk is None else replace(self, bulk=None)
 
     def volumetric_part(self) -> Any:
-        """U(J) as a law of its own, or `None` where there is none."""
+        """U(J) as a law of its own; `None` if the law has no U(J)."""
         return None if self.bulk is None else Volumetric(bulk=self.bulk, volumetric=self.volumetric)
 
     def without_volume(self) -> Any:
-        """The law without every U(J) that stands apart in it, or `None` where nothing is left."""
+        """The law without every U(J) that is a separate term of it; `None` if nothing is left."""
         split = self.isochoric_part()
         if split is not None:
             return split
@@ -165,7 +165,7 @@ class Law:
         return pack(invariant_terms.first_piola(self, unpack(_floating(F))))
 
     def tangent(self, F: jax.Array) -> jax.Array:
-        """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: the block of D = e_J, e_L."""
+        """d2W/dF dF [Pa], shape (..., 3, 3, 3, 3), by the hand-derived MJED terms: blocks of unit vectors D."""
         A = invariant_terms.tangent(invariant_terms.state(self, unpack(_floating(F))))
         rows = [[jnp.stack([pack(A[J][L]) for L in range(3)], axis=-1)] for J in range(3)]
         # pack gives (..., i, k); stacking L last then J second: (..., i, J, k, L).
@@ -198,12 +198,12 @@ class Sum(Law):
         return self.laws
 
     def isochoric_part(self):
-        """The isochoric parts added, without laws that are only volumetric; `None` where a law has no such part."""
+        """The sum of the isochoric parts, without laws that are only volumetric; `None` if a law has no such part."""
         parts = [law.isochoric_part() for law in self.laws if not isinstance(law, Volumetric)]
         return None if any(part is None for part in parts) else _added(parts)
 
     def volumetric_part(self):
-        """The sum over all laws."""
+        """The sum of the laws' volumetric parts; `None` if no law has one."""
         return _added([part for part in (law.volumetric_part() for law in self.laws) if part is not None])
 
     def without_volume(self):
@@ -237,11 +237,11 @@ class Sum(Law):
         return first, second
 
     def shear_modulus(self):
-        """The sum over all laws."""
+        """The sum of the laws' shear moduli [Pa]."""
         return sum(law.shear_modulus() for law in self.laws)
 
     def bulk_modulus(self):
-        """The sum over all laws."""
+        """The sum of the laws' bulk moduli [Pa]."""
         return sum(law.bulk_modulus() for law in self.laws)
 
 
@@ -254,7 +254,7 @@ class Volumetric(Law):
 
     bulk: Number = param("Pa", "bulk modulus K", lower=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
-    below: float | None = static(default=None, about="J below which U is its Taylor parabola there")
+    below: float | None = static(default=None, about="J below which U is replaced by its Taylor parabola at that J")
     invariants: ClassVar = ("J",)
 
     def volumetric_part(self):
@@ -262,7 +262,7 @@ class Volumetric(Law):
         return self
 
     def without_volume(self):
-        """Nothing is left."""
+        """None, since nothing is left."""
         return None
 
     def strain_energy(self, I):
@@ -280,7 +280,7 @@ class Volumetric(Law):
         return {"J": U1 if self.below is None else U1 + U2 * (I.J - above)}, {("J", "J"): U2}
 
     def shear_modulus(self):
-        """A fluid has none."""
+        """Zero: U(J) does not resist shear."""
         return 0.0
 
     def bulk_modulus(self):

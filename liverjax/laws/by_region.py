@@ -14,9 +14,10 @@ from liverjax.tensors.subsets import Subsets, in_subset, put_together
 
 @struct
 class ByRegion(Law):
-    """Laws side by side, one for each subset of the elements.
+    """Several laws, one for each subset of the elements.
 
-    A number of a law may have one value for each element of the whole body (E,); the values of its subset count.
+    A number of a law may have one value for each element of the whole body (E,); only the values in its subset are
+    used.
     """
 
     laws: tuple[Law, ...] = param("1", "one law for each subset", unnamed=True)
@@ -31,7 +32,7 @@ class ByRegion(Law):
         return in_subset(self.subsets, k, self.laws[k])
 
     def each(self, change: Callable[[Law], Law]) -> "ByRegion":
-        """The same with every law changed."""
+        """A copy with `change` applied to every law."""
         return ByRegion(laws=tuple(change(law) for law in self.laws), subsets=self.subsets)
 
     def check(self) -> None:
@@ -40,13 +41,13 @@ class ByRegion(Law):
             law.check()
 
     def isochoric_part(self) -> Any:
-        """The isochoric part of each law; None where one law has none."""
+        """The isochoric part of each law; None if one law has none."""
         if any(law.isochoric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.isochoric_part())
 
     def volumetric_part(self) -> Any:
-        """The volumetric part of each law; None where no law has one."""
+        """The volumetric part of each law; None if no law has one."""
         if all(law.volumetric_part() is None for law in self.laws):
             return None
         return self.each(lambda law: law.volumetric_part() or Volumetric(bulk=0.0))
@@ -56,17 +57,17 @@ class ByRegion(Law):
         return tuple(self.piece(k).measures(in_subset(self.subsets, k, F)) for k in range(len(self.laws)))
 
     def strain_energy(self, I: tuple) -> jax.Array:  # type: ignore[override]
-        """Energy density (…, E) [Pa]."""
+        """Energy density (…, E) [Pa] of every element, by its own law."""
         return put_together(self.subsets, [self.piece(k).strain_energy(i) for k, i in enumerate(I)])
 
     def energy_derivatives(self, I: Any) -> Any:
         """Refused: laws of several kinds have no invariants in common."""
-        raise InputError("laws of several kinds have no derivatives in common: ask each of them")
+        raise InputError("laws of several kinds have no derivatives in common: use those of each law")
 
     def shear_modulus(self) -> jax.Array:
-        """(E,) [Pa]."""
+        """Ground-state shear modulus (E,) [Pa]."""
         return put_together(self.subsets, [self.piece(k).shear_modulus() for k in range(len(self.laws))])
 
     def bulk_modulus(self) -> jax.Array:
-        """(E,) [Pa]."""
+        """Ground-state bulk modulus (E,) [Pa]."""
         return put_together(self.subsets, [self.piece(k).bulk_modulus() for k in range(len(self.laws))])

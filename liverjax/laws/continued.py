@@ -1,4 +1,4 @@
-"""A law continued below a chosen J: finite energy for flat and inverted elements, where the law itself has none."""
+"""A law continued below a chosen J: finite energy for flat and inverted elements, for which the law itself has none."""
 
 from typing import Any
 
@@ -13,14 +13,14 @@ from liverjax.tensors.matrices import determinant
 
 @struct
 class Continued(Law):
-    """A law of I1, I2 and J, the same above J = c; below, value and slope of its energy go on smoothly.
+    """A law of I1, I2 and J, unchanged above J = c; below c its energy continues smoothly in value and slope.
 
-    Isochoric energies are those at c^2/(2c - J) in place of J, which is positive for every J, so that isochoric
-    invariants exist; a volumetric energy is its Taylor parabola at c. The energy rises towards inversion.
+    Below c an isochoric energy is evaluated at c^2/(2c - J) in place of J. This is positive, so that isochoric
+    invariants exist. A volumetric energy is replaced by its Taylor parabola at c. The energy rises towards inversion.
     """
 
-    law: Any = param("1", "the law", unnamed=True)
-    below: float = static(default=0.1, about="c")
+    law: Any = param("1", "the law that is continued", unnamed=True)
+    below: float = static(default=0.1, about="c, the J below which the law is continued")
 
     @property
     def invariants(self) -> tuple:  # type: ignore[override]  # of the law inside
@@ -28,17 +28,17 @@ class Continued(Law):
         return self.law.invariants if "J" in self.law.invariants else (*self.law.invariants, "J")
 
     def isochoric_part(self) -> Law | None:
-        """The law without its volumetric energy; None where it has no such split."""
+        """The law without its volumetric energy; None if it has no such split."""
         part = self.law.isochoric_part()
         return None if part is None else Continued(law=part, below=self.below)
 
     def volumetric_part(self) -> Law | None:
-        """The volumetric energy alone, or None."""
+        """The volumetric energy of the law inside, continued; None if it has none."""
         part = self.law.volumetric_part()
         return None if part is None else Volumetric(bulk=part.bulk, volumetric=part.volumetric, below=self.below)
 
     def without_volume(self) -> Law | None:
-        """That of the law, continued."""
+        """The law inside without its volumetric energy, continued."""
         part = self.law.without_volume()
         return self if part is self.law else None if part is None else Continued(law=part, below=self.below)
 
@@ -71,11 +71,11 @@ class Continued(Law):
         return first, second
 
     def shear_modulus(self):
-        """That of the law."""
+        """Ground-state shear modulus [Pa] of the law inside."""
         return self.law.shear_modulus()
 
     def bulk_modulus(self):
-        """That of the law."""
+        """Ground-state bulk modulus [Pa] of the law inside."""
         return self.law.bulk_modulus()
 
     def _whole(self) -> Law:
@@ -96,10 +96,10 @@ class Continued(Law):
 
 
 def continued(law: Law, below: float) -> Law:
-    """The law with finite energy and forces for every J, the same above J = `below`; see `Continued`.
+    """The law with finite energy and forces for every J, unchanged above J = `below`; see `Continued`.
 
     Args:
-        law: of I1, I2, J; a sum of such.
+        law: a law of I1, I2 and J, or a sum of such laws.
         below: c, between 0 and 1, e.g. 0.1.
 
     Raises:

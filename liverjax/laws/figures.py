@@ -15,7 +15,7 @@ def _stress_of_curve(law: Law, test: str, driven: np.ndarray) -> np.ndarray:
 
 
 def curves(named: dict[str, Law], file: Path, stretches: tuple[float, float] = (0.6, 1.6)) -> None:
-    """Nominal stress of incompressible samples in four tests, one line a law, written to `file`.
+    """Nominal stress of incompressible samples in four tests, one line per law, written to `file`.
 
     Args:
         named: label -> law.

@@ -18,11 +18,11 @@ from liverjax.laws import Law, autodiff, homogeneous
 
 #: Steps of the difference quotients, relative to F.
 STEPS = 10.0 ** -np.arange(1.0, 10.5, 0.5)
-#: A central difference cannot be better than about eps^(2/3) of its terms; a thousand times that for their size.
+#: A central difference cannot be better than about eps^(2/3) of its terms; the factor allows for large terms.
 DIFFERENCE_LIMIT = 1e3 * np.finfo(float).eps ** (2 / 3)
-#: Sums of some hundred rounded terms, and their cancellation in deviatoric parts.
+#: Allows for roundoff in sums of some hundred terms, and for cancellation in deviatoric parts.
 EXACT_LIMIT = 1e-10
-#: As many of each: one program for both.
+#: Equal in number, so that one compiled program serves both.
 STRETCHES, SHEARS = np.linspace(0.2, 4.0, 381), np.linspace(0.0, 3.8, 381)
 
 
@@ -63,7 +63,7 @@ def load(name: str) -> Law:
         raise InputError(f"{name} names no law: give FILE.py:LAW")
     if not Path(file).is_file():
         raise InputError(f"{file} is not a file: give FILE.py:LAW with the path of a Python file")
-    # Under a private name that is registered: dataclasses look their module up, and the file may be called jax.py.
+    # The module is registered, as dataclasses look it up, under a private name: the file may be called jax.py.
     spec = importlib.util.spec_from_file_location(f"_law_file_{Path(file).stem}", file)
     if spec is None:
         raise InputError(f"{file} is not a Python file: give FILE.py:LAW")
@@ -83,7 +83,7 @@ def load(name: str) -> Law:
         offered = [n for n, c in own.items() if c.__module__ == module.__name__ or not inspect.isclass(vars(module)[n])]
         raise InputError(f"{file} has no {attribute}: {'use ' + ' or '.join(offered) if offered else 'define a law'}")
     if not _is_law(found):
-        raise InputError(f"{name} is no law: derive it from liverjax.Law and decorate it with liverjax.core.struct")
+        raise InputError(f"{name} is not a law: derive it from liverjax.Law and decorate it with liverjax.core.struct")
     law = _typical_law(found, name) if inspect.isclass(found) else found
     _try(law, name)
     return law
@@ -130,7 +130,7 @@ def _typical_law(cls: type, name: str) -> Law:
 
 
 def check(law: Law) -> Check:
-    """Run every row; nothing is raised for a law that is wrong."""
+    """Run all checks, one per row. A wrong law raises nothing: its rows fail."""
     F, D = _samples()
     energy, stress, tangent = jax.jit(law.energy), jax.jit(law.first_piola), jax.jit(law.tangent)
     rows, errors = [], {}
@@ -196,8 +196,9 @@ def _exact(name: str, ours: np.ndarray, theirs: np.ndarray, size: float | None =
 
 
 def _rest_state(law: Law, energy: Callable, stress: Callable, tangent: Callable) -> list[Row]:
-    """Energy, stress and moduli of the undeformed state. Moduli are Voigt's means; those of an isotropic law hold in
-    every direction."""
+    """Energy, stress and moduli of the undeformed state. Moduli are Voigt's means; for an isotropic law these are the
+    moduli of every direction.
+    """
     W, P, A = (_as_numbers(f, np.tile(np.eye(3), (len(_samples()[0]), 1, 1)))[0] for f in (energy, stress, tangent))
     normal, coupled = np.trace(np.einsum("iijj->ij", A)), A[0, 0, 1, 1] + A[0, 0, 2, 2] + A[1, 1, 2, 2]
     shear = (normal - coupled) / 15 + (A[0, 1, 0, 1] + A[0, 2, 0, 2] + A[1, 2, 1, 2]) / 5

@@ -11,7 +11,7 @@ from liverjax.laws.base import Law
 from liverjax.laws.terms.stretch_terms import stress_at_constant
 from liverjax.tensors.matrices import pack, unpack
 
-#: Test -> what is driven: a stretch, or the amount of shear.
+#: Test -> the quantity that is prescribed: a stretch, or the amount of shear.
 TESTS = {"uniaxial": "stretch", "equibiaxial": "stretch", "pure_shear": "stretch", "simple_shear": "shear"}
 
 

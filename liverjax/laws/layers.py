@@ -11,12 +11,12 @@ from liverjax.core.struct import replace
 from liverjax.laws.base import Law
 from liverjax.laws.registry import create, find
 
-#: Iterations for the stretch of the thickness, and the most that its logarithm changes in one.
+#: Iterations for the stretch of the thickness, and the largest change of its logarithm in one iteration.
 _ITERATIONS, _LONGEST = 30, 0.5
 
 
 def read_layer(table: object, name: str) -> Law:
-    """Read the law of a thin part from its table. Its bulk modulus does not act and may be left out.
+    """Read the law of a thin part from its table. Its bulk modulus has no effect and may be left out.
 
     Raises:
         InputError: an unknown law or number, in a sentence that begins with `name`.
@@ -34,7 +34,7 @@ def read_layer(table: object, name: str) -> Law:
 
 
 def check(law: Law, name: str) -> None:
-    """Refuse a law that has directions, or numbers that do not go together.
+    """Refuse a law that has directions, or numbers that contradict each other.
 
     Raises:
         InputError: one sentence that begins with `name`.
@@ -73,16 +73,16 @@ def _thinned(density: Any, start: jax.Array) -> jax.Array:
 
     def newton(u: jax.Array) -> jax.Array:
         first, second = jax.jvp(slope, (u,), (jnp.ones_like(u),))
-        # Downhill also where the energy is not convex.
+        # The step goes downhill also where the energy is not convex.
         return u - jnp.clip(first / jnp.where(second == 0, 1.0, jnp.abs(second)), -_LONGEST, _LONGEST)
 
     frozen = jax.lax.stop_gradient
     u = jax.lax.fori_loop(0, _ITERATIONS, lambda _, u: frozen(newton(u)), frozen(start))
-    # At the root one iteration more carries the first derivative, a second one the next.
+    # At the root one more iteration gives the first derivative, and another one the second derivative.
     return newton(newton(u))
 
 
 def axial_energy(law: Law, stretch: jax.Array) -> jax.Array:
-    """Energy density [Pa] of a bar in tension at constant volume, at its stretch."""
+    """Energy density [Pa] of a bar in tension at constant volume, as a function of its stretch."""
     side, zero = 1 / jnp.sqrt(stretch), jnp.zeros_like(stretch)
     return law.strain_energy(law.measures(((stretch, zero, zero), (zero, side, zero), (zero, zero, side))))

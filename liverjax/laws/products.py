@@ -48,7 +48,7 @@ def _isochoric(c: Number, i: int, j: int) -> list[Product]:
 
 
 def groups(law: Law) -> list[Group]:
-    """The products of a single law; `InputError` for a law that cannot be written so."""
+    """The products of a single law; `InputError` for a law that cannot be written in this form."""
     match law:
         case NeoHookean():
             return [Group(_isochoric(law.mu / 2, 1, 0))]
@@ -73,7 +73,7 @@ def groups(law: Law) -> list[Group]:
             return [_exponential(law.c1, law.c2), Group([Product(-law.c1 * law.c2 / 2, 0, 1, -4 / 3)])]
         case Volumetric():
             return []
-    raise InputError(f"law {type(law).__name__} is no sum of products g(I1, I2) h(J): use terms = 'contracted'")
+    raise InputError(f"law {type(law).__name__} is not a sum of products g(I1, I2) h(J): use terms = 'contracted'")
 
 
 def _exponential(scale: Number, factor: Number) -> Group:

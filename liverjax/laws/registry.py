@@ -48,7 +48,7 @@ LAWS: dict[str, type[Law]] = {
 
 
 def find(name: str) -> type[Law]:
-    """The class of a law's name; `InputError` offering the nearest known name."""
+    """The class of the law called `name`; the `InputError` for an unknown name offers the nearest known one."""
     if as_word(name, "law name") not in LAWS:
         raise InputError(f"law {name!r} is not known: {hint(name, LAWS)}")
     return LAWS[name]
@@ -92,7 +92,7 @@ def _sequence(value: Any) -> Any:
     if isinstance(value, (list, tuple)) and not any(isinstance(v, (list, tuple)) for v in value):
         return tuple(value)
     if jnp.ndim(value) == 0:
-        raise InputError(f"{value} is one number where a list of numbers is asked for: give a list")
+        raise InputError(f"{value} is one number, but a list of numbers is needed: give a list")
     return jnp.asarray(value) if jnp.ndim(value) > 1 else tuple(value)
 
 
@@ -117,7 +117,7 @@ def typical(name: str) -> Law:
 
 
 def scaled(law: Law, factor: Number) -> Law:
-    """The law with its energy times `factor`: every parameter in Pa is multiplied, every other one kept."""
+    """The law with its energy times `factor`: every parameter in Pa is multiplied, all others are kept."""
 
     def one(s: Law) -> Law:
         if isinstance(s, Continued):

@@ -11,11 +11,11 @@ from liverjax.core.struct import Indices, param, static, struct
 #: Pairs of an element's nodes, in the order of `Pattern.element_edges`.
 PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
-#: Nodes a patch up to so many patches; nodes a patch of larger meshes, so that iterations do not grow with the mesh;
-#: the most patches: the coarse matrix is dense, with 12 unknowns a patch.
+#: Nodes per patch, up to so many patches; nodes per patch in larger meshes, where iterations must not grow;
+#: the most patches: the coarse matrix is dense, with 12 unknowns per patch.
 PATCH_SIZE, FEW_PATCHES, LARGE_PATCH, MOST_PATCHES = 80, 32, 160, 192
 
-#: Neighbours are near where their distance is below this part of the mean one of either; most nodes of a cluster; the
+#: Neighbours are near if their distance is below this part of each one's mean distance; most nodes of a cluster; the
 #: part of its vertices that must have a near neighbour for a mesh to have clusters.
 NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 
@@ -24,14 +24,14 @@ NEAR, LARGEST_CLUSTER, SHARE = 1 / 3, 26, 0.1
 class Clusters:
     """Groups of near nodes in thin cells, and where the blocks of their matrices come from.
 
-    The entries of the matrix between two nodes a < b of a cluster have a place a M + b in its M x M blocks.
+    In the M x M blocks of a cluster, the matrix entries between its members a < b are at place a M + b.
     """
 
     nodes: jax.Array = param("1", "members of every cluster (G, M), padded with 0")
     there: jax.Array = param("1", "1 for a member, 0 for padding (G, M)")
-    places: jax.Array = param("1", "in all blocks (G M M), of every source (n,)")
+    places: jax.Array = param("1", "place of every source (n,) in all blocks (G M M)")
     sources: tuple[jax.Array, ...] = param(
-        "1", "of vertices (edge,); of functions of elements (element, one function, another, sign of the product) (n,)"
+        "1", "arrays (n,), of vertices: edge; of functions: element, one function, another, sign of the product"
     )
 
 
@@ -43,7 +43,7 @@ class Pattern:
     element_edges: jax.Array = param("1", "number of the edge of each of `PAIRS` (6, E)")
     row_nodes: jax.Array = param("1", "neighbours of every node (W, V), padded with the node itself")
     row_edges: jax.Array = param("1", "the edges to them (W, V), padded with N")
-    edge_slots: jax.Array = param("1", "place of an edge in the flattened rows, that of its lower node (N,)")
+    edge_slots: jax.Array = param("1", "place of each edge (N,) in the flattened rows, in the row of its lower node")
     patches: jax.Array = param("1", "number of the patch of every node (V,), for the coarse space")
     patch_functions: jax.Array = param("1", "1 and the place in its patch, about 1 in size, of every node (V, 4)")
     patch_width: jax.Array = param("m", "mean of the patches' widest extents")
@@ -95,7 +95,7 @@ def pattern(tetrahedra: Indices, points: jax.Array) -> Pattern:
 
 
 def node_numbers(of: Any) -> jax.Array:
-    """A copy as 32-bit integers; NumPy converts it, for JAX would compile a program for each shape."""
+    """A copy as 32-bit integers, converted by NumPy: JAX would compile a program for each shape."""
     return jax.device_put(np.asarray(of).astype(np.int32))
 
 
@@ -115,7 +115,7 @@ def patches(points: np.ndarray) -> np.ndarray:
 
 
 def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    # On the host where positions are known: small programs of their own would take a second to compile.
+    # On the host if positions are known: JAX would take a second to compile small programs for this.
     xp: Any = jnp if isinstance(points, jax.core.Tracer) else np
     given: Any = points if xp is jnp else np.asarray(points)
     members = [given[patch == k] for k in range(int(patch.max(initial=0)) + 1)]
@@ -127,7 +127,7 @@ def _patch_functions(points: jax.Array, patch: np.ndarray) -> tuple[jax.Array, j
 
 
 def vertex_clusters(points: np.ndarray, edges: np.ndarray) -> Clusters | None:
-    """Clusters of vertices (V, 3) that edges (2, N) join; None where few cells are thin; host side."""
+    """Clusters of vertices (V, 3) that edges (2, N) join; None if few cells are thin; host side."""
     return _clustered(near_groups(points, edges), edges, (np.arange(edges.shape[1]),))
 
 
@@ -141,7 +141,7 @@ def function_clusters(nodes: np.ndarray, places: np.ndarray, signs: np.ndarray) 
 
 
 def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Number of the group of every node (V,): nodes that chains of near pairs (2, N) join; host side."""
+    """Number of the group of every node (V,). Chains of near pairs, out of `pairs` (2, N), join a group; host side."""
     count, (one, other) = len(places), pairs
     square = np.sum((places[one] - places[other]) ** 2, axis=1)
     neighbours = np.maximum(np.bincount(pairs.ravel(), minlength=count), 1)
@@ -149,7 +149,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     near = square < NEAR**2 * np.minimum(mean[one], mean[other])
     if len(np.unique(pairs[:, near])) < SHARE * count:
         return np.arange(count)
-    import scipy.sparse.csgraph  # takes long to import, and few meshes want it
+    import scipy.sparse.csgraph  # slow to import, and few meshes need it
 
     graph = scipy.sparse.coo_array((np.ones(near.sum()), (one[near], other[near])), shape=(count, count))
     number, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
@@ -167,7 +167,7 @@ def near_groups(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _packed(group: np.ndarray) -> np.ndarray:
-    """Groups of several nodes put together up to the size of the largest: blocks of one size are then nearly full."""
+    """Join groups of several nodes up to the size of the largest group, so that blocks of one size are nearly full."""
     size = np.bincount(group)
     largest, free, last = int(size.max()), 0, 0
     new = np.arange(len(size))
@@ -183,7 +183,7 @@ def _clustered(group: np.ndarray, pairs: np.ndarray, sources: tuple[np.ndarray, 
     size = np.bincount(group)
     if size.max(initial=0) < 2:
         return None
-    number = np.cumsum(size > 1) - 1  # of a group among those of several nodes
+    number = np.cumsum(size > 1) - 1  # number of a group among the groups of several nodes
     order = np.argsort(group, kind="stable")
     place = np.empty(len(group), int)
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)

@@ -14,17 +14,17 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: How fast cells grow away from a rim: with quadratic elements finer ones gain little (experiments/TABLES.md).
+#: How fast cells grow away from a rim: with quadratic elements slower growth gains little (experiments/TABLES.md).
 GROWTH = 0.7
 
 
 def graded(length: float, cells: Mapping[float, float], largest: float, growth: float = GROWTH) -> np.ndarray:
-    """Places from 0 to `length`, close together near some of them.
+    """Places from 0 to `length`, with short cells near given places.
 
     Args:
         length: [m].
-        cells: place [m] -> length of a cell there [m]; every place becomes one of the result.
-        largest: no cell is longer [m].
+        cells: place [m] -> length of a cell there [m]; every such place is also in the result.
+        largest: length of the longest cells [m].
         growth: by how much cells grow in length, per distance from such a place.
 
     Returns:
@@ -75,28 +75,28 @@ class Sector(NamedTuple):
     """A part of a cylinder between two planes through its axis."""
 
     mesh: TetMesh  # node sets bottom, top, mantle, axis, start (the plane y = 0) and end
-    normal: np.ndarray  # of the plane `end` (3,)
-    parts: float  # how many such sectors are a cylinder
+    normal: np.ndarray  # normal (3,) of the plane `end`
+    parts: float  # how many such sectors make a cylinder
     stretch: float  # distance of a ring's corners from the axis, over its radius
 
 
 def sector(radii: np.ndarray, heights: np.ndarray, corners: int, slices: int = 1) -> Sector:
-    """The part of a cylinder between the plane y = 0 and a turned plane; `corners` are those of each ring.
+    """The part of a cylinder between the plane y = 0 and another plane through the axis.
 
-    An axisymmetric problem needs no more than one slice: both planes are planes of symmetry. Areas of polygons are
-    those of circles.
+    An axisymmetric problem needs no more than one slice: both planes are planes of symmetry. Every polygon has the area
+    of its circle.
 
     Args:
         radii, heights: as in `graded_cylinder`.
-        corners: of every ring of the whole cylinder, at least 3.
-        slices: edges of a ring in the sector; `corners` / 4 of them are a quarter.
+        corners: number of corners of every ring of the whole cylinder, at least 3.
+        slices: number of edges of a ring in the sector; `corners` / 4 make a quarter of the cylinder.
 
     Raises:
         InputError: as `graded_cylinder`; slices that fill half of the cylinder or more.
     """
     radii, heights = _rising("radii", radii), _rising("heights", heights)
     if not 0 < 2 * slices < corners:
-        raise InputError(f"slices = {slices} of {corners} are no sector below half a cylinder: take fewer")
+        raise InputError(f"slices = {slices} of {corners} must make less than half a cylinder: take fewer, at least 1")
     stretch, step = _stretch(corners), 2 * np.pi / corners
     angle = step * np.arange(slices + 1)
     ring = stretch * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -129,13 +129,13 @@ def _stretch(corners: int) -> float:
 
 
 def _corners(radii: np.ndarray) -> np.ndarray:
-    """How many corners the ring at each radius but the first has."""
+    """Number of corners of the ring at each radius except the first."""
     width = np.diff(radii)
     edge = width.max()
     found, last = [], 6
     for k, w in enumerate(width):
         wanted = round(2 * np.pi * radii[k + 1] / edge)
-        # Across a ring thinner than half an edge, polygons of different corners would cut each other.
+        # At a ring thinner than half an edge, polygons with different numbers of corners would cut each other.
         if k == 0 or w > edge / 2:
             last = max(last, wanted)
         found.append(last)
@@ -157,8 +157,9 @@ def _rings(radii: np.ndarray, corners: np.ndarray, match_area: bool) -> tuple[np
 
 
 def _ring_of_triangles(inner: np.ndarray, outer: np.ndarray) -> list[list[int]]:
-    """Triangles between two rings. Each takes the next edge, inside or outside, whose middle comes first around the
-    ring."""
+    """Triangles between two rings. Each has the next edge of the inner or of the outer ring, the one whose middle comes
+    first around the axis.
+    """
     n, m = len(inner), len(outer)
     if n == 1:
         return [[inner[0], outer[j], outer[(j + 1) % m]] for j in range(m)]

@@ -21,7 +21,7 @@ from liverjax.mesh.tetrahedra import UNITS, TetMesh, check_mesh, tet_mesh
 if TYPE_CHECKING:
     import meshio
 
-#: Cells of files that become elements.
+#: Order of the elements -> meshio's name of their cells.
 CELLS = {1: "tetra", 2: "tetra10"}
 _NAMES = {1: "linear", 2: "quadratic"}
 #: Edges of a quadratic element in the order of VTK and meshio.
@@ -31,10 +31,10 @@ _STRAIGHT = 1e-6
 
 
 def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
-    """Read any file meshio reads that holds tetrahedra of 4 or 10 nodes; sets of nodes and elements come along.
+    """Read a file with tetrahedra of 4 or 10 nodes, in any format of meshio, and its sets of nodes and elements.
 
-    Of 10-node elements the vertices come first, in the file's order, then the middles of the edges; curved edges are
-    made straight, with a warning.
+    With 10-node elements the vertices get the first numbers, in the file's order, then the middles of the edges. Curved
+    edges are made straight, with a warning.
 
     Args:
         path: mesh file.
@@ -53,7 +53,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
     if order is None:
         kinds = ", ".join(sorted({block.type for block in data.cells})) or "nothing"
         raise InputError(
-            f"mesh file {path}: it holds {kinds} but no linear tetrahedra, nor quadratic; export those of 4 or 10 nodes"
+            f"mesh file {path}: it holds {kinds} but no linear or quadratic tetrahedra; export some of 4 or 10 nodes"
         )
     cell = CELLS[order]
     blocks = [block.data for block in data.cells if block.type == cell]
@@ -89,7 +89,7 @@ def read_mesh(path: str | os.PathLike, unit: str = "m") -> TetMesh:
 
 
 def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element_sets: dict, name: str) -> TetMesh:
-    """A quadratic mesh of elements (E, 10) in the order of VTK, whose edges become straight."""
+    """A quadratic mesh with straight edges, from elements (E, 10) in the order of VTK."""
     used = np.unique(tets[:, :4])
     new = np.full(len(points), -1)
     new[used] = np.arange(len(used))
@@ -99,7 +99,7 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     middles = np.stack([np.asarray(n) for n in mesh.element_nodes[4:]], axis=1)
     of_file = tets[:, [4 + _VTK.index(pair) for pair in PAIRS]]
     if np.any(np.isin(of_file, used)):
-        raise InputError(f"{name}: a node is a vertex here and the middle of an edge there; export the mesh anew")
+        raise InputError(f"{name}: a node is a vertex of one element and a middle in another; export the mesh anew")
     new[of_file] = middles
     straight = np.asarray(mesh.points)
     low, high = np.asarray(mesh.pattern.edges)
@@ -108,15 +108,15 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     curved = of_file[off > _STRAIGHT * length]
     if len(curved):
         warnings.warn(
-            f"{name}: {len(np.unique(curved))} middles of edges stand up to {off.max():.3g} m off the straight edge: "
-            "they are moved onto it, for elements are straight here; refine curved parts",
+            f"{name}: {len(np.unique(curved))} middles of edges lie up to {off.max():.3g} m off the straight edge: "
+            "they are moved onto it, since elements are straight here; refine curved parts",
             stacklevel=3,
         )
     sets = {k: new[nodes][new[nodes] >= 0] for k, nodes in node_sets.items()}
     return replace(mesh, node_sets={k: node_numbers(np.unique(v)) for k, v in sets.items()})
 
 
-#: What the beginning of a file says that meshio does not read -> what it is, and the remedy.
+#: The beginning of a file that meshio cannot read -> what the file is, and the remedy.
 _FOREIGN = {
     r"\$NOD\b": "it is in Gmsh's format of version 1 ($NOD, $ELM); open it in Gmsh and save it as version 4 or VTK",
     r"DATASET\s+POLYDATA|type=.PolyData": "it holds VTK polygons, a surface; fill the surface with tetrahedra "
@@ -125,7 +125,7 @@ _FOREIGN = {
 
 
 def _read_quietly(path: Path) -> Any:
-    """Read with meshio, without its printed lines: our own sentence says what was found."""
+    """Read with meshio, but print none of its messages: our own message says what was found."""
     import meshio
 
     try:
@@ -140,24 +140,24 @@ def _read_quietly(path: Path) -> Any:
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
             return meshio.read(path)
-    except SystemExit:  # meshio's way to say that no reader took the file; their reasons are printed
+    except SystemExit:  # meshio exits if no reader accepts the file, and prints their reasons
         reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
     except Exception as error:  # meshio's readers raise whatever their parser meets
         reason = " ".join(str(error).split()) or type(error).__name__
     raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh")
 
 
-#: Cells of surfaces and edges, which a volume mesh may carry beside its own.
+#: Cells of surfaces and edges, which a file may have in addition to its tetrahedra.
 _FLAT_CELLS = ("vertex", "line", "triangle", "quad", "polygon")
 #: A body longer than this [m] is likelier a mesh in millimetres.
 _LARGE = 10.0
 
 
 def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    """meshio's point sets, integer point data ``set:NAME`` (how `write_mesh` keeps them in VTU), groups of triangles.
+    """Node sets: meshio's point sets, integer point data ``set:NAME`` (from `write_mesh`), and groups of triangles.
 
     Raises:
-        InputError: a name that stands for two sets.
+        InputError: two different sets have the same name.
     """
     sets = {name: np.asarray(nodes, dtype=np.int32) for name, nodes in (data.point_sets or {}).items()}
     for key, values in data.point_data.items():
@@ -173,24 +173,24 @@ def _node_sets(data: Any, tets: np.ndarray, name: str) -> dict[str, np.ndarray]:
     return sets
 
 
-#: A cell array of whole numbers with more of them than this numbers the cells, it does not group them.
+#: A cell array with more different whole numbers than this is taken as numbers of cells, not of groups.
 _MOST_GROUPS = 100
 
 
 def _element_sets(data: Any, cell: str) -> dict[str, np.ndarray]:
-    """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups of whole numbers.
+    """Sets of tetrahedra: meshio's cell sets, cell data ``set:NAME``, and groups given by whole numbers.
 
     A group is named by the file (Gmsh's physical names), or by array and number, as in ``medit:ref=2``.
     """
     return _cell_groups(data, (cell,), 3)
 
 
-#: Cells of surfaces whose named groups become node sets, and the edges of the first.
+#: Cells of surfaces whose named groups become node sets; the edges of a triangle.
 _TRIANGLES, _EDGES = ("triangle", "triangle6"), ((0, 1), (1, 2), (0, 2))
 
 
 def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
-    """Nodes of the triangles that the file groups under a name; of 3 nodes beside quadratic elements with middles."""
+    """Nodes of each named group of triangles; 3-node triangles of a quadratic mesh get their edges' middles."""
     sets = {}
     for name, parts in _triangle_groups(data).items():
         nodes = [part.ravel() for part in parts]
@@ -201,7 +201,7 @@ def _surface_sets(data: Any, tets: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _named_triangles(data: "meshio.Mesh") -> dict[str, np.ndarray]:
-    """Vertices (m, 3) of the triangles that the file groups under a name."""
+    """Vertices (m, 3) of each named group of triangles."""
     groups = _triangle_groups(data)
     return {name: np.concatenate([part[:, :3] for part in parts]).astype(np.int32) for name, parts in groups.items()}
 
@@ -230,9 +230,9 @@ def _middles(tets: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str, np.ndarray]:
-    """Numbers of the cells of some types, counted through their blocks, by the name of their group.
+    """Name of a group -> numbers of its cells, counted over all blocks of the types `cells`.
 
-    Groups that have a number alone are named by it if they are volumes, and left out if they are surfaces.
+    A group with a number but no name is named by its number if it is a volume, and left out if it is a surface.
     """
     kinds = [block.type for block in data.cells]
     first = np.cumsum([0, *(len(block.data) if block.type in cells else 0 for block in data.cells)])
@@ -262,14 +262,14 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
 
 
 def _are_whole(values: np.ndarray) -> bool:
-    """Whether all are whole numbers, of any type: ParaView's filters write those of regions as floats."""
+    """Whether all values are whole numbers, of any type: ParaView's filters write numbers of regions as floats."""
     if np.issubdtype(values.dtype, np.floating):
         return bool(np.all(np.isfinite(values)) and np.all(values == np.rint(values)))
     return np.issubdtype(values.dtype, np.integer)
 
 
 def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, object] | None = None) -> None:
-    """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that carry data."""
+    """Write a mesh [m] with meshio; sets are kept as 0/1 data ``set:NAME``, in formats that can store data."""
     import meshio
 
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
@@ -283,7 +283,7 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
         mask[np.asarray(elements)] = 1
         cell_data[f"set:{name}"] = [mask]
     cells = [meshio_cells(mesh)]
-    # meshio takes .msh for an ANSYS file; in this field it is Gmsh's.
+    # meshio would write .msh in the format of ANSYS; in this field it is Gmsh's.
     file_format = "gmsh" if Path(path).suffix == ".msh" else None
     meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
         path, file_format=file_format
@@ -291,7 +291,7 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
 
 
 def meshio_cells(mesh: TetMesh) -> tuple[str, np.ndarray]:
-    """Cells (E, 4) or (E, 10) as meshio has them, in the order of VTK."""
+    """meshio's name of the cells, and the cells (E, 4) or (E, 10) in the order of VTK."""
     if mesh.order == 1:
         return "tetra", np.asarray(mesh.tetrahedra)
     nodes = np.stack([np.asarray(n) for n in mesh.element_nodes], axis=1)

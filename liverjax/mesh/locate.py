@@ -8,9 +8,9 @@ from liverjax.core.errors import InputError
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import TetMesh
 
-#: Barycentric coordinate above minus this counts as inside.
+#: A point counts as inside if its barycentric coordinates are above minus this.
 _INSIDE = 1e-9
-#: Pieces of a line that are shorter, over the line's length, are left out.
+#: Pieces shorter than this part of the line's length are left out.
 _SHORTEST = 1e-9
 
 
@@ -53,7 +53,7 @@ def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarr
 
 
 def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
-    """Straight lines from `begin` to `end` (n, 3) cut at the faces of the tetrahedra; what lies outside is left out."""
+    """Straight lines from `begin` to `end` (n, 3) cut at the faces of the tetrahedra, without the parts outside."""
     found = []
     first, last = barycentric(mesh, begin), barycentric(mesh, end)
     for line in range(len(begin)):
@@ -67,7 +67,7 @@ def pieces(mesh: TetMesh, begin: np.ndarray, end: np.ndarray) -> Pieces:
         least = (a[:, None] + b[:, None] * middle[None, :, None]).min(axis=0)
         element = least.argmax(axis=1)
         inside = least[np.arange(len(middle)), element] > -_INSIDE
-        # Cuts by planes of far elements split nothing: neighbours in one element are one piece.
+        # The planes of far elements cut lines too: neighbouring parts in one element are joined to one piece.
         start = np.flatnonzero(inside & ~np.concatenate([[False], (element[1:] == element[:-1]) & inside[:-1]]))
         for k in start:
             stop = k

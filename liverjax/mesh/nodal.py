@@ -1,4 +1,4 @@
-"""Integrals of fields over nodes, and values of nodal fields at the points of elements."""
+"""Integrals of fields times nodal functions, and values of nodal fields at the points of elements."""
 
 from functools import cache
 from itertools import product
@@ -83,7 +83,7 @@ def _weighted_parts(mesh: TetMesh, parts: tuple[float, ...]) -> jax.Array:
 
 @cache
 def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Consistent mass of an element over its mass in two parts: a diagonal (n,), and what is left (n, n).
+    """Consistent mass matrix of an element divided by its mass, in two parts: a diagonal (n,) and the rest (n, n).
 
     The diagonal is the lumped mass. Functions of order 3 have no lumped mass: their entries are the integrals of their
     squares.
@@ -96,7 +96,7 @@ def mass_parts(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def products(order: int) -> np.ndarray:
-    """Integrals (n, n) of the products of two functions over an element, over its volume; exact."""
+    """Integrals (n, n) over an element of the products of two functions, divided by its volume; exact."""
     vertex = [tuple(int(k == a) for k in range(4)) for a in range(4)]
     if order == 1:
         functions: list[dict[tuple, float]] = [{v: 1.0} for v in vertex]

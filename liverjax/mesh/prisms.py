@@ -18,7 +18,7 @@ def stacked(plane: np.ndarray, triangles: np.ndarray, heights: np.ndarray) -> tu
 
 
 def _split(prisms: np.ndarray) -> np.ndarray:
-    """Three tetrahedra a prism (bottom a b c, top d e f); diagonals start at the lower node number, so faces match."""
+    """Cut prisms (bottom a b c, top d e f) in three; diagonals start at the lower node number, so faces match."""
     # Rotate each prism so that its smallest bottom number comes first: then only one quadrilateral is left to decide.
     shift = np.argmin(prisms[:, :3], axis=1)
     turn = (np.arange(3)[None] + shift[:, None]) % 3

@@ -40,7 +40,7 @@ def of_faces(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
 
 
 def cubic(mesh: TetMesh) -> TetMesh:
-    """A quadratic mesh with the functions of order 3 beside its own: unknowns, which are 0 in the reference shape."""
+    """A quadratic mesh with functions of order 3 added; their unknowns are 0 in the reference shape."""
     tets = np.asarray(mesh.tetrahedra)
     triples = np.concatenate([np.sort(tets[:, face], axis=1) for face in map(list, FACES)])
     _, number = np.unique(triples, axis=0, return_inverse=True)
@@ -51,7 +51,7 @@ def cubic(mesh: TetMesh) -> TetMesh:
 
 
 def _all_clusters(mesh: TetMesh) -> Clusters | None:
-    """Of all functions, each at its middle, where the vertices have clusters; host side."""
+    """Clusters of all functions, each at the middle of its edge or face; None if vertices have none; host side."""
     if mesh.pattern.clusters is None or isinstance(mesh.points, jax.core.Tracer):
         return None
     points, tets, (low, high) = (np.asarray(a) for a in (mesh.points, mesh.tetrahedra, mesh.pattern.edges))
@@ -78,7 +78,7 @@ def face_numbers(mesh: TetMesh, triangles: np.ndarray) -> np.ndarray:
 
 
 def with_faces(mesh: TetMesh, triangles: Indices) -> Indices:
-    """Triangles (m, 3) as a mesh of order 3 wants them: vertices in order, then the number of the face; host side."""
+    """Triangles (m, 3); in a mesh of order 3 (m, 4): vertices in order, then the number of the face; host side."""
     if mesh.order < 3:
         return triangles
     vertices = np.sort(np.asarray(triangles), axis=1)
@@ -111,7 +111,7 @@ def _nodes_of_face(face: tuple[int, ...]) -> list[int]:
 
 
 def on_middles(mesh: TetMesh, values: jax.Array) -> jax.Array:
-    """A field of the vertices (..., V), linear along every edge, at all nodes of the mesh."""
+    """Values at all nodes of a field that is linear along every edge, from its values (..., V) at the vertices."""
     if mesh.order == 1:
         return values
     low, high = mesh.pattern.edges

@@ -15,13 +15,13 @@ def refined(mesh: TetMesh, near: Indices | None = None) -> TetMesh:
     """The mesh with every tetrahedron cut into eight (Bey 1995), of the same order; host side.
 
     The old vertices keep their numbers, and the middles of the edges follow in the order of `pattern.edges`. So the new
-    vertices are the nodes of `quadratic(mesh)`. A node set takes in the new nodes on all faces that it holds. The
-    surface keeps its flat triangles: refinement does not bring it nearer to the organ.
+    vertices are the nodes of `quadratic(mesh)`. A node set also gets the new nodes on all faces whose three vertices it
+    contains. The surface keeps its flat triangles: refinement does not bring it nearer to the organ.
 
     Args:
-        near: node numbers (n,). With them only the edges that meet these nodes are halved, and as many others as keep
-            the mesh whole: an element is cut at its longest edge first (Rivara 1984), so elements stay as round as
-            they were. `rim` gives the nodes around a clamp, where most of a mesh's error is.
+        near: node numbers (n,). If given, only the edges at these nodes are halved, and the further edges that keep the
+            mesh conforming. An element is cut at its longest edge first (Rivara 1984), so elements do not become
+            flatter. `rim` gives the nodes around a clamp, where most of a mesh's error is.
     """
     V = mesh.number_of_vertices
     points, (low, high) = np.asarray(mesh.points)[:V], np.asarray(mesh.pattern.edges)
@@ -50,7 +50,7 @@ def _parts_of(triangles: np.ndarray, surface: np.ndarray, ends: np.ndarray) -> j
 
 
 def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
-    """Of some surface nodes (n,), those (m,) at the edge of the patch that they cover. Strain is largest there."""
+    """The nodes (m,) at the edge of the patch that surface nodes (n,) cover. Strain is largest there."""
     held = np.asarray(nodes)[np.asarray(nodes) < mesh.number_of_vertices]
     triangles = boundary_triangles(mesh, held)
     sides = np.sort(np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=1)
@@ -59,7 +59,7 @@ def rim(mesh: TetMesh, nodes: Indices) -> np.ndarray:
 
 
 def _eighths(mesh: TetMesh, middle: np.ndarray) -> np.ndarray:
-    """Elements (8 E, 4) of the numbers (N,) of the edges' middles."""
+    """Elements (8 E, 4), from the node numbers (N,) of the edges' middles."""
     a, b, c, d = np.asarray(mesh.tetrahedra).T
     ab, ac, ad, bc, bd, cd = middle[np.asarray(mesh.pattern.element_edges)]
     children = [
@@ -73,7 +73,7 @@ def _by_length(mesh: TetMesh) -> np.ndarray:
     """Ranks (N,) of the edges by length. No two are equal, so two elements cut their common face in the same way."""
     low, high = np.asarray(mesh.pattern.edges)
     points = np.asarray(mesh.points)
-    # Rounded, so that edges of one length are told by their number on every machine.
+    # Rounded, so that on every machine edges of equal length are ordered by their number.
     lengths = np.linalg.norm(points[low] - points[high], axis=1).astype(np.float32)
     place = np.empty(len(low), int)
     place[np.argsort(lengths, kind="stable")] = np.arange(len(low))

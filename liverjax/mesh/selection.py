@@ -34,7 +34,7 @@ def select(
             raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
         return np.asarray(mesh.node_sets[set])
     if not isinstance(where, Mapping):
-        raise InputError(f"{name} = {where!r} is no place: write where = {{z_max = 0.0}}")
+        raise InputError(f"{name} = {where!r} is not a place: write where = {{z_max = 0.0}}")
     points = np.asarray(mesh.points)
     tolerance = 1e-9 * np.linalg.norm(np.ptp(points, axis=0))
     inside = np.ones(len(points), dtype=bool)
@@ -54,7 +54,7 @@ def select(
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
-    """Outer triangles (m, 3), normals outwards; with `nodes` those whose three nodes are among them."""
+    """Outer triangles (m, 3), normals outwards; with `nodes` only those between these nodes."""
     tets = np.asarray(mesh.tetrahedra)
     faces = np.concatenate([tets[:, f] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
@@ -63,7 +63,7 @@ def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarra
 
 
 def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> np.ndarray:
-    """Outer triangles (m, 3) of a place: those between its nodes, or of a set of triangles these triangles alone.
+    """Outer triangles (m, 3) of a place: those between its nodes, or only those of the triangle set `set`.
 
     Args:
         mesh: `TetMesh`.
@@ -78,7 +78,7 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
 
 
 def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
-    """Refuse what is no list of node numbers (n,) below a count; host side.
+    """Refuse anything but a list of node numbers (n,) below `count`; host side.
 
     Raises:
         InputError: one sentence that begins with `name`.
@@ -91,18 +91,18 @@ def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:
         raise InputError(f"{name} names no node: give node numbers from 0 to {count - 1}")
     wrong = numbers[(numbers < 0) | (numbers >= count)]
     if wrong.size:
-        raise InputError(f"{name} names node {wrong[0]}, the mesh has 0 to {count - 1}: renumber them")
+        raise InputError(f"{name} names node {wrong[0]}, but the nodes are 0 to {count - 1}: renumber them")
 
 
 def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
-    """Refuse triangles (m, 3) that are no faces of elements; host side.
+    """Refuse triangles (m, 3) that are not faces of elements; host side.
 
     Raises:
         InputError: one sentence that begins with `name`.
     """
     numbers = np.asarray(triangles)
     if numbers.ndim != 2 or numbers.shape[1] != 3:
-        raise InputError(f"{name} has shape {numbers.shape}: give three node numbers a triangle (m, 3)")
+        raise InputError(f"{name} has shape {numbers.shape}: give three node numbers per triangle (m, 3)")
     check_nodes(numbers.ravel(), mesh.number_of_vertices, name)
     V, touched = mesh.number_of_vertices, np.zeros(mesh.number_of_vertices, bool)
     touched[numbers] = True
@@ -114,4 +114,4 @@ def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
     lost = np.flatnonzero(~np.isin(own @ code, faces @ code))
     if len(lost):
         first = numbers[lost[0]].tolist()
-        raise InputError(f"{name} has {first}, which is no face of an element: take boundary_triangles of the mesh")
+        raise InputError(f"{name} has {first}, not a face of an element: take boundary_triangles of the mesh")

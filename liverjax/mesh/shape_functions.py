@@ -7,8 +7,8 @@ With barycentric coordinates L_k and their constant gradients D_k, the shape vec
 with y_k = sum_a c_ak x_a: at each point an element of any order is a linear element with corners y_k. So the terms of
 MJED hold at every point, and no matrix is inverted there either.
 
-Functions of order 2: L_k (2 L_k - 1) of the vertices and 4 L_i L_j of the edges (10 nodes). Order 3 adds to these
-L_i L_j (L_i - L_j) of the edges and 27 L_i L_j L_k of the faces; their unknowns are no positions. It serves the
+Functions of order 2: L_k (2 L_k - 1) of the vertices and 4 L_i L_j of the edges (10 nodes). Order 3 adds to these L_i
+L_j (L_i - L_j) of the edges and 27 L_i L_j L_k of the faces; their unknowns are not positions. Order 3 is for the
 estimate of the mesh's error (`liverjax.simulation.mesh_error`).
 """
 
@@ -56,13 +56,13 @@ def functions(order: int, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _four_points() -> tuple[np.ndarray, np.ndarray]:
-    """Exact to degree 2 (Hammer and Stroud 1956)."""
+    """A rule that is exact to degree 2 (Hammer and Stroud 1956): weights (4,), coordinates (4, 4)."""
     near, far = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
     return np.full(4, 0.25), far + (near - far) * np.eye(4)
 
 
 def _fourteen_points() -> tuple[np.ndarray, np.ndarray]:
-    """Exact to degree 5, all weights positive (Walkington 2000)."""
+    """A rule that is exact to degree 5, with positive weights (Walkington 2000): weights (14,), coordinates (4, 14)."""
     columns, weights = [], []
     for a, w in ((0.31088591926330060980, 0.11268792571801585080), (0.092735250310891226402, 0.073493043116361949544)):
         columns += [np.where(np.arange(4) == k, 1 - 3 * a, a) for k in range(4)]

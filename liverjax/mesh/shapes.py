@@ -11,7 +11,7 @@ from liverjax.mesh.cylinders import graded, graded_cylinder
 from liverjax.mesh.prisms import stacked
 from liverjax.mesh.tetrahedra import TetMesh, tet_mesh
 
-#: The most tetrahedra of a shape; linear ones of so many take about 20 GB, with a run.
+#: The most tetrahedra of a shape; a run with so many linear ones takes about 20 GB.
 MOST_TETRAHEDRA = 20_000_000
 
 
@@ -56,7 +56,7 @@ def cylinder(
 
     Args:
         radius, height: [m].
-        cell_size: edge length aimed at [m]; at least two rings and one layer are made.
+        cell_size: target edge length [m]; at least two rings and one layer are made.
         rim_cell: edge length [m] at the rims of both faces and at `rings`; cells grow from there to `cell_size`.
         rings: radii [m] at which there is a ring of nodes, for instance that of a punch.
         match_area: give the polygons the areas of their circles.
@@ -89,14 +89,14 @@ def cylinder(
 def _graded(
     radius: float, height: float, cells: tuple[float, float], rings: Sequence[float], match_area: bool
 ) -> TetMesh:
-    """A cylinder whose cells are `cells` long: anywhere, and at its rims and rings."""
+    """A cylinder with cells of two lengths, `cells`: the first anywhere, the second at its rims and rings."""
     cell_size, rim_cell = cells
     _positive("rim_cell", [rim_cell])
     for ring in rings:
         if not (np.isfinite(ring) and 0 < ring < radius):
             raise InputError(f"shape rings = {list(rings)} must lie between 0 and the radius {radius:g}: mend them")
     largest = min(cell_size, radius / 2)
-    # A ring of radius r has at least 2 pi r / largest cells: as many prisms as cells of this length, at least.
+    # A ring of radius r has at least 2 pi r / largest cells: no fewer prisms than with cells of this length.
     _not_too_many(18 * math.ceil(radius / largest) ** 2 * math.ceil(height / cell_size), "radius, height and cell_size")
     _not_too_many(18 * math.ceil(min(radius, height) / rim_cell) ** 2 // 100, "rim_cell")
     radii = graded(radius, dict.fromkeys([*map(float, rings), float(radius)], rim_cell), largest)
@@ -125,7 +125,7 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _not_too_many(tetrahedra: int, names: str) -> None:
-    """Refuse a mesh that no memory holds, before it is made."""
+    """Refuse a mesh that is too large for any memory, before it is made."""
     if tetrahedra > MOST_TETRAHEDRA:
         raise InputError(
             f"shape {names} ask for about {tetrahedra:.2g} tetrahedra, more than {MOST_TETRAHEDRA:.0e}: are the "

@@ -11,14 +11,14 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 #: Edges of a triangle, in the order of its middles.
 _EDGES = ((0, 1), (1, 2), (2, 0))
-#: The same edges as functions of order 3 run along them, from the lower of two vertices in order.
+#: The same edges in the direction of their functions of order 3, for vertices in rising order.
 _THIRD = ((0, 1), (1, 2), (0, 2))
 
 
 def triangle_nodes(mesh: TetMesh, triangles: Indices) -> list[Indices]:
-    """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, of quadratic meshes, middles of edges.
+    """Numbers (m,) of the nodes of triangles (m, 3): their vertices and, in quadratic meshes, middles of edges.
 
-    Triangles (m, 4) of a mesh of order 3 have the functions of order 3 of their edges and of their face beside.
+    For triangles (m, 4) of a mesh of order 3 the functions of order 3 of their edges and of their face follow.
     """
     vertices = [triangles[:, a] for a in range(3)]
     if mesh.order == 1:
@@ -65,7 +65,7 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
         nodes, own = triangles.T, jnp.broadcast_to(-1 / 6 * twice, (3, *twice.shape))
     else:
         nodes = jnp.stack(triangle_nodes(mesh, triangles))
-        # Exact of quadratic positions, and so is the derivative of the unmoved shape.
+        # Exact for quadratic positions; so is the derivative in the reference shape.
         weights, l = triangle_rule(4 if mesh.order == 2 else 5)
         N, along = (_quadratic if mesh.order == 2 else _ten_functions)(l)
         signs = None if mesh.order == 2 else _signs_of_functions(triangles, x.dtype)
@@ -77,9 +77,9 @@ def pressure_forces(triangles: Indices, x: jax.Array, mesh: TetMesh | None = Non
 
 
 def _signs_of_functions(triangles: Indices, dtype: DTypeLike) -> jax.Array:
-    """Signs (10, m, 1) of the ten functions of triangles (m, 4) whose normals count, so that vertices are in no order.
+    """Signs (10, m, 1) of the ten functions of triangles (m, 4), whose vertices are in the order of the normal.
 
-    A function of order 3 of an edge points to the higher vertex: it has the other sign where the triangle runs down.
+    A function of order 3 on an edge points to the higher vertex: its sign is -1 if the triangle runs to the lower one.
     """
     signs = jnp.ones((10, len(triangles), 1), dtype)
     for k, (a, b) in enumerate(_THIRD):
@@ -116,7 +116,7 @@ def _quadratic(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _ten_functions(l: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The same, and those of order 3 of the edges and of the face, ten (10, Q)."""
+    """The functions of `_quadratic`, then those of order 3 of the edges and of the face: (10, Q); and their slopes."""
     N, slopes = _quadratic(l)
     zero = np.zeros_like(l[0])
     more, by = [], []

@@ -39,41 +39,41 @@ class TetMesh:
     element_sets: dict[str, Any] = param("1", "named arrays of element numbers")
     pattern: Pattern = param("1", "which vertices share an element")
     triangle_sets: dict[str, jax.Array] | None = param(
-        "1", "named arrays of vertices (m, 3) of triangles; None: no file had any", default=None
+        "1", "named arrays of vertices (m, 3) of triangles; None: the file had none", default=None
     )
-    faces: Any = param("1", "number of each of an element's faces (4, E), of order 3", default=None)
-    clusters: Any = param("1", "`Clusters` of all nodes of an order above 1, where cells are thin", default=None)
+    faces: Any = param("1", "numbers of every element's faces (4, E), for order 3", default=None)
+    clusters: Any = param("1", "`Clusters` of all nodes, if cells are thin and the order is above 1", default=None)
     order: int = static(default=1, about="of the shape functions: 1 linear, 2 quadratic", lower=1)
 
     @property
     def number_of_nodes(self) -> int:
-        """V, vertices and middles of edges."""
+        """Number of nodes V: vertices and middles of edges."""
         return self.points.shape[0]
 
     @property
     def number_of_vertices(self) -> int:
-        """Corners of elements: the first nodes."""
+        """Number of corners of elements, which are the first nodes."""
         return self.pattern.row_nodes.shape[1]
 
     @property
     def number_of_elements(self) -> int:
-        """E."""
+        """Number of elements, E."""
         return self.tetrahedra.shape[0]
 
     @property
     def weights(self) -> jax.Array:
-        """Reference volume [m^3] of every point of integration: (E,) of linear elements, else (Q, E)."""
+        """Reference volume [m^3] of every point of integration: (E,) for linear elements, else (Q, E)."""
         if self.order == 1:
             return self.volumes
         return jnp.asarray(basis(self.order).weights, self.volumes.dtype)[:, None] * self.volumes[None]
 
     @property
     def gradients(self) -> jax.Array:
-        """`shape_vectors` as they go with arrays over the points: (3, 3, E), or (3, 3, 1, E)."""
+        """`shape_vectors` in a shape that broadcasts over the points: (3, 3, E), or (3, 3, 1, E)."""
         return self.shape_vectors if self.order == 1 else self.shape_vectors[:, :, None]
 
     def at_points(self, numbers: T) -> T:
-        """A pytree, such as a law, whose numbers by element (E,) or (E, 3) go with arrays over the points."""
+        """A pytree, such as a law, with its numbers by element (E,) or (E, 3) shaped to broadcast over the points."""
         if self.order == 1:
             return numbers
         by_element = ((self.number_of_elements,), (self.number_of_elements, 3))
@@ -92,7 +92,7 @@ class TetMesh:
         return vertices + middles + [N + m for m in middles] + [V + 2 * N + face for face in self.faces]
 
     def edges(self, columns: Sequence[jax.Array]) -> list[tuple[jax.Array, ...]]:
-        """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array a column, (E,) or (Q, E).
+        """y_k - y_0 of a nodal field with columns (V,): for k = 1, 2, 3 one array per column, (E,) or (Q, E).
 
         y_k are the corners of `liverjax.mesh.shape_functions`; with shape vectors D_k the field's gradient is the sum
         of (y_k - y_0) D_k.
@@ -106,7 +106,7 @@ class TetMesh:
         return [tuple(y[k, :, i] for i in range(len(columns))) for k in range(3)]
 
     def spread(self, forces: Sequence[Sequence[jax.Array]]) -> list[jax.Array]:
-        """The transpose of `edges`: nodal columns (V,) from what acts on the corners 1, 2, 3, balanced at corner 0."""
+        """The transpose of `edges`: nodal columns (V,) from forces at corners 1, 2, 3, which corner 0 balances."""
         count = len(forces[0])
         if self.order == 1:
             forces = [[-(forces[0][i] + forces[1][i] + forces[2][i]) for i in range(count)], *forces]
@@ -167,9 +167,9 @@ def tet_mesh(
 
 
 def with_points(mesh: TetMesh, points: Numbers) -> TetMesh:
-    """The mesh with other reference positions (V, 3) [m], which may be traced; patches stay those it was made with.
+    """The mesh with other reference positions (V, 3) [m], which may be traced; its patches do not change.
 
-    Edges stay straight: where the mesh is quadratic the positions of their middles follow from those of the vertices.
+    Edges stay straight: in a quadratic mesh the positions of their middles follow from the vertices.
     """
     points = jnp.array(points, mesh.points.dtype)
     if points.shape != mesh.points.shape:
@@ -196,7 +196,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
     Raises:
         InputError: no elements, node numbers out of range, positions that are not finite, flat or inverted elements,
-            elements twice, nodes of no element.
+            elements that occur twice, nodes that belong to no element.
     """
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     if tets.size == 0:
@@ -218,7 +218,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
     if np.any(copies > 1):
         again = int(first[copies > 1].min())
         raise InputError(
-            f"{name}: {int((copies - 1).sum())} tetrahedra stand there twice (first: {again}, nodes "
+            f"{name}: {int((copies - 1).sum())} tetrahedra occur twice (first: {again}, nodes "
             f"{tets[again].tolist()}); remove the copies"
         )
     unused = np.setdiff1d(np.arange(mesh.number_of_vertices), tets)

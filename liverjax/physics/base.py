@@ -1,20 +1,20 @@
-"""What a physics is: one frozen struct of numbers, and a second struct that acts during a step.
+"""The base of every physics: one frozen struct of numbers, and a second struct that acts during a step.
 
 A scene has a tuple of physics. Each has a memory between steps, and parts that act during a step:
 
-* `begin(start)` -> memory: what it knows of the past at the beginning of a run, any pytree;
-* `freeze(memory, step)` -> what acts: everything that is constant during the step, put together once;
+* `begin(start)` -> memory: its memory at the beginning of a run, any pytree;
+* `freeze(memory, step)` -> the acting part, with everything that is constant during the step;
 * `advance(memory, acting, end)` -> memory: after an accepted step;
-* `check(...)`: refuses what no step can use, with one sentence.
+* `check(...)`: refuses numbers that no step can use, with one sentence.
 
-Loads and motions change during a step: they are asked for at part s of it, 0 at its beginning and 1 at its end.
+Loads and motions change during a step: they are evaluated at part s of it, 0 at its beginning and 1 at its end.
 
 The acting parts are of three kinds. Step, tangent and energy are sums over them and know nothing else.
 
 * `Solid` and `VolumeStress` act in elements, before assembly: stress and blocks of the stiffness.
 * `NodalForce` acts at nodes, after assembly: forces and blocks of the diagonal.
 
-A `VolumeStress` has pressures at the nodes. The mixed system of positions and pressures solves them
+A `VolumeStress` has pressures at the nodes. The mixed system of positions and pressures solves for them
 (`liverjax.simulation.mixed_system`).
 """
 
@@ -34,12 +34,12 @@ from liverjax.solvers.attached import definite as without_negative
 from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.tensors.matrices import Matrix, Vector
 
-#: Which blocks of the stiffness are asked for, as pairs of indices into a list of shape vectors.
+#: Blocks of the stiffness to compute, as pairs of indices into a list of shape vectors.
 Pairs = tuple[tuple[int, int], ...]
 
 
 class Tied(Protocol):
-    """Nodes that move together in a step, by a few numbers; a field of the nodes carries these numbers."""
+    """Nodes that move together in a step. A few numbers give their motion; these are stored in a field of the nodes."""
 
     def gathered(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
         """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
@@ -59,7 +59,7 @@ class Free(NamedTuple):
     tied: tuple[Tied, ...] = ()  # nodes that move together
 
     def vectors(self, field: jax.Array, x: jax.Array | None = None) -> jax.Array:
-        """The free part of a field (V, 3). Forces need the positions x (V, 3) where nodes move together."""
+        """The free part of a field (V, 3). Forces need the positions x (V, 3) if nodes move together."""
         field = self.mask * field
         if self.normals is not None:
             field = field - jnp.sum(self.normals * field, axis=1, keepdims=True) * self.normals
@@ -85,8 +85,8 @@ class Start(NamedTuple):
     mesh: TetMesh
     x: jax.Array  # (V, 3) [m]
     free: Free
-    force: Callable[[], jax.Array]  # (V, 3) [N] what acts on the nodes at x, without inertia
-    moved: bool = False  # whether the body was brought to x at this moment; if not, x is at rest or but a guess
+    force: Callable[[], jax.Array]  # (V, 3) [N] forces of the nodes at x, without inertia
+    moved: bool = False  # whether the body was brought to x at this moment; if not, x is at rest or only a guess
 
 
 class Step(NamedTuple):
@@ -97,7 +97,7 @@ class Step(NamedTuple):
     k: Number  # its number, from 1
     steps: int  # of the run
     dt: Any  # [s] or None: load steps without time
-    inertia: bool  # loads act at once where there is inertia
+    inertia: bool  # whether there is inertia: then loads act at once
     tolerance: Any  # of the residual, without derivative
     free: Free
 
@@ -111,7 +111,7 @@ class End(NamedTuple):
 
 
 class Solid:
-    """Acts in elements; depends on the deformation gradient alone."""
+    """A part that acts in elements and depends on the deformation gradient only."""
 
     def stress(self, F: Matrix) -> Matrix:
         """First Piola-Kirchhoff stress [Pa]."""
@@ -131,11 +131,11 @@ class Solid:
 
 
 class VolumeStress:
-    """Acts on the volume of elements, with pressures at the nodes."""
+    """A part that acts on the volume of elements, with pressures at the nodes."""
 
-    #: Whether pressures depend on where the step ends: then they are unknowns of the mixed system.
+    #: Whether pressures depend on the end of the step: then they are unknowns of the mixed system.
     coupled: ClassVar[bool] = True
-    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`), not solved for on the way.
+    #: Whether pressures are unknowns of Newton's method (`liverjax.physics.volumes.mixed`), not eliminated.
     unknown: ClassVar[bool] = False
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: Guess | None = None) -> jax.Array:
@@ -158,18 +158,18 @@ class VolumeStress:
         """Matrix of the pressures [m^3/Pa]; `positive`: with no negative eigenvalue."""
         raise TypeError(f"{type(self).__name__} lacks matrix(mesh, J, positive)")
 
-    #: The equation of pressures that flow (`liverjax.physics.darcy.Flow`); None: each node by itself.
+    #: The equation of pressures that flow (`liverjax.physics.darcy.Flow`); None: there is no flow between nodes.
     flow: Any = None
 
 
 class NodalForce:
-    """Acts at nodes."""
+    """A part that acts at nodes."""
 
-    #: Whether it acts on every node: then it keeps slow motions from holding up the linear solver.
+    #: Whether it acts on every node: then slow motions do not slow down the linear solver.
     everywhere: ClassVar[bool] = False
     #: Whether the force has an energy; one that follows the body has none, and its stiffness is not symmetric.
     conservative: bool = True
-    #: Whether the force has kinks, as where a surface comes to touch.
+    #: Whether the force has kinks, as at the beginning of contact.
     kinked: ClassVar[bool] = False
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -183,12 +183,12 @@ class NodalForce:
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
         """An energy [J] at x whose gradient at `start` (V, 3) is the force there, for a search that begins there.
 
-        It is the energy itself where there is one. Otherwise the part that has no energy is held as it is at `start`.
+        It is the energy itself if the force has one. Otherwise the part without an energy keeps its value at `start`.
         """
         return self.energy(mesh, x)
 
     def stiffness(self) -> Block | None:
-        """Diagonal blocks 3 x 3 of (V,) [N/m], an entry None where it is 0; None: the force is constant."""
+        """Diagonal blocks 3 x 3 of (V,) [N/m], with None for entries that are 0; None: the force is constant."""
         return None
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
@@ -196,7 +196,7 @@ class NodalForce:
         return None
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Between | None:
-        """The same without negative eigenvalues."""
+        """`attached` without negative eigenvalues."""
         own = self.attached(mesh, x, s)
         return without_negative(own) if isinstance(own, Attached) else own
 
@@ -207,7 +207,7 @@ class NodalForce:
         return None
 
     def predicted(self) -> jax.Array | None:
-        """Positions (V, 3) [m] where the body would go by itself: the first guess of Newton; None: it stays."""
+        """Positions (V, 3) [m] that the body would reach without forces, Newton's first guess; None: it stays."""
         return None
 
     def product(self, mesh: TetMesh, x: jax.Array, s: Number, dx: jax.Array) -> jax.Array:
@@ -222,7 +222,7 @@ class Physics:
     __dataclass_fields__: ClassVar[Content]
     #: Table of the scene file that it is read from, and the keys of that table.
     section: ClassVar[str] = ""
-    #: Whether it makes nodes move together: the factorisation knows no such rows.
+    #: Whether it makes nodes move together: the factorisation cannot treat them.
     ties: ClassVar[bool] = False
     #: Whether its forces have an energy; those of friction have none.
     conservative: ClassVar[bool] = True
@@ -230,7 +230,7 @@ class Physics:
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> "Physics":
-        """From a table of a scene file.
+        """Read the physics from a table of a scene file.
 
         Raises:
             InputError: values that cannot be used.
@@ -245,7 +245,7 @@ class Physics:
         """
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse a mesh that it cannot begin with; host side. A loaded mesh may be any: no run begins there.
+        """Refuse a mesh that it cannot begin with; host side. A loaded mesh is not checked: no run begins there.
 
         Raises:
             InputError: one sentence that begins with `name`.
@@ -292,7 +292,7 @@ class Physics:
         return None
 
     def output(self, memory: Any) -> dict[str, jax.Array]:
-        """Fields of the vertices (V,) for the result, beside positions and reactions."""
+        """Further fields of the vertices (V,) for the result, besides positions and reactions."""
         return {}
 
 

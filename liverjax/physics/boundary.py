@@ -1,4 +1,4 @@
-"""All that holds, moves and loads a body, under one name: `lj.boundary`."""
+"""Supports, prescribed motions and loads of a body, under one name: `lj.boundary`."""
 
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.selection import AXES, boundary_triangles, select, surface_of

@@ -25,7 +25,7 @@ LEAST_J = 1e-3
 
 
 class Flow(NamedTuple):
-    """dt times storage rate plus Darcy's Laplacian, in the positions at the beginning of a step: made once a step."""
+    """dt times storage rate plus Darcy's Laplacian, at the positions of a step's beginning: made once per step."""
 
     matrix: block_matrix.BlockMatrix  # symmetric positive definite, 1 x 1 blocks
     store: jax.Array  # (V,) [m^3/Pa]
@@ -35,7 +35,7 @@ class Flow(NamedTuple):
     high: jax.Array  # no eigenvalue of D^-1 A is above it
     tolerance: jax.Array  # of a solve, relative to its right-hand side
     given: jax.Array | None = None  # (V,) [Pa] pressures where they are given, 0 elsewhere; None: they are 0
-    enters: jax.Array | None = None  # (V,) [m^3] what enters during the step; None: nothing does
+    enters: jax.Array | None = None  # (V,) [m^3] fluid that enters during the step; None: none enters
 
 
 def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Array:
@@ -53,7 +53,7 @@ def unknown_pressures(porosity: Any, mesh: TetMesh, dtype: jnp.dtype) -> jax.Arr
 def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tolerance: jax.Array) -> Flow:
     """The matrix of the pressure equation for a step of dt [s] that begins at F, with volume ratios J (E,)."""
     mask = unknown_pressures(porosity, mesh, J.dtype)
-    # Everything times dt: the storage term stays of the size of a volume whatever the step.
+    # Everything is multiplied by dt, so that the storage term does not depend on the step.
     J = jnp.maximum(J, LEAST_J)
     by_element = jnp.ndim(porosity.limit_bulk) > 0
     store = integrals(mesh, J / porosity.limit_bulk) if by_element else integrals(mesh, J) / porosity.limit_bulk
@@ -71,13 +71,13 @@ def flow(porosity: Any, mesh: TetMesh, J: jax.Array, F: Matrix, dt: Number, tole
 
 
 def _least_eigenvalue(mesh: TetMesh, rate: Number, store: jax.Array, diagonal: jax.Array) -> jax.Array:
-    """About the least eigenvalue of D^-1 A beyond the coarse space, at rates dt kappa, one or one an element."""
+    """About the least eigenvalue of D^-1 A beyond the coarse space, at rates dt kappa, one or one per element."""
     stored, total = jnp.sum(store), jnp.sum(diagonal)
     if jnp.ndim(rate):
-        # It is least where the fluid flows fastest: the whole body as if it flowed so everywhere.
+        # It is least where the fluid flows fastest: treat the whole body as if it flowed so everywhere.
         fastest, mean = jnp.max(rate), jnp.sum(jnp.ravel(rate) * mesh.volumes) / jnp.sum(mesh.volumes)
         total, rate = stored + (total - stored) * fastest / jnp.where(mean > 0, mean, 1.0), fastest
-    # Storage, and Darcy flow at the wave number 5 / width: slower waves the coarse space takes (measured: 4.9 to 5.4).
+    # Storage, and Darcy flow at the wave number 5 / width: the coarse space treats slower waves (measured: 4.9 to 5.4).
     waves = rate * (5 / mesh.pattern.patch_width) ** 2 * jnp.sum(mesh.volumes)
     return (stored + waves) / total
 
@@ -151,7 +151,7 @@ def flow_product(flow: Flow, p: jax.Array) -> jax.Array:
     return flow.store * p + jnp.sum(rows * (p[nodes] - p[None]), axis=0)
 
 
-#: Error of the polynomial that stands for the inverse of the pressure's matrix in Newton's direction.
+#: Error of the polynomial that replaces the inverse of the pressure's matrix in Newton's direction.
 _POLYNOMIAL_ERROR = 0.1
 
 

@@ -2,8 +2,9 @@
 
 Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
 (a Winkler foundation). They begin without tension. A history of factors changes their stiffness in time. A history of
-displacements moves the wall, and the springs with it. Each node of a triangle has a third of it; in quadratic elements
-the middles of its edges have these thirds. The functions of order 3, of the mesh's estimate, have their integrals.
+displacements moves the wall, and the springs with it. Each node of a triangle gets a third of its stiffness; in
+quadratic elements the middles of its edges get these thirds. For the functions of order 3, which the estimate of the
+mesh's error uses, the springs are integrated over the triangle.
 """
 
 from collections.abc import Callable
@@ -38,7 +39,7 @@ class ElasticSupport(Physics):
     stiffness: Number = param("N/m", "of each node, in every direction", lower=0.0, default=0.0)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param(
-        "1", "factors of the stiffness (T,), or where the wall moves to (T, 3) [m]", default=None
+        "1", "factors of the stiffness (T,), or displacements of the wall (T, 3) [m]", default=None
     )
 
     section: ClassVar[str] = "support"
@@ -46,7 +47,7 @@ class ElasticSupport(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "ElasticSupport":
-        """From [[support]]: a place, and stiffnesses."""
+        """Read [[support]]: a place, and stiffnesses."""
         nodes = selection.select(mesh, table.get("where"), table.get("set"), f"{name} where")
         given: Content = {k: table[k] for k in ("normal", "tangential", "stiffness") if k in table}
         if ("stiffness" in given) == bool({"normal", "tangential"} & set(given)):
@@ -83,7 +84,7 @@ class ElasticSupport(Physics):
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
-        """One symmetric block a node, or one a point of functions of order 3."""
+        """The springs: one symmetric block per node, or one per point of a triangle if the mesh has order 3."""
         kind: Any = Foundation if self.triangles is not None and step.mesh.order == 3 else Springs
         own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
         given = {"triangles": self.triangles} if kind is Foundation else {}
@@ -95,7 +96,7 @@ class ElasticSupport(Physics):
         return kind(blocks=tuple(tuple(after * entry for entry in row) for row in own), **given)
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "ElasticSupport":
-        """On the same triangles or nodes."""
+        """The support on the same triangles or nodes of the richer mesh."""
         if self.triangles is None:
             return self
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
@@ -116,7 +117,7 @@ def _refuse_idle(support: ElasticSupport, keys: tuple[str, ...], name: str, inst
 
 
 def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """3 x 3 blocks of (V,) [N/m]."""
+    """Stiffness of the nodes: 3 x 3 blocks of arrays (V,) [N/m]."""
     zero = jnp.zeros(mesh.points.shape[0], mesh.points.dtype)
     if support.triangles is None:
         own = zero.at[support.nodes].add(support.stiffness)
@@ -132,13 +133,13 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
 
 
 def point_blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
-    """3 x 3 blocks of (Q, m) [N/m]: of the points of triangles."""
+    """Stiffness of the points of triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
     weights = triangle_rule(_DEGREE)[0]
     return _each(support, mesh, lambda whole: jnp.asarray(weights, whole.dtype)[:, None] * whole[None])
 
 
 def _each(support: ElasticSupport, mesh: TetMesh, shared: Callable[[jax.Array], jax.Array]) -> Block:
-    """3 x 3 blocks of what `shared` makes of the stiffness (m,) [N/m] of triangles."""
+    """3 x 3 blocks, to which `shared` distributes the stiffness (m,) [N/m] of triangles."""
     normal = surface.areas(mesh.points, support.triangles)
     area = jnp.sqrt(jnp.sum(normal * normal, axis=1))
     n = normal / area[:, None]
@@ -167,22 +168,22 @@ class Springs(NodalForce):
         return x - mesh.points - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Blocks times displacement."""
+        """Forces (V, 3) [N]: blocks times stretch."""
         u = self._stretch(mesh, x, s).T
         return jnp.stack([sum(row[c] * u[c] for c in range(3)) for row in self.blocks], axis=-1)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Half of displacement times force."""
+        """Half of stretch times force."""
         return 0.5 * jnp.sum(self._stretch(mesh, x, 1.0) * self.force(mesh, x, 1.0))
 
     def stiffness(self) -> Block:
-        """The blocks."""
+        """The blocks, which are constant during the step."""
         return self.blocks
 
 
 @struct
 class Foundation(NodalForce):
-    """Springs during a step at the points of triangles, for functions of order 3: each function has its integral."""
+    """Springs during a step at the points of triangles, for functions of order 3, integrated over triangles."""
 
     triangles: Indices = param("1", "(m, 4), as in `liverjax.mesh.promotion.with_faces`")
     blocks: Block = param("N/m", "3 x 3 of (Q, m)")

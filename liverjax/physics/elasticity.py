@@ -1,4 +1,4 @@
-"""A hyperelastic solid: its law acts in every element, and nothing is remembered."""
+"""A hyperelastic solid: its law acts in every element, without memory."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ class Elasticity(Physics):
     law: Law = param("1", "the law")
 
     def freeze(self, memory: None, step: Step) -> "Elastic":
-        """The law itself."""
+        """The law, ready to act during a step."""
         return Elastic(law=self.law)
 
 
@@ -29,11 +29,11 @@ class Elastic(Solid):
     law: Law = param("1", "the law")
 
     def stress(self, F: Matrix) -> Matrix:
-        """The hand-derived terms."""
+        """First Piola-Kirchhoff stress by the hand-derived terms."""
         return invariant_terms.first_piola(self.law, F)
 
     def blocks(self, F: Matrix, D: list[Vector], pairs: Pairs) -> list[Matrix]:
-        """By the hand-derived terms."""
+        """Blocks of the stiffness by the hand-derived terms."""
         return invariant_terms.blocks(invariant_terms.state(self.law, F), D, pairs)
 
     def energy(self, F: Matrix) -> jax.Array:
@@ -41,5 +41,5 @@ class Elastic(Solid):
         return self.law.strain_energy(self.law.measures(F))
 
     def parts(self) -> tuple[list[tuple[Any, Any]], None]:
-        """The law alone."""
+        """The law with weight 1, and no constant stress."""
         return [(1.0, self.law)], None

@@ -31,7 +31,7 @@ class Motion(NamedTuple):
 class Inertia(Physics):
     """Mass of the body, at its nodes or as the integrals of the products of its functions."""
 
-    density: Any = param("kg/m^3", "per reference volume, one number or one a node (V,)", above=0.0)
+    density: Any = param("kg/m^3", "per reference volume, one number or one per node (V,)", above=0.0)
     integrator: str = static(default="euler", about="euler (first order) or newmark (second order)")
     mass: str = static(default="lumped", about="lumped: at the nodes; or consistent")
 
@@ -91,7 +91,7 @@ class Moving(NodalForce):
     dt: jax.Array = param("s", "time step")
     mask: jax.Array = param("1", "(V, 3) 1 where free")
     integrator: str = static(default="euler")
-    shared: Masses | None = param("kg", "what elements have beside the masses of their nodes", default=None)
+    shared: Masses | None = param("kg", "rest of the elements' consistent mass; None: lumped", default=None)
 
     everywhere: ClassVar[bool] = True
 
@@ -101,7 +101,7 @@ class Moving(NodalForce):
         velocity = (x - self.x) / dt
         acceleration = (velocity - before.velocity) / dt
         if before.acceleration is not None:
-            # Free degrees only: where motion is prescribed the average acceleration would swing without end.
+            # Free degrees only: where motion is prescribed the average acceleration would oscillate without end.
             average = 4 * acceleration - before.acceleration
             free = self.mask > 0
             velocity = jnp.where(free, before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
@@ -109,7 +109,7 @@ class Moving(NodalForce):
         return velocity, acceleration
 
     def predicted(self) -> jax.Array:
-        """Straight on."""
+        """Positions after a motion at constant velocity."""
         return self.x + self.dt * self.motion.velocity
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -122,11 +122,11 @@ class Moving(NodalForce):
         return 0.5 * self.dt**2 / FACTOR[self.integrator] * jnp.sum(_inertia(self.mass, self.shared, a) * a)
 
     def stiffness(self) -> Block:
-        """k m/dt^2 along every axis."""
+        """Stiffness k m/dt^2 of every node along every axis."""
         return diagonal(FACTOR[self.integrator] / self.dt**2 * self.mass)
 
     def attached(self, mesh: TetMesh, x: jax.Array, s: Number) -> Masses | None:
-        """The same k/dt^2 times the masses that the nodes of an element share."""
+        """k/dt^2 times the rest of the consistent mass, between the nodes of an element."""
         if self.shared is None:
             return None
         return self.shared._replace(size=FACTOR[self.integrator] / self.dt**2 * self.shared.size)

@@ -18,8 +18,8 @@ class Traction:
     """A load on boundary triangles: dead (`value`), or a pressure that follows them."""
 
     triangles: Indices = param("1", "node numbers (m, 3), normals outwards", lower=0)
-    value: Any = param("Pa", "force per reference area (3,); direction and reference area count", default=None)
-    pressure: Number | None = param("Pa", "positive pushes inwards; normal and area of the moment", default=None)
+    value: Any = param("Pa", "force per reference area (3,), in a fixed direction", default=None)
+    pressure: Number | None = param("Pa", "positive pushes inwards; current normal and area", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Any = param("1", "factors of value or pressure (T,), or the value itself (T, 3) [Pa]", default=None)
 
@@ -61,10 +61,10 @@ def follower_forces(tractions: tuple, x: jax.Array, mesh: TetMesh | None = None)
 
 
 def dead_loads(mesh: TetMesh, density: Number, gravity: Numbers, tractions: tuple) -> jax.Array:
-    """Nodal forces (V, 3) [N] that do not follow the body: weight (none where `density` is None) and tractions."""
+    """Nodal forces (V, 3) [N] that do not follow the body: weight (none if `density` is None) and tractions."""
     force = jnp.zeros(mesh.points.shape, mesh.points.dtype)
     if density is not None:
-        # A node's own density weighs its share of a linear element; of a quadratic one that share may be negative.
+        # A node's own density weighs its share of the elements; in quadratic elements a vertex's share is negative.
         mass = density * load_volumes(mesh)
         force = force + mass[:, None] * jnp.asarray(gravity, force.dtype)[None]
     return force + nodal_tractions(mesh, tractions) if tractions else force
@@ -81,7 +81,7 @@ class Loads(Physics):
     traction: tuple[Traction, ...] = param("1", "on the surface", default=())
 
     def freeze(self, memory: None, step: Step) -> "Loading":
-        """Dead loads are summed once; which part of them acts depends on the part of the step."""
+        """Dead loads are summed once; the fraction of them that acts depends on the part of the step."""
         if self.history is not None or any(load.history is not None for load in self.traction):
             begin, end = (self.at(n * step.dt)._loading(step, "none") for n in (step.k - 1, step.k))
             return replace(end, before=begin)
@@ -103,15 +103,15 @@ class Loading(NodalForce):
     """Loads during a step."""
 
     dead: jax.Array = param("N", "(V, 3)")
-    traction: tuple[Traction, ...] = param("1", "of which pressures follow the body")
+    traction: tuple[Traction, ...] = param("1", "tractions; pressures among them follow the body")
     k: Number = param("1", "number of the step")
     steps: int = static(default=1, about="of the run")
     growth: str = static(default="none", about="steps: with the load steps; first: within the first step; none")
-    before: "Loading | None" = param("1", "at the beginning of the step, where there is a history", default=None)
+    before: "Loading | None" = param("1", "loads at the beginning of the step, if there is a history", default=None)
 
     @property
     def conservative(self) -> bool:  # type: ignore[override]
-        """No pressure follows the body."""
+        """Whether no pressure follows the body."""
         return not follows(self.traction)
 
     def fraction(self, s: Number) -> Any:
@@ -122,7 +122,7 @@ class Loading(NodalForce):
         return jnp.ones((), dtype) if self.growth == "none" else jnp.where(self.k == 1, s, 1.0).astype(dtype)
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Any) -> jax.Array:
-        """Minus the loads. With a history they change linearly from the beginning to the end of the step."""
+        """Minus the loads (V, 3) [N]. With a history they change linearly from the beginning to the end of the step."""
         if self.before is not None:
             end = replace(self, before=None)
             return s * end.force(mesh, x, s) + (1 - s) * self.before.force(mesh, x, s)
@@ -136,7 +136,7 @@ class Loading(NodalForce):
         return -jnp.vdot(self.fraction(jnp.ones((), x.dtype)) * self.dead, x - mesh.points)
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Pressures that follow are held as they are at `start`."""
+        """Energy with pressures that follow the body kept at their values at `start`."""
         if self.conservative:
             return self.energy(mesh, x)
         return jnp.vdot(self.force(mesh, start, jnp.ones((), x.dtype)), x - start)

@@ -39,9 +39,9 @@ SCHEMES = ("implicit", "lagged")
 class Inlet:
     """A part of the body with a given pressure of the fluid, or a given flux through its surface."""
 
-    nodes: Indices | None = param("1", "nodes of the pressure (n,)", lower=0, default=None)
+    nodes: Indices | None = param("1", "nodes with the given pressure (n,)", lower=0, default=None)
     pressure: Number | None = param("Pa", "of the fluid at the nodes", default=None)
-    triangles: Any = param("1", "surface of the flux, node numbers (m, 3)", lower=0, default=None)
+    triangles: Any = param("1", "triangles with the given flux, node numbers (m, 3)", lower=0, default=None)
     flux: Number | None = param("m/s", "volume that enters per reference area and time", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param("1", "factors of pressure or flux (T,)", default=None)
@@ -56,14 +56,14 @@ class Porosity(Physics):
     """A sponge of bulk modulus K0 filled with a fluid that makes up the part r_w of its volume."""
 
     bulk: Number = param("Pa", "K0, bulk modulus of the drained sponge at rest", above=0.0)
-    limit_bulk: Number = param("Pa", "K_lim, of the compressed sponge and of the pressure", above=0.0)
+    limit_bulk: Number = param("Pa", "K_lim, bulk modulus of the compressed sponge and for the pressure", above=0.0)
     fluid_fraction: Number = param("1", "r_w", above=0.0, upper=1.0)
     permeability: Number = param("m^4/(N s)", "kappa", lower=0.0)
     drained: Indices | None = param("1", "nodes where P = 0 (n,); None: sealed", lower=0, default=None)
     inlet: tuple[Inlet, ...] = param("1", "given pressures and fluxes", default=())
     initial_pressure: Number | None = param("Pa", "of the fluid at the beginning; None: 0", default=None)
     scheme: str = static(default="implicit", about="implicit or lagged (the chapter's)", words=SCHEMES)
-    keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy beside that of the sponge")
+    keep_bulk: bool = static(default=False, about="keep the law's own volumetric energy in addition to the sponge's")
 
     def __post_init__(self) -> None:
         """The old name of a scheme becomes the new one."""
@@ -71,7 +71,7 @@ class Porosity(Physics):
             object.__setattr__(self, "scheme", "lagged")
 
     def begin(self, start: Start) -> "Fluid":
-        """No pressure, reference volumes."""
+        """The fluid at the beginning of a run: initial pressure, reference volumes."""
         return initial_fluid(self, start.mesh)
 
     def freeze(self, memory: "Fluid", step: Step) -> "Sponge":
@@ -94,7 +94,7 @@ class Porosity(Physics):
         return self.bulk
 
     def output(self, memory: "Fluid") -> dict[str, jax.Array]:
-        """The fluid's pressure."""
+        """The fluid's pressure (V,) [Pa], by its name."""
         return {"pressure": memory.pressure}
 
 
@@ -149,15 +149,16 @@ def check_limit(porosity: Porosity) -> None:
 
 
 def law_in_force(porosity: Porosity | None, law: Law) -> Law:
-    """The law beside the sponge. It has no volumetric energy U(J) of its own, unless asked for, since bulk would count
-    twice: every summand is without it. A law that does not separate volume change from shear stays whole."""
+    """The law that acts in parallel to the sponge. Its summands have no volumetric energy U(J), unless `keep_bulk` is
+    set, since bulk would count twice. A law that does not separate volume change from shear stays whole.
+    """
     if porosity is None or porosity.keep_bulk:
         return law
     return law.each(lambda own: own.without_volume() or Volumetric(bulk=0.0))
 
 
 def bulk_in_force(porosity: Porosity, law: Law) -> str:
-    """One sentence: which bulk modulus acts."""
+    """One sentence that says which bulk modulus acts."""
     sponge = f"bulk modulus in force: the sponge's, {float(porosity.bulk):g} Pa"
     if porosity.keep_bulk:
         return f"{sponge}, and the law's own (keep_bulk)"
@@ -167,8 +168,8 @@ def bulk_in_force(porosity: Porosity, law: Law) -> str:
         return f"{sponge}; the law's own volumetric energy is off"
     names = " and ".join(dict.fromkeys(type(getattr(part, "law", part)).__name__ for part in whole))
     changed = any(part.without_volume() is not part for part in parts)
-    off = "; the volumetric energy that stands apart is off" if changed else ""
-    return f"{sponge}, and what {names} has in one with its shear{off}"
+    off = "; the separate volumetric energy is off" if changed else ""
+    return f"{sponge}, and the part of {names} that is not separate from shear{off}"
 
 
 def volumetric_stress(porosity: Porosity, J: Number) -> Number:
@@ -197,7 +198,7 @@ def volumetric_energy(porosity: Porosity, J: Number) -> Number:
 
 
 def initial_fluid(porosity: Porosity, mesh: TetMesh) -> Fluid:
-    """No pressure, reference volumes."""
+    """The initial pressure (0 if None), and reference volumes."""
     J = jnp.ones_like(mesh.weights)
     start = 0.0 if porosity.initial_pressure is None else porosity.initial_pressure
     return Fluid(jnp.full(mesh.number_of_vertices, start, J.dtype), J, J if porosity.scheme == "lagged" else None)
@@ -261,7 +262,7 @@ class Sponge(VolumeStress):
 
 @struct
 class CoupledSponge(Sponge):
-    """The pressure belongs to the end of the step."""
+    """Sponge and fluid, with the pressure of the end of the step."""
 
     porosity: Porosity = param("1", "its numbers")
     fluid: Fluid = param("1", "at the beginning of the step")
@@ -272,12 +273,12 @@ class CoupledSponge(Sponge):
         return pressure(self.porosity, mesh, self.fluid, self.flow, J, guess)
 
     def in_force(self, pressure: jax.Array) -> jax.Array:
-        """Pressures (V,) [Pa] with the given ones where they are given."""
+        """Pressures (V,) [Pa], with the given values at nodes where a pressure is given."""
         free = self.flow.mask * pressure
         return free if self.flow.given is None else free + self.flow.given
 
     def balance(self, mesh: TetMesh, pressure: jax.Array, J: jax.Array) -> jax.Array:
-        """Volumes (V,) [m^3] that pressures leave over: 0 at a solution. Where they are given, minus their error."""
+        """Residual (V,) [m^3] of the pressure equation, 0 at a solution; where a pressure is given, minus its error."""
         b = self.flow.store * self.fluid.pressure - integrals(mesh, J - self.fluid.J)
         return darcy.lack(self.flow, b, pressure)
 
@@ -293,7 +294,7 @@ class CoupledSponge(Sponge):
 
 @struct
 class LaggedSponge(Sponge):
-    """The pressure is known from the beginning of the step."""
+    """Sponge and fluid, with a pressure that is known from the beginning of the step."""
 
     coupled: ClassVar[bool] = False
     porosity: Porosity = param("1", "its numbers")
@@ -301,7 +302,7 @@ class LaggedSponge(Sponge):
     given: jax.Array = param("Pa", "the pressure (V,)")
 
     def pressure(self, mesh: TetMesh, J: jax.Array, guess: darcy.Guess | None = None) -> jax.Array:
-        """Wherever the step ends."""
+        """The known pressures, which do not depend on the end of the step."""
         return self.given
 
     def energy(self, mesh: TetMesh, J: jax.Array) -> jax.Array:

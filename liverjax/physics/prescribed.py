@@ -21,10 +21,10 @@ class Fixed:
 
 @struct
 class Displaced:
-    """Nodes that are moved by `by` at the last step, in proportion before; or along a history, which may scale `by`."""
+    """Nodes that move in proportion, up to `by` at the last step; or along a history, which may scale `by`."""
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
-    by: Numbers | None = param("m", "displacement (3,), or one a node (n, 3), reached at the last step", default=None)
+    by: Numbers | None = param("m", "displacement (3,), or one per node (n, 3), reached at the last step", default=None)
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param(
         "m", "displacements at these times (T, 3), or factors of by (T,); linear in between", default=None
@@ -33,7 +33,7 @@ class Displaced:
 
 
 def check_axes(axes: object, name: str) -> None:
-    """Refuse what does not name axes.
+    """Refuse a value that does not name axes.
 
     Raises:
         InputError: one sentence that begins with `name`.
@@ -54,7 +54,7 @@ def free_degrees(mesh: TetMesh, fixed: tuple, displaced: tuple) -> jax.Array:
 
 
 def free_places(mesh: TetMesh, fixed: tuple, displaced: tuple) -> np.ndarray:
-    """The same on the host (V, 3), for checks: True if unknown."""
+    """`free_degrees` on the host (V, 3), for checks: True if unknown."""
     free = np.ones(mesh.points.shape, bool)
     for condition in (*fixed, *displaced):
         for axis in condition.axes:

@@ -20,7 +20,7 @@ from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.physics.volumes.averaged import AveragedVolume
 from liverjax.physics.volumes.mixed import MixedVolume
 
-#: Physics with a table of their own in scene files: a new one is a line here.
+#: Physics with a table of their own in scene files: a new one needs a line here.
 NAMED: tuple[type[Physics], ...] = (
     ElasticSupport,
     SlidingSupport,
@@ -34,7 +34,7 @@ NAMED: tuple[type[Physics], ...] = (
 
 
 def law_at_rest(scene: Any) -> Law:
-    """The whole law of the body at rest: beside a sponge, the law without its own volumetric energy."""
+    """The law of the body at rest; with a sponge, the law without its own volumetric energy."""
     return porosity.law_in_force(scene.porosity, scene.law)
 
 

@@ -1,9 +1,9 @@
 """A rigid plate: nodes that turn about an axis as one body, by an angle or a torque given over time.
 
-The nodes of the plate keep two motions only: the turn, and the way along the axis if that is free.
-Unknowns stay nodal vectors. The turn is carried by the field b = e x (x - c) / R of the plate's nodes at the beginning
-of a step. R^2 is the sum of their squared distances from the axis. A field a b stands for the angle a / R. Positions
-follow the circle exactly, so angles may be large.
+The nodes of the plate keep two motions only: the turn, and the displacement along the axis if that is free. Unknowns
+stay nodal vectors. The field b = e x (x - c) / R, for the plate's nodes at the beginning of a step, represents the
+turn. R^2 is the sum of their squared distances from the axis. A field a b means the angle a / R. Positions follow
+the circle exactly, so angles may be large.
 """
 
 from collections.abc import Callable
@@ -53,12 +53,12 @@ class RigidPlate(Physics):
             raise InputError(f"{name} has all its nodes on its axis: name more nodes, or move the centre")
 
     def at_rest(self, mesh: TetMesh) -> "Plate":
-        """Its nodes in the reference positions."""
+        """The plate's nodes in the reference positions."""
         X, zero = mesh.points[self.nodes], jnp.zeros((), mesh.points.dtype)
         return Plate(self, X, X, zero, zero)
 
     def tied(self, step: Step) -> "Plate":
-        """Its nodes during a step."""
+        """The plate's nodes during a step."""
         before = after = jnp.asarray(self.turn)
         if self.times is not None:
             before, after = (jnp.interp(step.dt * n, jnp.asarray(self.times), after) for n in (step.k - 1, step.k))
@@ -71,7 +71,7 @@ class RigidPlate(Physics):
         return Torque(plate=self.tied(step))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "RigidPlate":
-        """With the nodes in between."""
+        """The plate with the nodes in between."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +91,7 @@ class Plate(NamedTuple):
 
     plate: RigidPlate
     reference: jax.Array  # (n, 3) [m]
-    carrier: jax.Array  # (n, 3) [m] positions at the beginning of the step, which the field b is of
+    carrier: jax.Array  # (n, 3) [m] positions at the beginning of the step, which define the field b
     before: jax.Array  # angle [rad] or torque [N m] at the beginning
     after: jax.Array  # and at the end
 
@@ -107,7 +107,7 @@ class Plate(NamedTuple):
 
     @property
     def radius(self) -> jax.Array:
-        """R [m]."""
+        """R [m], the root of the sum of squared distances from the axis."""
         return jnp.linalg.norm(self._arms(self.reference))
 
     def angle(self, x: jax.Array) -> jax.Array:
@@ -116,7 +116,7 @@ class Plate(NamedTuple):
         return jnp.arctan2(jnp.sum(jnp.cross(old, new) @ e), jnp.sum(old * new))
 
     def lift(self, x: jax.Array) -> jax.Array:
-        """Way [m] of the plate along the axis in positions x (V, 3)."""
+        """Displacement [m] of the plate along the axis at positions x (V, 3)."""
         return jnp.mean((x[self.plate.nodes] - self.reference) @ self._axis(x))
 
     def torque(self, x: jax.Array, f: jax.Array) -> jax.Array:
@@ -124,14 +124,14 @@ class Plate(NamedTuple):
         return jnp.sum(self.arms(x) * f[self.plate.nodes])
 
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
-        """The field (V, 3) with the plate's rows made of amplitudes of its two motions."""
+        """The field (V, 3) with the plate's rows computed from the amplitudes of its two motions."""
         rows = turn * self._arms(self.carrier) / self.radius
         if self.plate.lifts:
             rows = rows + lift * self._axis(field)[None] / len(self.reference) ** 0.5
         return field.at[self.plate.nodes].set(rows)
 
     def amplitudes(self, field: jax.Array, arms: jax.Array) -> tuple[Number, Number]:
-        """R times the turn, and sqrt(n) times the way along the axis, that a field (V, 3) has along `arms` (n, 3)."""
+        """R times the turn (by `arms` (n, 3)) and sqrt(n) times the displacement along the axis, of a field (V, 3)."""
         rows = field[self.plate.nodes]
         turn = jnp.sum(arms * rows) / self.radius if self.plate.by == "torque" else 0.0
         return turn, jnp.sum(rows @ self._axis(field)) / len(self.reference) ** 0.5
@@ -150,15 +150,15 @@ class Plate(NamedTuple):
         return self.spread(field, turn, len(self.reference) ** 0.5 * self.lift(x))
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
-        """Positions (V, 3) from a field."""
+        """Positions (V, 3) [m] from a field, at part s of the step."""
         turn, lift = self.amplitudes(field, self._arms(self.carrier))
         angle = turn / self.radius if self.plate.by == "torque" else self.given(s)
         return self.moved(field, angle, lift / len(self.reference) ** 0.5)
 
     def moved(self, field: jax.Array, angle: Number, lift: Number) -> jax.Array:
-        """The field (V, 3) with the plate's rows at the positions of an angle [rad] and a way along the axis [m]."""
+        """The field (V, 3) with the plate's rows at the positions of an angle [rad] and an axial displacement [m]."""
         axis, arms = self._axis(field)[None], self._arms(self.reference)
-        # x - c turns in its plane: it changes by sin(a) of its arm and by cos(a) - 1 of what is across the axis.
+        # x - c turns in its plane: it changes by sin(a) of its arm and by cos(a) - 1 of its part across the axis.
         rows = self.reference + jnp.sin(angle) * arms + (jnp.cos(angle) - 1) * jnp.cross(arms, axis)
         if self.plate.lifts:
             rows = rows + lift * axis

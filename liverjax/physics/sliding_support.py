@@ -13,13 +13,13 @@ from liverjax.mesh import selection
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import Free, Physics
 
-#: Distance from the plane that counts as in it, over the extent of the nodes.
+#: Largest distance from the plane that counts as in it, over the extent of the nodes.
 _FLAT = 1e-6
 
 
 @struct
 class SlidingSupport(Physics):
-    """Nodes that do not move along a normal: along an axis, or any direction."""
+    """Nodes that do not move along a normal, which is a coordinate axis or any direction."""
 
     nodes: Indices = param("1", "node numbers (n,)", lower=0)
     normal: Numbers | None = param("1", "of the plane (3,), of length 1; not used with an axis", default=None)
@@ -30,7 +30,7 @@ class SlidingSupport(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "SlidingSupport":
-        """From [[support]] with `sliding = true`: the nodes define the plane."""
+        """Read [[support]] with `sliding = true`: the nodes define the plane."""
         if table["sliding"] is not True:
             raise InputError(
                 f"{name} sliding = {table['sliding']!r} is not true: write sliding = true, or leave it out"
@@ -56,21 +56,21 @@ class SlidingSupport(Physics):
         return free._replace(normals=normals.at[self.nodes].set(loose * normal))
 
     def enriched(self, mesh: TetMesh, more: Callable[[Any], Any]) -> "SlidingSupport":
-        """With the nodes in between."""
+        """The support with the nodes in between."""
         return replace(self, nodes=more(self.nodes))
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Along the normal."""
+        """Nodes are held along the normal."""
         nodes = np.asarray(self.nodes)
         normal = np.eye(3)[selection.AXES.index(self.axis)] if self.axis else np.asarray(self.normal)
         return nodes, np.tile(normal, (len(nodes), 1))
 
 
 def on_plane(mesh: TetMesh, nodes: np.ndarray, name: str = "support") -> SlidingSupport:
-    """A sliding support of nodes (n,) that lie in one plane, whose normal is found.
+    """A sliding support of nodes (n,) that lie in one plane, with the normal of that plane.
 
     Raises:
-        InputError: fewer than three nodes, or nodes that lie in no plane.
+        InputError: fewer than three nodes, or nodes that do not lie in one plane.
     """
     points = np.asarray(mesh.points)[nodes]
     size, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[1:]

@@ -8,7 +8,7 @@ Both recursions have the form gamma^n = a S^n + c S^(n-1) + b gamma^(n-1):
 * ``"backward_euler"``: as printed, a = g dt/(dt + tau), c = 0, b = tau/(dt + tau). First order in dt. Its old name,
   "chapter", is accepted.
 
-The memory advances once an accepted step; inside a step `recall` is a constant.
+The memory advances once per accepted step; inside a step `recall` is a constant.
 """
 
 from typing import Any, NamedTuple
@@ -47,7 +47,7 @@ class Prony:
     """alpha(t) = 1 - sum_k g_k (1 - exp(-t/tau_k)): the instantaneous law relaxes to 1 - sum g_k of its stress."""
 
     ratios: Any = param("1", "g_k, the part of the stress that mode k relaxes (N,), or (N, E)", lower=0.0, upper=1.0)
-    relaxation_times: Any = param("s", "tau_k (N,), or one an element (N, E)", above=0.0)
+    relaxation_times: Any = param("s", "tau_k (N,), or one per element (N, E)", above=0.0)
     part: str = static(
         default="all",
         about="all: the whole stress relaxes (as printed); isochoric: its isochoric part (Fig. 3)",
@@ -87,7 +87,7 @@ def check(prony: Prony, law: Law) -> None:
 
 
 def check_part(part: str, law: Law, section: str) -> None:
-    """Refuse a part of the law that is not there; numbers are not looked at.
+    """Refuse a part that the law does not have; numbers are not checked.
 
     Raises:
         InputError: isochoric relaxation of a law without isochoric split.
@@ -100,7 +100,7 @@ def check_part(part: str, law: Law, section: str) -> None:
 
 
 def check_series(prony: Prony) -> None:
-    """Refuse ratios and times that are no Prony series; host side. If they are traced, only their counts are checked.
+    """Refuse ratios and times that form no Prony series; host side. If they are traced, only their counts are checked.
 
     Raises:
         InputError: lengths that differ, values out of bounds, ratios adding up to 1 or more.
@@ -109,16 +109,16 @@ def check_series(prony: Prony) -> None:
     both = (prony.ratios, prony.relaxation_times)
     for key, values in zip(("ratios", "relaxation_times"), both, strict=True):
         if not isinstance(values, (tuple, list)) and not np.ndim(values):
-            raise InputError(f"viscosity.{key} = {values} is one number: give one of each mode, e.g. [{values}]")
+            raise InputError(f"viscosity.{key} = {values} is one number: give one per mode, e.g. [{values}]")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(both)):
-        # Of a tuple of traced numbers NumPy knows no shape.
+        # NumPy cannot tell the shape of a tuple of traced numbers.
         ratios, times = (len(v) if isinstance(v, (tuple, list)) else (*np.shape(v), 1)[0] for v in both)
         if ratios != times:
-            raise InputError(f"viscosity has {ratios} ratios and {times} relaxation_times: give one of each a mode")
+            raise InputError(f"viscosity has {ratios} ratios and {times} relaxation_times: give one each per mode")
         return
     g, tau = (np.atleast_1d(np.asarray(v, float)) for v in both)
     if g.shape != tau.shape:
-        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one of each a mode")
+        raise InputError(f"viscosity has {g.size} ratios and {tau.size} relaxation_times: give one each per mode")
     if not np.all(g.sum(axis=0) < 1):
         shown = g if g.ndim == 1 else g[:, int(np.argmax(g.sum(axis=0)))]
         raise InputError(f"viscosity.ratios = {shown.tolist()} must add up to less than 1: lower them")
@@ -135,14 +135,15 @@ def coefficients(prony: Prony, dt: Any) -> tuple[jax.Array, jax.Array, jax.Array
 
 
 def lasting(prony: Prony, order: int = 1) -> jax.Array:
-    """The part of the stress that never relaxes: one number (), or one an element with the axes of the points of that
-    order."""
+    """The part of the stress that never relaxes: one number (), or one per element with an axis for the points if
+    `order` is above 1.
+    """
     left = 1 - jnp.sum(jnp.asarray(prony.ratios), axis=0)
     return left[None] if left.ndim and order > 1 else left
 
 
 def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
-    """Numbers (N,) or (N, E) with axes for arrays of so many dimensions (N, 6, …, E)."""
+    """Numbers (N,) or (N, E), shaped to broadcast with arrays (N, 6, …, E) of `ndim` dimensions."""
     if numbers.ndim == 1:
         return numbers[(slice(None), *(None,) * (ndim - 1))]
     return numbers[(slice(None), *(None,) * (ndim - 2))]
@@ -272,12 +273,12 @@ class Viscoelasticity(Physics):
     prony: Prony = param("1", "how it relaxes")
 
     def begin(self, start: Start) -> History:
-        """Nothing is remembered. Where the body has just been brought to its positions, all of its stress is new."""
+        """An empty memory; if the body has just been brought to its positions, with the stress that it has there."""
         memory = initial_history(self.prony, start.mesh.weights.shape, start.x.dtype)
         if memory.stress is None or not start.moved:
             return memory
         F = deformation_gradient(start.mesh, start.x)
-        # What is inside out has no stress to go on from.
+        # Inverted elements have no stress to begin with.
         whole = determinant(F) > 0
         F = tuple(tuple(jnp.where(whole, F[i][j], float(i == j)) for j in range(3)) for i in range(3))
         return memory._replace(stress=relaxing_stress(self.prony, self.law, F))
@@ -287,7 +288,7 @@ class Viscoelasticity(Physics):
         return Viscoelastic(law=self.law, prony=self.prony, recall=recall(self.prony, memory, step.dt), dt=step.dt)
 
     def advance(self, memory: History, acting: "Viscoelastic", end: End) -> History:
-        """The memory takes in the stress at the end of the step."""
+        """The memory, updated with the stress at the end of the step."""
         return advance(self.prony, memory, self.law, end.F, acting.dt)
 
 
@@ -297,7 +298,7 @@ class Viscoelastic(Solid):
 
     law: Law = param("1", "the instantaneous law")
     prony: Prony = param("1", "how it relaxes")
-    recall: Recall = param("1", "what is remembered")
+    recall: Recall = param("1", "contribution of the memory")
     dt: jax.Array = param("s", "time step")
 
     def stress(self, F: Matrix) -> Matrix:

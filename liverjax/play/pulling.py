@@ -21,11 +21,11 @@ from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import State, initial_state
 from liverjax.simulation.run import prepared, simulate_part
 
-#: A run without end.
+#: Number of steps of a run without end.
 STEPS = 10**9
-#: A spring this slack, over the size of the body, has a direction wherever its end is.
+#: Rest length of the spring, over the size of the body: a spring without length would have no direction.
 SLACK = 1e-3
-#: Of no pull, over the stiffness of a pull.
+#: Stiffness of a spring that does not pull, over the stiffness of one that does.
 NOTHING = 1e-12
 
 
@@ -35,7 +35,7 @@ class Playing(NamedTuple):
     scene: Scene
     program: Callable[..., Any]
     state: State
-    step: int  # finished ones
+    step: int  # number of finished steps
     size: float  # diagonal of the body's box [m]
     nodes: np.ndarray  # (n,) of the surface: numbers in the mesh
     triangles: np.ndarray  # (m, 3) numbers in `nodes`
@@ -92,7 +92,7 @@ def _after_load_steps(scene: Scene) -> State:
 
 
 def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = None, stiffness: float = 0.0) -> Playing:
-    """The body a step later. If the step fails, it stays as it was, with the code of the failure.
+    """The body after one more step. If the step fails, it stays as it was, with the code of the failure.
 
     Args:
         playing: the body before.
@@ -101,7 +101,7 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
         stiffness: of the spring [N/m].
 
     Raises:
-        InputError: no such node, a place or a stiffness that is no number.
+        InputError: no such node, a place or a stiffness that is not a number.
     """
     *others, spring = playing.scene.physics
     if node is None:
@@ -125,15 +125,15 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
 
 
 def _end_of_spring(playing: Playing, node: int, to: Any, stiffness: float) -> np.ndarray:
-    """The end of the spring."""
+    """The end (3,) [m] of the spring, checked."""
     if not isinstance(node, int) or not 0 <= node < len(playing.positions):
-        raise InputError(f"node = {node!r} is none of the mesh: give 0 to {len(playing.positions) - 1}")
+        raise InputError(f"node = {node!r} is not in the mesh: give 0 to {len(playing.positions) - 1}")
     try:
         end = np.asarray(to, float)
     except (TypeError, ValueError):
         end = np.empty(0)
     if end.shape != (3,) or not np.all(np.isfinite(end)):
-        raise InputError(f"to = {to!r} is no place: give three numbers in m")
+        raise InputError(f"to = {to!r} is not a place: give three numbers in m")
     if not (isinstance(stiffness, int | float) and np.isfinite(stiffness) and stiffness > 0):
         raise InputError(f"stiffness = {stiffness!r} must be above 0 N/m: give e.g. {playing.stiffness:.3g}")
     return end

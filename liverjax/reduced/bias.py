@@ -1,8 +1,9 @@
-"""How far numbers that were identified through a reduced model are from those that the full model would give.
+"""Bias of numbers that were identified with a reduced model, against those that the full model would give.
 
 Data y are fitted by the reduced model: its answer u(p) is nearest to y at numbers p. The full model's answer there is
 u(p) + d, and one full run gives d. The full model meets the same data at p - b, where to first order J b = d in the
-least squares, with J the derivative of u. So b is what the reduced model did to the numbers, and p - b is nearer.
+least squares, with J the derivative of u. So b is the bias due to the reduced model, and p - b is free of it to first
+order.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,7 +28,7 @@ def reduced_bias(
     Args:
         model, scene: as in `simulate_reduced`.
         values: dotted names -> numbers that were identified through the model.
-        observed: what was fitted to data, from positions (T, V, 3) [m]; weighted as it was there.
+        observed: the function of positions (T, V, 3) [m] that was fitted to data, with the weights of that fit.
 
     Raises:
         InputError: as `simulate_reduced`; a full run that fails.
@@ -41,7 +42,7 @@ def reduced_bias(
     full = simulate(with_parameters(scene, shaped(flat))).check()
     off = np.asarray(jnp.ravel(observed(full.positions)) - jax.jit(answer)(flat))
     J = np.asarray(jax.jit(jax.jacfwd(answer))(flat))
-    # Numbers of unlike units: columns of length 1.
+    # Numbers have different units, so columns are scaled to length 1.
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     found = np.linalg.lstsq(J / size, off, rcond=None)[0] / size

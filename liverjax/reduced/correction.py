@@ -1,15 +1,15 @@
-"""What modes and points leave out, learnt from the full runs of the training: a closure of the reduced model.
+"""The error of modes and points, learnt from the full runs of the training: a closure of the reduced model.
 
 The reduced model is run with the rows of its training, whose full runs are known. The difference is a sum of fields,
-and the part of each field is a polynomial of the coordinates: linear in all, quadratic in the first few. Where there is
-time, the rates of the coordinates count too. The numbers are those of least squares with a small ridge (closures of
-reduced models: Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301). Differences count in
-proportion to the largest motion of their run.
+and the part of each field is a polynomial of the coordinates: linear in all, quadratic in the first few. In time, rates
+of the coordinates are terms too. The factors come from least squares with a small ridge (closures of reduced models:
+Ahmed, Pawar, San, Rasheed, Iliescu, Noack 2021, Phys. Fluids 33, 091301). Differences count in proportion to the
+largest motion of their run.
 
-Groups of runs are left out in turn. How far off the runs left out are decides how many coordinates have products. The
-same runs tell the error of the corrected motion: the logarithm of it is linear in the logarithms of three numbers that
-are known without the full run. They are the size of the correction, the largest displacement, and the leverage of the
-terms: the variance of the least squares there, over that of the data (Hoaglin, Welsch 1978).
+Groups of runs are left out in turn. The errors of the runs left out decide how many coordinates have products. The same
+runs give the error of the corrected motion: its logarithm is linear in the logarithms of three numbers that are known
+without the full run. They are the size of the correction, the largest displacement, and the leverage of the terms: the
+variance of the least squares there, over that of the data (Hoaglin, Welsch 1978).
 """
 
 from functools import partial
@@ -24,25 +24,25 @@ from liverjax.tensors.principal_fields import principal_fields
 
 #: Groups of runs that are left out in turn, and the fewest runs that are corrected.
 GROUPS, FEWEST_RUNS = 12, 6
-#: Numbers of coordinates that have products; as many as `RATES` have products with rates.
+#: Numbers of coordinates that have products; at most `RATES` of them have products with rates.
 PRODUCTS, RATES = (0, 6, 12, 20), 8
 #: The ridge over the squares of the features; part of the differences outside of the fields, and the most fields.
 RIDGE, OUTSIDE, MOST_FIELDS = 1e-6, 0.02, 150
 #: The most differences from which fields are made.
 FIELD_STATES = 1500
-#: Exponents of the stated error where few runs tell none: the root of the leverage times a constant.
+#: Exponents of the stated error if too few runs determine them: the root of the leverage times a constant.
 FEW_RUNS_EXPONENTS = np.array([0.0, -1.0, 0.5])
-#: As many runs speak for these exponents.
+#: Weight of these exponents, as a number of runs.
 FEW_RUNS = 10.0
 
 
 @struct
 class Correction:
-    """Polynomials with k terms for m fields, and what tells the error that they leave."""
+    """Polynomials with k terms for m fields, and numbers that state the error that remains."""
 
     fields: jax.Array = param("1", "(m, V, 3), orthonormal with the lumped volumes of the nodes")
-    factors: jax.Array = param("m^2.5", "of every term in every field (k, m)")
-    inverse: jax.Array = param("1", "of the normal equations of the terms (k, k)")
+    factors: jax.Array = param("m^2.5", "factors of every term in every field (k, m)")
+    inverse: jax.Array = param("1", "inverse of the normal equations of the terms (k, k)")
     scale: jax.Array = param("m", "size of the first coordinate")
     statement: jax.Array = param("1", "logarithm of the stated error: constant and exponents (4,), see `_logarithms`")
     left: jax.Array = param("1", "error of each run left out, over its largest displacement (R,)")
@@ -73,7 +73,7 @@ def terms(q: jax.Array, scale: Number, products: int, dt: Number | None) -> jax.
 
 
 def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
-    """What is added to the motion of the nodes: (T, V, 3) [m]."""
+    """The correction of the motion of the nodes: (T, V, 3) [m]."""
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
@@ -101,7 +101,7 @@ def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None
 def _largest_of_steps(u: jax.Array) -> jax.Array:
     """Largest length of vectors (T, V, 3) at each step (T,)."""
     square = jnp.max(jnp.sum(u**2, axis=-1), axis=-1)
-    # The root has no derivative at zero.
+    # The square root has no derivative at zero.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
@@ -125,7 +125,7 @@ class _LeftOut(NamedTuple):
 
 
 def learnt_correction(runs: Learnt) -> Correction | None:
-    """The correction with the smallest errors of runs left out; None with too few runs or where none is better."""
+    """The correction with the smallest errors of runs left out; None with too few runs or if none is better."""
     R = len(runs.q)
     if R < FEWEST_RUNS or not np.any(runs.q):
         return None
@@ -139,7 +139,7 @@ def learnt_correction(runs: Learnt) -> Correction | None:
     for products in PRODUCTS:
         of_run = partial(terms, scale=scale, products=products, dt=runs.dt)
         A = np.asarray(jax.vmap(of_run)(jnp.asarray(runs.q)))
-        if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # more terms than half of the states tell nothing
+        if 2 * A.shape[2] > A.shape[0] * A.shape[1]:  # so many terms cannot be found from so few states
             break
         sums = _least_squares(A, parts, runs.moved, group)
         out = _left_out(A, sums, group, runs.missing, fields.reshape(-1, *runs.missing.shape[2:]) / roots)
@@ -178,8 +178,8 @@ def _left_out(
 def _statement(out: _LeftOut, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Constant and exponents (4,) of the stated error, and stated over true error of the runs left out (R,).
 
-    The exponents are those of least squares of logarithms; few runs leave them near `FEW_RUNS_EXPONENTS`. The
-    constant puts the runs left out as far above the true error as below.
+    The exponents are those of least squares of logarithms; few runs leave them near `FEW_RUNS_EXPONENTS`. With the
+    constant, stated errors of the runs left out are as far above the true ones as below.
     """
     x = np.asarray(_logarithms(*(jnp.asarray(a) for a in (out.corrected, moved, out.leverage))))
     y = np.log(np.maximum(out.off / moved, np.finfo(float).tiny)) - x @ FEW_RUNS_EXPONENTS
@@ -202,7 +202,7 @@ def _error_fields(weighted: np.ndarray) -> np.ndarray:
 
 
 class _LeastSquares(NamedTuple):
-    """Normal equations of factors, one set a group of runs."""
+    """Normal equations of factors, one set per group of runs."""
 
     squares: np.ndarray  # (g, k, k)
     products: np.ndarray  # (g, k, m)

@@ -5,14 +5,14 @@ forces out of balance, r, drive the error e. To first order e follows the linear
 
     M a(e) + K e - memory(e) = -r,
 
-with the stiffness K of the reference shape and the same recursions in time. K and M are factorised once a run, so a
+with the stiffness K of the reference shape and the same recursions in time. K and M are factorised once per run, so a
 step costs the forces of the full mesh and one solve, and no iterations of Newton's method. In the static case the
 energy norm of e is the dual norm of r. The estimate leaves out terms of second order in e and the change of the
 stiffness by the deformation.
 
-Of a porous scene the pressures of the full mesh are solved for along the reduced motion, so that only forces are out
-of balance. Their error drives motion and pressure (`liverjax.reduced.fluid_error`). The pressure's own error is the
-distance of the reduced pressure from the one that was solved for, with what the error of the motion adds.
+In a porous scene the pressures of the full mesh are solved for along the reduced motion, so that only forces are out of
+balance. These drive the errors of motion and pressure (`liverjax.reduced.fluid_error`). The pressure's own error is the
+distance of the reduced pressure from the one that was solved for, plus the part due to the error of the motion.
 """
 
 from collections.abc import Callable
@@ -53,13 +53,13 @@ if TYPE_CHECKING:
 class _Body(NamedTuple):
     """The linear body that the error moves: sparse matrices (f, f) of the free degrees of freedom."""
 
-    relaxing: jax.Array  # stiffness of what relaxes [N/m]
-    rest: Any  # of what does not, or None
+    relaxing: jax.Array  # stiffness of the part that relaxes [N/m]
+    rest: Any  # stiffness of the part that does not relax, or None
     mass: Any  # diagonal (f,) [kg], or None
 
 
 def reduced_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ReducedResult:
-    """The result with its estimated errors (T,) [m], [Pa] and reactions (T, V, 3) [N]; host side, beside the run of one
+    """The result with its estimated errors (T,) [m], [Pa] and reactions (T, V, 3) [N]; host side, after the run of one
     scene.
 
     Args:
@@ -148,7 +148,7 @@ def _errors(scene: Scene, residuals: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid | None
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """As `coupled_solver`, or with K alone where there is no fluid."""
+    """As `coupled_solver`, or with K alone if there is no fluid."""
     from scipy.sparse.linalg import splu
 
     if fluid is not None:
@@ -158,7 +158,7 @@ def _solver(
 
 
 def _recursion(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """a, b, c (N,) of the viscosity; empty where there is none."""
+    """a, b, c (N,) of the viscosity; empty if there is none."""
     if scene.viscosity is None:
         return np.zeros(0), np.zeros(0), np.zeros(0)
     a, b, c = coefficients(scene.viscosity, scene.solve.dt)

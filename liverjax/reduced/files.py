@@ -28,8 +28,8 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
 
     Args:
         model: `ReducedModel`.
-        file: HDF5 file, replaced where it exists.
-        scene_text: the scene file it was made from, kept beside it.
+        file: HDF5 file, replaced if it exists.
+        scene_text: content of the scene file it was made from, stored with it.
     """
     import h5py
 
@@ -57,7 +57,7 @@ def load_reduced(file: str | Path) -> ReducedModel:
     """Read a reduced model that `save_reduced` wrote.
 
     Raises:
-        InputError: no file, one of something else, or a damaged one.
+        InputError: no file, a file of another kind, or a damaged file.
     """
     import h5py
 
@@ -74,14 +74,14 @@ def load_reduced(file: str | Path) -> ReducedModel:
         model = ReducedModel(**arrays, ranges=ranges, correction=correction, pressures=fluid, identity=identity)
         wrong = _wrong(model)
     except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"{file} is no reduced model ({error}): make one with python -m liverjax reduce") from None
+        raise InputError(f"{file} is not a reduced model ({error}): make one with python -m liverjax reduce") from None
     if wrong:
         raise InputError(f"{file} is damaged: {wrong}; make it again with python -m liverjax reduce")
     return model
 
 
 def _wrong(model: ReducedModel) -> str:
-    """The first array of another shape than the others ask for, or that has no numbers; empty: none."""
+    """A text on the first array whose shape does not fit the others or that is not finite; empty: there is none."""
     n, V, S = *jnp.shape(model.modes)[:2], *jnp.shape(model.weights)[:1]
     shapes: dict[str, tuple] = {"modes": (n, V, 3), "slopes": (9, S, n), "weights": (S,), "points": (S,)}
     arrays = {name: getattr(model, name) for name in shapes}
@@ -99,12 +99,12 @@ def _wrong(model: ReducedModel) -> str:
         if jnp.shape(array) != shapes[name]:
             return f"{name} has shape {jnp.shape(array)}, not {shapes[name]}"
         if not np.all(np.isfinite(np.asarray(array))):
-            return f"{name} has values that are no numbers"
+            return f"{name} has values that are not numbers"
     return ""
 
 
 def _correction(stored: "h5py.File") -> Correction | None:
-    """The correction of an open file, where it has one."""
+    """Read the correction from an open file; None if it has none."""
     if "correction" not in stored:
         return None
     own = stored["correction"]

@@ -7,8 +7,9 @@ with the same modes, and its integrals are sums over the weighted points of the 
     S_kl = sum_p w_p J_before / K_lim sum_a N_a psi_ka psi_la,
     D_kl = sum_p w_p kappa / J_before (cof F_before grad psi_k) . (cof F_before grad psi_l),
 
-with the functions N_a of the vertices a. Storage is lumped at the vertices, as there. As A is positive, p is
-eliminated: what is left for the motion has an energy. With all modes and all points the equations are the full ones.
+with the functions N_a of the vertices a. Storage is lumped at the vertices, as in the full model. As A is positive, p
+is eliminated, and the remaining equations of motion have an energy. With all modes and all points the equations are the
+full ones.
 """
 
 from typing import NamedTuple
@@ -30,7 +31,7 @@ from liverjax.tensors.matrices import IDENTITY, Matrix, cofactor, determinant, m
 
 
 class ReducedFluid(NamedTuple):
-    """What a step hands to the next."""
+    """The state of the fluid that a step passes to the next."""
 
     pressure: jax.Array  # coordinates p (m,) [Pa]
     F: jax.Array  # deformation gradients (9, S)
@@ -48,7 +49,7 @@ class Flowing(NamedTuple):
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
-    """The porosity, its numbers by element (S,) at the points."""
+    """The porosity; its numbers by element become numbers at the points (S,)."""
     assert scene.porosity is not None
     own = porosity_of_elements(scene.porosity, scene.region, scene.mesh)
     elements = model.points % scene.mesh.number_of_elements
@@ -126,7 +127,7 @@ def volume_blocks(model: ReducedModel, own: Flowing, F: Matrix, pairs: tuple[tup
 
 
 def stiffness_of_pressures(model: ReducedModel, own: Flowing, F: Matrix) -> jax.Array:
-    """What the change of the pressures with the coordinates adds to the tangent (n, n) [N/m]."""
+    """The part of the tangent (n, n) [N/m] that is due to the change of the pressures with the coordinates."""
     n = model.number_of_modes
     if own.porosity.scheme == "lagged":
         return jnp.zeros((n, n), model.slopes.dtype)

@@ -1,4 +1,4 @@
-"""The error of a porous reduced run: what the forces out of balance do to the linear sponge and its fluid.
+"""The error of a porous reduced run: the response of the linear sponge and its fluid to forces out of balance.
 
 To first order the errors e of the motion and p of the pressure follow the linear equations at the reference shape,
 
@@ -73,8 +73,9 @@ def linear_fluid(scene: Scene, free: np.ndarray) -> LinearFluid:
 
 
 def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list]":
-    """Sparse matrices from fields of the vertices to values at the points, from those of the nodes to their three
-    slopes, and from those of the vertices to theirs."""
+    """Sparse matrices that give, at the points, values of a field of the vertices, three slopes of a field of the
+    nodes, and three slopes of a field of the vertices.
+    """
     import scipy.sparse
 
     E, D = mesh.number_of_elements, np.asarray(mesh.shape_vectors)
@@ -84,7 +85,7 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
     rows = np.arange(Q * E).reshape(Q, E)
 
     def matrix(entries: np.ndarray, count: int) -> "scipy.sparse.csr_array":
-        """From entries (n, Q, E) of the n nodes of every element."""
+        """The matrix from entries (n, Q, E) of the n nodes of every element."""
         nodes = np.stack([np.broadcast_to(np.asarray(n), (Q, E)) for n in mesh.element_nodes[: len(entries)]])
         at = (np.broadcast_to(rows, entries.shape).ravel(), nodes.ravel())
         return scipy.sparse.csr_matrix((entries.ravel(), at), shape=(Q * E, count))
@@ -98,7 +99,7 @@ def _point_operators(mesh: TetMesh) -> "tuple[scipy.sparse.csr_array, list, list
 def coupled_solver(
     K: "scipy.sparse.csr_array", fluid: LinearFluid
 ) -> Callable[[np.ndarray, ErrorBefore], tuple[np.ndarray, np.ndarray]]:
-    """A function of a load (f,) [N] and the errors before to those at the end of the step: (f,) [m] and (v,) [Pa].
+    """A function (load (f,) [N], errors before) -> errors at the end of the step, (f,) [m] and (v,) [Pa].
 
     Args:
         K: stiffness and inertia without the sponge (f, f) [N/m].

@@ -1,4 +1,4 @@
-"""A reduced model: modes of motion, and weighted points of elements at which stresses are taken.
+"""A reduced model: modes of motion, and weighted points of elements at which stresses are evaluated.
 
 Positions are x = X + u_D(t) + sum_k q_k phi_k with prescribed motion u_D, and modes phi_k that vanish where the body is
 held or moved. The energy is W(q) = sum_p w_p W(F_p(q)) over the sampled points p, with weights w_p >= 0. Its gradient,
@@ -37,7 +37,7 @@ class PressureModes:
     """m modes of the fluid's pressure, which vanish where it is drained, and their values at the points."""
 
     modes: jax.Array = param("1", "(m, V), orthonormal with the lumped volumes of the vertices")
-    values: jax.Array = param("1", "at the points (S, m)")
+    values: jax.Array = param("1", "values at the points (S, m)")
     parts: jax.Array = param("1", "at the vertices of each point's element, times the root of their part (m, 4, S)")
     slopes: jax.Array = param("1/m", "gradients at the points (m, 3, S)")
 
@@ -48,12 +48,12 @@ class ReducedModel:
 
     modes: jax.Array = param("1", "(n, V, 3), orthonormal with the lumped volumes of the nodes")
     slopes: jax.Array = param("1/m", "gradients of the modes at the points (9, S, n), row by row")
-    weights: jax.Array = param("m^3", "reference volume that a point stands for (S,), not negative")
+    weights: jax.Array = param("m^3", "reference volume that a point represents (S,), not negative")
     points: jax.Array = param("1", "number q E + e of point q of element e (S,)")
     ranges: dict[str, Any] = param("1", "parameters of the training: name -> lowest and highest value")
-    correction: Correction | None = param("1", "of what modes and points leave out, or none", default=None)
+    correction: Correction | None = param("1", "correction of the error of modes and points, or None", default=None)
     pressures: PressureModes | None = param("1", "of a porous scene", default=None)
-    identity: str = static(default="", about="digest of what modes and points are made for")
+    identity: str = static(default="", about="digest of the scene for which the model is made")
 
     @property
     def number_of_modes(self) -> int:
@@ -88,8 +88,9 @@ def pressure_modes(mesh: TetMesh, modes: jax.Array) -> PressureModes:
 
 
 def with_all_points(scene: Scene, modes: jax.Array, pressures: jax.Array | None = None) -> ReducedModel:
-    """The model of these modes (n, V, 3), and (m, V) of pressures, that takes the stress at every point: Galerkin's
-    projection."""
+    """The model of these modes (n, V, 3), and (m, V) of pressures, that evaluates the stress at every point: Galerkin's
+    projection.
+    """
     mesh = scene.mesh
     slopes = jnp.moveaxis(jax.lax.map(lambda mode: flat_gradient(mesh, mode), modes), 0, -1)
     w = mesh.weights.ravel()
@@ -140,7 +141,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
             or mixed volumes.
     """
     if any(region.viscosity for region in scene.region):
-        raise InputError("a reduced model has one viscosity: leave that of regions out, or run the full model")
+        raise InputError("a reduced model has one viscosity: leave the viscosity of regions out, or run the full model")
     if len(laws_of(scene.law, scene.region)) > 1:
         raise InputError("a reduced model has one kind of law: give regions other numbers of it, or run the full model")
     if scene.porosity is not None and scene.porosity.inlet:

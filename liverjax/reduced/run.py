@@ -45,18 +45,18 @@ from liverjax.tensors.matrices import determinant
 class ReducedResult:
     """Result of a reduced run: arrays over the T steps. `reduced_positions` gives the motion of the nodes."""
 
-    times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
+    times: jax.Array = param("s", "(T,); the number of the load step if there is no time")
     coordinates: jax.Array = param("m", "of the modes (T, n)")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     iterations: jax.Array = param("1", "(T,) of Newton's method")
     residual: jax.Array = param("1", "(T,) of the reduced equations over the forces at work")
     pressures: jax.Array | None = param("Pa", "coordinates of the pressure's modes (T, m)", default=None)
     error: jax.Array | None = param(
-        "m", "(T,) estimated largest distance of a node from the full model, where asked for", default=None
+        "m", "(T,) estimated largest distance of a node from the full model; None: not estimated", default=None
     )
-    reactions: jax.Array | None = param("N", "(T, V, 3) as of the full model, where error is", default=None)
+    reactions: jax.Array | None = param("N", "(T, V, 3) of the full model, given with error", default=None)
     pressure_error: jax.Array | None = param(
-        "Pa", "(T,) estimated largest error of the fluid's pressure, of a porous scene where error is", default=None
+        "Pa", "(T,) estimated largest error of the fluid's pressure, given with error if porous", default=None
     )
 
 
@@ -64,7 +64,7 @@ class _Given(NamedTuple):
     """Prescribed loads and motion at the end of every step."""
 
     load: jax.Array  # (T, n) [N]
-    gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) where nothing moves
+    gradient: jax.Array  # deformation gradient of the prescribed motion (T, 9, S), or (1, 9, S) without motion
 
 
 def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
@@ -90,7 +90,7 @@ def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
 
 
 def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
-    """Deformation gradients of the prescribed motion at the points: (T, 9, S), or (1, 9, S) where nothing moves."""
+    """Deformation gradients of the prescribed motion at the points: (T, 9, S), or (1, 9, S) without motion."""
     mesh, solve = scene.mesh, scene.solve
 
     def moved(k: jax.Array) -> jax.Array:
@@ -104,7 +104,7 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
 
 
 def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
-    """What a run begins with: coordinates, memory, fluid, motion at rest, an empty inverse, mass matrix. Without
+    """The beginning of a run: coordinates, memory, fluid, motion at rest, an empty inverse, mass matrix. Without
     inertia motion and mass are None."""
     n, S = model.number_of_modes, model.weights.shape[0]
     q = jnp.zeros(n, model.modes.dtype)
@@ -131,8 +131,9 @@ def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> 
 
 
 def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Callable:
-    """One step: from (coordinates, memory, motion) before it and its loads to the same after it, and a row of the
-    result."""
+    """A function for one step: (coordinates, memory, motion) before it and its loads -> the same after it, and a row of
+    the result.
+    """
     solve, solid = scene.solve, solid_at_points(model, scene)
     points = scene.mesh.points
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
@@ -195,7 +196,7 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
-    # What the run does not need: models that differ in it alone share one program.
+    # Leave out parts that the run does not need: models that differ only in these share one program.
     return _reduced_run(replace(model, correction=None, ranges={}), scene)
 
 

@@ -1,4 +1,4 @@
-"""Points and weights that give the reduced forces of the training runs, none of them negative.
+"""Sampled points, and non-negative weights with which they give the reduced forces of the training runs.
 
 The contributions of all points to the reduced forces are a matrix G (rows, P); the forces are the sums of its rows.
 Weights xi >= 0 with few entries above 0 are the least-squares solution of G xi = G 1 by Lawson and Hanson's method, on
@@ -25,7 +25,7 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
 from liverjax.tensors.principal_fields import principal_fields
 
-#: The most states whose forces are taken: memory and time grow with them.
+#: The most states whose forces are used: memory and time grow with their number.
 MOST_STATES = 240
 #: States whose forces move less than this part of the largest coordinate are left out: roundoff [1].
 LEAST_MOTION = 1e-9
@@ -35,21 +35,21 @@ class Coordinates(NamedTuple):
     """Coordinates of R runs of T steps."""
 
     q: np.ndarray | jax.Array  # of the modes (R, T, n) [m]
-    p: np.ndarray | jax.Array | None  # of those of the pressure (R, T, m) [Pa]
+    p: np.ndarray | jax.Array | None  # of the modes of the pressure (R, T, m) [Pa]
 
 
 def sampled(
     whole: ReducedModel, scene: Scene, values: Mapping[str, Any], runs: Coordinates, tolerance: float
 ) -> ReducedModel:
-    """The model with few points, from one of all points and coordinates of runs with R rows of values.
+    """The model with few points, from a model with all points and coordinates of runs with R rows of values.
 
-    States are left out if they are at rest, or if an element is inside out there and its law then has no force.
+    States are left out if they are at rest, or if an element is inverted there and its law then has no force.
 
     Args:
         whole: as `with_all_points` makes it.
         scene: `Scene`.
         values: dotted names -> (R, …).
-        runs: their coordinates.
+        runs: coordinates of these runs.
         tolerance: part of the motions by these forces that may be left out [1].
     """
     compliance, rows, q = _reduced_compliance(whole, scene), [], runs.q
@@ -57,10 +57,10 @@ def sampled(
         own = with_parameters(scene, {name: jnp.asarray(v[r]) for name, v in values.items()})
         p = None if runs.p is None else jnp.asarray(runs.p[r])
         forces, volumes = _contributions(whole, own, (jnp.asarray(q[r]), p), jnp.asarray(times))
-        # As motions: forces of stiff modes are large and move little.
+        # Forces count as motions, since forces of stiff modes are large but move little.
         G = compliance @ np.asarray(forces)
         size = np.linalg.norm(G.sum(axis=2), axis=1)
-        # Where modes alone turn an element inside out, some laws have no force; a state at rest has none to share.
+        # If modes alone invert an element, some laws have no force there; a state at rest has no forces.
         good = np.isfinite(G).all(axis=(1, 2)) & (size > LEAST_MOTION * np.abs(q).max())
         rows.append((G[good] / size[good, None, None]).reshape(-1, whole.weights.size))
         if volumes is not None:
@@ -71,8 +71,9 @@ def sampled(
 
 
 def _balances(volumes: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Rows (…, P) of both sides of the fluid's balance (2, K, m, P), as pressures, over their size and that of p
-    (K, m)."""
+    """Rows (…, P) of both sides of the fluid's balance (2, K, m, P), as pressures, divided by their size plus that of p
+    (K, m).
+    """
     size = np.linalg.norm(volumes[0].sum(axis=2), axis=1) + np.linalg.norm(p, axis=1)
     return (volumes / np.where(size > 0, size, 1.0)[:, None, None]).reshape(-1, volumes.shape[-1])
 
@@ -110,8 +111,9 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
 def _contributions(
     whole: ReducedModel, scene: Scene, run: tuple[jax.Array, jax.Array | None], times: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Contributions of each point along a run (T, n), (T, m), at some times: to each reduced force (K, n, P), and those
-    of `_balance`, of a porous scene."""
+    """Contributions of each point along a run (T, n), (T, m), at some times: to each reduced force (K, n, P), and in a
+    porous scene those of `_balance`.
+    """
     solve, points, solid = scene.solve, scene.mesh.points, solid_at_points(whole, scene)
     F0, (q, p) = prescribed_gradients(whole, scene), run
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, False, None, Free(jnp.ones_like(points)))

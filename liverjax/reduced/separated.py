@@ -57,10 +57,10 @@ def separate(
         points: of the grid along each parameter: points ** n full runs.
         tolerance: part of the grid's displacements that the terms may leave out.
         most_terms: the most terms.
-        checks: runs at random parameters, seed 0, that tell the error.
+        checks: runs at random parameters, seed 0, from which the error follows.
 
     Raises:
-        InputError: a scene with time, ranges that are none, too many runs, a run that did not converge.
+        InputError: a scene with time, unusable ranges, too many runs, a run that did not converge.
     """
     names, limits = _names_and_limits(scene, ranges, points)
     t = np.cos(np.pi * (np.arange(points) + 0.5) / points)  # Chebyshev's points in (-1, 1)
@@ -92,11 +92,11 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
     """Displacements (V, 3) [m] at a value of each parameter; may be differentiated, vmapped and jitted.
 
     Raises:
-        InputError: a parameter without a value, a value of none, or one outside of the model's range.
+        InputError: a parameter without a value, a value without a parameter, or a value outside of the model's range.
     """
     wrong = sorted(set(model.names) ^ set(values))
     if wrong:
-        raise InputError(f"the separated form is of {', '.join(model.names)}: leave out or give {wrong[0]}")
+        raise InputError(f"the separated form is for {', '.join(model.names)}: leave out or give {wrong[0]}")
     product = jnp.ones(model.fields.shape[0], model.fields.dtype)
     for name, function, (low, high) in zip(model.names, model.functions, model.ranges, strict=True):
         value = jnp.asarray(values[name], model.fields.dtype)
@@ -121,7 +121,7 @@ def _names_and_limits(
 ) -> tuple[tuple[str, ...], np.ndarray]:
     """Names and limits (n, 2) of the parameters."""
     if scene.solve.kind != "static" or scene.solve.dt is not None:
-        raise InputError("a separated form is of a static answer: give a scene of kind 'static' without dt")
+        raise InputError("a separated form is for a static answer: give a scene of kind 'static' without dt")
     if not 1 <= len(ranges) <= MOST_PARAMETERS:
         raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
     if points < 2 or points ** len(ranges) > MOST_RUNS:
@@ -132,7 +132,7 @@ def _names_and_limits(
         if np.ndim(numbers_at(scene, name)) != 0:
             raise InputError(f"{name} is not one number: name one of them, e.g. {name}.0")
         if np.shape(limits) != (2,) or not np.all(np.isfinite(limits)) or not limits[0] < limits[1]:
-            raise InputError(f"ranges[{name!r}] = {limits!r} is no range: give the lowest and the highest value")
+            raise InputError(f"ranges[{name!r}] = {limits!r} is not a range: give the lowest and the highest value")
     return tuple(ranges), np.array([ranges[name] for name in ranges], float)
 
 
@@ -159,7 +159,7 @@ def _terms(
         shape: of the grid.
         tolerance, most: as in `separate`.
     """
-    # In coordinates of the runs' own space: as many numbers as there are runs.
+    # Use coordinates in the space of the runs: as many numbers as there are runs.
     U, S, _ = np.linalg.svd(known, full_matrices=False)
     data = U * S
     size, left = np.linalg.norm(data), data
@@ -198,7 +198,7 @@ def _rank_one(tensor: np.ndarray) -> list[np.ndarray]:
 
 
 def _against(tensor: np.ndarray, factors: list[np.ndarray | None]) -> np.ndarray:
-    """The tensor summed with all factors; the axis without one is left."""
+    """The tensor contracted with all factors; an axis without a factor stays."""
     out = tensor
     for a in reversed(range(tensor.ndim)):
         f = factors[a]

@@ -1,7 +1,7 @@
 """A step of a reduced model: its equations with stresses at the sampled points alone, and their solution.
 
-Newton's method keeps an inverse from step to step and corrects it with the forces that it sees. The tangent is taken
-anew only where the iterations gain little.
+Newton's method keeps an inverse from step to step and corrects it with the forces that it sees. The tangent is computed
+anew only if the iterations gain little.
 """
 
 from collections.abc import Callable
@@ -47,15 +47,15 @@ class ReducedEquations(NamedTuple):
     motion: ReducedMotion | None
     dt: jax.Array
     newmark: bool | None
-    spread: jax.Array | None  # sizes of the slopes (9, S, n) [1/m] where a part of the body is moved
-    noise: jax.Array  # size of forces whose roundoff is the tolerance [N]: no load leaves only these
+    spread: jax.Array | None  # sizes of the slopes (9, S, n) [1/m] if motion is prescribed
+    noise: jax.Array  # size of forces [N] whose roundoff equals the tolerance; without loads the only scale
     fluid: Flowing | None  # of a porous scene
     light: SinglePrecision
     steepest: jax.Array  # root of the sum of squares of all slopes [1/m]
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
-    """As `liverjax.physics.inertia.Moving.kinematics`."""
+    """Velocity and acceleration at q, as in `liverjax.physics.inertia.Moving.kinematics`."""
     assert e.motion is not None
     velocity = (q - e.q) / e.dt
     acceleration = (velocity - e.motion.velocity) / e.dt
@@ -103,15 +103,15 @@ def _point_forces(e: ReducedEquations, F: jax.Array) -> jax.Array:
 
 
 def _added_up(e: ReducedEquations, P: jax.Array) -> jax.Array:
-    """Forces (n,) [N] of the points' (9, S)."""
+    """Forces (n,) [N] on the modes, from the forces of the points (9, S)."""
     return jnp.tensordot(P, e.model.slopes, axes=2)
 
 
 def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (n,) and the size of all, of the points' forces (9, S) and what they add up to (n,)."""
+    """Out-of-balance forces (n,) and the size of all forces, from the points' forces (9, S) and their sum (n,)."""
     r, size = internal - e.load, jnp.linalg.norm(internal) + jnp.linalg.norm(e.load) + e.noise
     if e.spread is not None:
-        # Without loads the forces of the points cancel at the solution: their sizes are what is at work.
+        # Without loads the forces of the points cancel at the solution: their sizes are the forces at work.
         size = size + jnp.linalg.norm(jnp.tensordot(jnp.abs(P), e.spread, axes=2))
     if e.mass is not None:
         inertia = e.mass @ reduced_kinematics(e, q).acceleration
@@ -155,10 +155,10 @@ class _ReducedIterate(NamedTuple):
     q: jax.Array
     F: jax.Array  # (9, S)
     P: jax.Array  # forces of the points (9, S)
-    internal: jax.Array  # what they add up to (n,)
+    internal: jax.Array  # their sum on the modes (n,)
     r: jax.Array
     size: jax.Array  # of r, relative to the forces at work
-    rounded: jax.Array  # the part of that which single precision may have added or taken away since it was exact
+    rounded: jax.Array  # the part of `size` that single precision may have changed since it was exact
     inverse: jax.Array  # of the tangent, or near it (n, n) [m/N]
     fresh: jax.Array  # the inverse is that of the tangent at q
     slow: jax.Array  # the last iteration gained little
@@ -166,7 +166,7 @@ class _ReducedIterate(NamedTuple):
     tangents: jax.Array
 
 
-#: An iteration that leaves more than this part of the residual calls for the tangent at hand, which costs ten of them.
+#: If an iteration leaves more than this part of the residual, a new tangent is made, at the cost of ten iterations.
 _LITTLE_GAIN = 0.95
 #: Part of the tolerance that single precision may have rounded away before forces are added up anew.
 _DOUBT = 0.1
@@ -175,7 +175,8 @@ _DOUBT = 0.1
 def _updated(inverse: jax.Array, moved: jax.Array, change: jax.Array) -> jax.Array:
     """The inverse that fits the change of the forces along the last motion; it stays symmetric, and positive if it was.
 
-    Broyden, Fletcher, Goldfarb, Shanno (1970). Where forces fall along the motion, no positive one fits: it is kept.
+    Broyden, Fletcher, Goldfarb, Shanno (1970). If forces fall along the motion, no positive inverse fits: the old one
+    is kept.
     """
     work, towards = moved @ change, inverse @ change
     seen = work > 1e-8 * jnp.linalg.norm(moved) * jnp.linalg.norm(change)
@@ -220,7 +221,7 @@ def _corrected(e: ReducedEquations, at: _ReducedIterate) -> _ReducedIterate:
     more = jnp.tensordot(change.astype(jnp.float32), e.light.slopes, axes=2).astype(dq.dtype)
     internal = at.internal + more
     r, size = _relative_residual(e, q, P, internal)
-    # Of r over the forces at work: a bound of what the products have rounded away.
+    # A bound on the roundoff of the products in r, over the forces at work.
     lost = float(jnp.finfo(jnp.float32).eps) * e.steepest * jnp.linalg.norm(change) * size
     rounded = at.rounded + lost / jnp.maximum(jnp.linalg.norm(r), jnp.finfo(r.dtype).tiny)
     inverse = _updated(at.inverse, -part * dq, r - at.r)
@@ -250,7 +251,9 @@ def step_end(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, i
 
 def _lane_by_lane(function: Callable) -> Callable:
     """The function of arrays, with lanes of vmap one by one: on a CPU all of them would wait for the slowest, and for
-    the tangent that any one needs. As `jax.custom_batching.sequential_vmap`, which fails in second derivatives."""
+    the tangent that any one needs. It replaces `jax.custom_batching.sequential_vmap`, which fails in second
+    derivatives.
+    """
     own = jax.custom_batching.custom_vmap(function)
 
     @own.def_vmap
@@ -268,7 +271,7 @@ def _lane_by_lane(function: Callable) -> Callable:
 
 
 def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, inverse: jax.Array) -> _Found:
-    """Newton's method with an inverse that is kept; the tangent is taken anew only where the iterations gain little."""
+    """Newton's method with an inverse that is kept; the tangent is made anew only if the iterations gain little."""
     e = e._replace(newmark=newmark)
 
     def unfinished(at: _ReducedIterate) -> jax.Array:
@@ -291,8 +294,8 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
 
     start = e.q if e.motion is None else e.q + e.dt * e.motion.velocity
     if e.motion is not None and not newmark:
-        # A parabola or a cubic through the last coordinates: that which would have foretold the step before better.
-        # Accelerations of Newmark's method ring: they predict nothing.
+        # A parabola or a cubic through the last coordinates: the one that would have predicted the step before better.
+        # Accelerations of Newmark's method oscillate: they predict nothing.
         more = jnp.where(e.motion.steady, e.motion.change, 0.0)
         start = start + e.dt**2 * (e.motion.acceleration + more)
     foretold, none = gradients_at(e, start), jnp.zeros((), jnp.int32)
@@ -303,11 +306,11 @@ def _solved(newmark: bool, most: int, e: ReducedEquations, tolerance: Number, in
     begin = _ReducedIterate(start, F, F, e.q, e.q, zero, zero, inverse, no, no, none, none)
     begin = _in_double_precision(e, begin)
     at = inner(begin)
-    # Where the old inverse does not lead to the end, the step begins again.
+    # If the old inverse does not lead to the end, the step begins again.
     begin = begin._replace(iterations=at.iterations)
     at = jax.tree.map(lambda old, new: jnp.where(at.size > tolerance, new, old), at, begin)
     at = jax.lax.while_loop(unfinished, lambda at: inner(refreshed(at)), at)
-    # One more correction costs no forces.
+    # One more correction needs no new forces.
     return _Found(at.q - at.inverse @ at.r, at.size, at.iterations, at.inverse)
 
 
@@ -317,7 +320,7 @@ def _derivative_of_end(newmark: bool, most: int, primals: tuple, tangents: tuple
     found = step_end(newmark, most, *primals)
     without = e._replace(newmark=None)
 
-    # Derivatives by what is differentiated alone: those by the slopes would take longer than all the others.
+    # Only by the numbers that are differentiated: derivatives by the slopes would take longer than all others.
     numbers, tree = jax.tree.flatten(without)
     changes = jax.tree.leaves(de)
     live = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]

@@ -25,7 +25,7 @@ class SinglePrecision(NamedTuple):
 
 
 class ReducedTangent(NamedTuple):
-    """What the tangent (n, n) [N/m] is made of."""
+    """The parts of the tangent (n, n) [N/m]."""
 
     slopes: jax.Array  # (9, S, n) [1/m]
     moduli: jax.Array  # (9, 9, S) [N m], weights included
@@ -45,7 +45,7 @@ def tangent_times(K: ReducedTangent, x: jax.Array) -> jax.Array:
 
 
 def tangent_matrix(K: ReducedTangent) -> jax.Array:
-    """All of K (n, n)."""
+    """The matrix K (n, n) [N/m]."""
     AB = jnp.sum(K.moduli[..., None] * K.slopes[None], axis=1)
     return jnp.tensordot(K.slopes, AB, axes=((0, 1), (0, 1))) + K.rest
 
@@ -66,7 +66,7 @@ def solved_by_tangent(K: ReducedTangent, light: SinglePrecision, b: jax.Array) -
         def going(at: tuple) -> jax.Array:
             _, r, before, count = at
             size = jnp.linalg.norm(r)
-            # Without a gain of a half roundoff is left, or the inverse is not near.
+            # If r is not halved, only roundoff is left, or the inverse is not near.
             return (size > LEFT * limit) & (size < 0.5 * before) & (count < CORRECTIONS)
 
         def corrected(at: tuple) -> tuple:

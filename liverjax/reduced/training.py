@@ -1,4 +1,4 @@
-"""Modes from runs of the full model (proper orthogonal decomposition of their displacements), and which runs."""
+"""Modes from runs of the full model (proper orthogonal decomposition of their displacements), and their choice."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.simulation.batch import simulate_batch
 from liverjax.tensors.principal_fields import principal_fields
 
-#: Displacements below this part of the body's size are none.
+#: Displacements below this part of the body's size count as none.
 _ROUNDOFF = 1e-13
 #: A porous scene has at most one mode of pressure for so many modes of motion.
 PRESSURES = 2
@@ -46,17 +46,17 @@ def reduce_scene(
 
     Args:
         scene: `Scene`.
-        rows: dotted names -> one value a run, as in `simulate_batch`.
+        rows: dotted names -> one value per run, as in `simulate_batch`.
         tolerance: part of the displacements of these runs that the modes may leave out [1], root of mean squares.
         most_modes: the most modes.
         point_tolerance: part of the motions by the reduced forces that the sampled points may leave out [1]; default:
             `tolerance`.
-        runs: of the full model. The first two thirds are the first rows. Of the others, those follow whose errors a
-            first reduced model states as the largest, over its own displacements. Default: all rows.
+        runs: number of full runs. The first two thirds are the first rows. The last third are the rows for which a
+            first reduced model states the largest errors, relative to its own displacements. Default: all rows.
 
     Raises:
-        InputError: physics that a reduced model has not, a tolerance outside of 0 to 1, no row whose run converged,
-            `runs` that are none of the rows.
+        InputError: physics that a reduced model does not have, a tolerance outside of 0 to 1, no row whose run
+            converged, `runs` that does not fit the number of rows.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance
@@ -144,7 +144,7 @@ def _coordinates_of_rows(
 
 
 def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Size of the correction (or of the largest coordinates where there is none), over the largest displacement."""
+    """Size of the correction over the largest displacement; without a correction the largest displacement itself."""
     q, failed = _coordinates_of_rows(model, scene, values)
     found = np.zeros(len(q))
     for k, own in enumerate(q):
@@ -154,7 +154,7 @@ def _errors_of_rows(model: ReducedModel, scene: Scene, values: Mapping[str, np.n
             continue
         off = np.linalg.norm(np.asarray(correction_at(model.correction, jnp.asarray(own), scene.solve.dt)), axis=-1)
         found[k] = off.max() / max(u, 1e-300)
-    # A run that fails has nothing to say; the full one would most likely fail too.
+    # A run that fails states no error; the full run would most likely fail too.
     return np.where(failed, -1.0, found)
 
 

@@ -1,4 +1,4 @@
-"""Numbers of regions as arrays: one number an element, where a region of the body has its own.
+"""Numbers of regions as arrays: one number per element, if a region of the body has its own.
 
 A law of another kind is computed for the elements of its region alone.
 """
@@ -18,7 +18,7 @@ from liverjax.tensors.subsets import subsets
 
 
 def by_element(scene: Scene) -> Scene:
-    """The scene without regions: law, viscosity and porosity have one number an element where a region has its own."""
+    """The scene without regions: numbers of law, viscosity and porosity that a region changes become arrays."""
     mesh, law, prony, sponge = scene.mesh, scene.law, scene.viscosity, scene.porosity
     if scene.region:
         law = law_of_elements(law, scene.region, mesh.number_of_elements)
@@ -30,10 +30,10 @@ def by_element(scene: Scene) -> Scene:
 
 
 def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: int) -> Law:
-    """The law of every element.
+    """The law of the scene with the numbers and laws of its regions.
 
-    A number has one value an element (E,) if a region changes it. Laws stand side by side if a region has a law of its
-    own.
+    A number has one value per element (E,) if a region changes it. If a region has a law of its own, the result is a
+    `ByRegion` of all laws.
 
     Raises:
         InputError: a name that the law does not have.
@@ -51,7 +51,7 @@ def law_of_elements(law: Law, regions: tuple[Region, ...], number_of_elements: i
 
 
 def viscosity_of_elements(prony: Prony, regions: tuple[Region, ...], number_of_elements: int) -> Prony:
-    """The series with one number a mode and element (N, E) where a region has its own."""
+    """The series; numbers that a region changes have one value per mode and element, (N, E)."""
     found: Content = {}
     for name in VISCOUS:
         own = {

@@ -1,6 +1,6 @@
 """The same scene in the next richer space of functions: quadratic elements for linear ones, cubic for quadratic ones.
 
-Supports, motions and loads stay the same. Positions and numbers of a node between others follow from theirs.
+Supports, motions and loads stay the same. Positions and numbers of a new node follow from the nodes around it.
 """
 
 import jax
@@ -17,7 +17,7 @@ from liverjax.scenes.scene import Scene
 
 
 def enriched(scene: Scene) -> Scene:
-    """The scene of quadratic elements, or of cubic ones (`liverjax.mesh.promotion.cubic`); numbers may be traced."""
+    """The scene with quadratic or cubic elements (`liverjax.mesh.promotion.cubic`); numbers may be traced."""
     return _quadratic_mesh(scene) if scene.mesh.order == 1 else _cubic(scene)
 
 
@@ -54,7 +54,7 @@ def _cubic(scene: Scene) -> Scene:
     def more(nodes: Indices) -> jax.Array:
         return node_numbers(promotion.with_functions(mesh, np.asarray(nodes)))
 
-    # The unknowns of the new functions are no positions: where their nodes are moved, they stay 0.
+    # The unknowns of the new functions are not positions: in a prescribed motion they stay 0.
     still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
     body = scene.body
     if body is not None and jnp.ndim(body.density):
@@ -72,7 +72,7 @@ def _cubic(scene: Scene) -> Scene:
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:
-    """Triangles with the number of their face, whose function takes a part of the load."""
+    """The load, whose triangles also have the number of their face: its function gets a part of the load."""
     triangles = np.asarray(load.triangles)
     faces = promotion.face_numbers(mesh, triangles)
     return replace(load, triangles=node_numbers(np.column_stack([triangles, faces])))

@@ -1,9 +1,9 @@
-"""Settings of a scene file that would change nothing, each refused in one sentence: what is asked for is done."""
+"""Settings of a scene file that would change nothing, each is refused in one sentence, so that none is ignored."""
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Keys of [mesh] that each kind of mesh reads, beside those that all read.
+#: Keys of [mesh] that all meshes read; further keys of each kind of mesh.
 _EVERY_MESH = ("unit", "order", "is")
 _MESHES = {
     "file": ("file",),
@@ -16,7 +16,7 @@ def refuse_idle(content: Content) -> None:
     """Refuse settings without effect in the content of a scene file whose values have been read.
 
     Raises:
-        InputError: a key that this mesh, this kind of motion or this run does not look at.
+        InputError: a key that this mesh, this kind of motion or this run does not use.
     """
     mesh, solve, output = (content.get(name, {}) for name in ("mesh", "solve", "output"))
     kind = "file" if "file" in mesh else mesh["shape"]

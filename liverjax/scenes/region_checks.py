@@ -19,7 +19,8 @@ def check_region_numbers(scene: Scene) -> None:
     """Refuse numbers of regions that no step can use; traced ones pass.
 
     Raises:
-        InputError: a part that the scene has not, an unknown name, numbers out of bounds, another number of modes.
+        InputError: a part that the scene does not have, an unknown name, numbers out of bounds, another number of
+            modes.
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
@@ -61,7 +62,7 @@ def check_viscosity(prony: Prony | None, region: Region, name: str) -> None:
         return
     if prony is None:
         raise InputError(
-            f"{name}: viscosity needs a [viscosity] of the scene: give one, with ratios = [0.0] where it has none"
+            f"{name}: viscosity needs a [viscosity] in the scene: give one, with ratios = [0.0] if the rest has none"
         )
     unknown = sorted(set(own) - set(VISCOUS))
     if unknown:
@@ -90,7 +91,7 @@ def check_porosity(porosity: Porosity | None, region: Region, name: str) -> None
     if not own:
         return
     if porosity is None:
-        raise InputError(f"{name}: porosity needs a [porosity] of the scene: give one")
+        raise InputError(f"{name}: porosity needs a [porosity] in the scene: give one")
     for key, value in own.items():
         if key not in POROUS:
             raise InputError(f"{name}: porosity has {key}, which cannot differ in a region: {hint(key, POROUS)}")
@@ -117,5 +118,5 @@ def _check_own_laws(regions: tuple[Region, ...]) -> None:
             if other.law and np.isin(np.asarray(other.elements), elements).any():
                 raise InputError(
                     f"region.{later} changes the law of elements to which region.{k} gives a law of its own: give them "
-                    "elements apart, or write the numbers into that law"
+                    "separate elements, or write the numbers into that law"
                 )

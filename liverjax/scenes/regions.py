@@ -13,7 +13,7 @@ from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics import boundary
 
-#: What may differ in a region's viscosity, and in its porosity.
+#: Numbers that may differ in a region's viscosity, and in its porosity.
 VISCOUS = ("ratios", "relaxation_times")
 POROUS = ("bulk", "limit_bulk", "fluid_fraction", "permeability")
 
@@ -36,7 +36,7 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
     """Numbers of the elements of a set, or of those whose four nodes satisfy `where` (see `boundary.select`).
 
     Raises:
-        InputError: both or neither given, a set that the mesh has not, no element found.
+        InputError: both or neither given, a set that the mesh does not have, no element found.
     """
     if set is not None and where is None:
         if as_word(set, f"{name}: set") not in mesh.element_sets:
@@ -51,12 +51,12 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
 
 
 def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
-    """The law of a scene, and those that regions have of their own."""
+    """The law of a scene, and the laws that regions have in its place."""
     return (*law.pieces(), *(region.law for region in regions if isinstance(region.law, Law)))
 
 
 def changed_numbers(region: Region) -> dict[str, object]:
-    """Names and values where a region changes numbers of the scene's law."""
+    """Name -> value of the numbers of the scene's law that a region changes."""
     return region.law if isinstance(region.law, dict) else {}
 
 
@@ -73,5 +73,5 @@ def law_number(law: Law, name: str) -> jax.Array:
 
 
 def refused_name(name: str) -> str:
-    """How a refusal begins where the law has no such number."""
+    """The beginning of a refusal if the law has no such number."""
     return f"region: the law has no number {name!r}"

@@ -1,4 +1,4 @@
-"""A scene: a mesh, a law, the physics it has and no other, and what holds, moves and loads it."""
+"""A scene: a mesh, a law, its physics, and its supports, motions and loads."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,13 +23,13 @@ from liverjax.scenes.springpots import SpringpotSeries
 
 @struct
 class Body:
-    """Mass and weight. Lumped, a node has its density times a quarter of every linear element around it."""
+    """Mass and weight. A lumped node has its density times a quarter of every linear element around it."""
 
-    density: Number = param("kg/m^3", "per reference volume; one number, or one a node (V,)", above=0.0, typical=1060.0)
+    density: Number = param("kg/m^3", "per reference volume; one, or one per node (V,)", above=0.0, typical=1060.0)
     gravity: Numbers = param("m/s^2", "acceleration (3,)", default=(0.0, 0.0, 0.0))
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param("1", "factors of gravity (T,), or gravity itself (T, 3) [m/s^2]", default=None)
-    mass: str = static(default="lumped", about="in motion lumped: at the nodes; or consistent: as the weight is")
+    mass: str = static(default="lumped", about="mass in motion: lumped at the nodes, or consistent, as the weight")
 
 
 @struct
@@ -43,9 +43,9 @@ class Solve:
     newton: str = static(
         default="converged",
         about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "
-        "solve a step (not for derivatives)",
+        "solve per step (not for derivatives)",
     )
-    newton_iterations: int = static(default=25, about="the most of a step; 1 means newton = one_step", lower=1)
+    newton_iterations: int = static(default=25, about="most iterations of a step; 1 means newton = one_step", lower=1)
     integrator: str = static(
         default="euler", about="dynamic: euler (first order) or newmark (average acceleration, second order)"
     )
@@ -55,11 +55,11 @@ class Solve:
     )
     volumetric: str = static(
         default="element",
-        about="element; against locking mixed: pressures of their own, or nodal: averaged at nodes; auto: mixed for "
-        "quadratic elements where it can be",
+        about="element; against locking: mixed (pressures as unknowns) or nodal (averaged at nodes); auto: mixed for "
+        "quadratic elements if possible",
     )
     robust: str = static(
-        default="off", about="projected or regularised: make the energy least where a step cannot be followed"
+        default="off", about="projected or regularised: minimise the energy if a step cannot be followed"
     )
     frequencies: Numbers | None = param("Hz", "(F,) of harmonic motion", above=0.0, default=None)
     reduced: str = static(default="", about="file of a reduced model, as `python -m liverjax reduce` makes it")
@@ -76,18 +76,18 @@ class Scene:
     law: Law = param("1", "its hyperelastic law")
     region: tuple[Region, ...] = param("1", "parts of the body with other numbers in the law", default=())
     viscosity: Prony | None = param("1", "Prony series", default=None)
-    springpots: SpringpotSeries | None = param("1", "fractional model, of harmonic motion alone", default=None)
+    springpots: SpringpotSeries | None = param("1", "fractional model, for harmonic motion only", default=None)
     porosity: Porosity | None = param("1", "sponge and fluid", default=None)
     body: Body | None = param("1", "density and gravity", default=None)
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
     traction: tuple[Traction, ...] = param("1", "loads", default=())
-    physics: tuple[Physics, ...] = param("1", "what else acts: supports, …", unnamed="named", default=())
-    solve: Solve = param("1", "how", default=Solve())
+    physics: tuple[Physics, ...] = param("1", "further physics: supports, …", unnamed="named", default=())
+    solve: Solve = param("1", "how it is solved", default=Solve())
     points_are: str = static(default="reference", about="the mesh's points: reference; or loaded, under the loads")
 
     def named(self, section: str) -> list[int]:
-        """Places in `physics` of those that scene files write as [[section]]."""
+        """Places in `physics` of the physics that scene files write as [[section]]."""
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
@@ -98,7 +98,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
         scene: `Scene`.
         values: dotted names as in the scene file -> values: ``law.mu`` (``law.1.mu`` of several laws),
             ``viscosity.relaxation_times``, ``viscosity.ratios.0``, ``body.density``, ``displaced.0.by``, ``solve.dt``,
-            ``mesh.points``, ``region.0.law.mu``; a number of a law may be one an element (E,).
+            ``mesh.points``, ``region.0.law.mu``; a number of a law may have one value per element (E,).
 
     Raises:
         InputError: a name that the scene does not have.
@@ -121,14 +121,14 @@ def numbers_at(scene: Scene, name: str) -> Any:
     """The number, or numbers, of a scene at a dotted name.
 
     Raises:
-        InputError: a name that the scene does not have, or one of no floating-point number.
+        InputError: a name that the scene does not have, or the name of something else than floating-point numbers.
     """
     found = names.get(scene, name, _refusal(name))
-    # Whole numbers are allowed where a user wrote one (`mu = 770`); an array of them holds places in the mesh.
+    # Whole numbers are allowed where a user wrote one (`mu = 770`); an array of them names places in the mesh.
     if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):
         raise InputError(f"{_refusal(name)}: use one like law.mu")
     return found if isinstance(found, tuple) else jnp.asarray(found, float)
 
 
 def _refusal(name: str) -> str:
-    return f"parameter {name!r} is no number of the scene file"
+    return f"parameter {name!r} is not a number of the scene file"

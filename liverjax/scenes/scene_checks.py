@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Container
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +23,7 @@ from liverjax.scenes.regions import Region, laws_of
 from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.springpots import SpringpotSeries, check_springpots
 
-#: What the choices of [solve] may be.
+#: Allowed values of the choices in [solve].
 CHOICES = {
     "kind": ("static", "dynamic", "harmonic"),
     "newton": ("converged", "one_step"),
@@ -32,7 +33,7 @@ CHOICES = {
     "volumetric": ("element", "nodal", "mixed", "auto"),
     "robust": ("off", "projected", "regularised"),
 }
-#: Of what type the parts of a scene are: one, and several.
+#: Types of the parts of a scene: of single parts, and of parts that may be several.
 PARTS = {
     "mesh": TetMesh,
     "law": laws.Law,
@@ -43,12 +44,12 @@ PARTS = {
     "solve": Solve,
 }
 SEVERAL = {"region": Region, "fixed": Fixed, "displaced": Displaced, "traction": Traction, "physics": Physics}
-#: What [body] mass may be.
+#: Allowed values of [body] mass.
 MASSES = ("lumped", "consistent")
 
 
 def check_before_run(scene: Scene) -> None:
-    """Refuse choices that mean nothing, numbers out of bounds and nodes that are not there; traced ones pass. Compiles
+    """Refuse unknown choices, numbers out of bounds and nodes that are not in the mesh; traced ones pass. Compiles
     nothing.
 
     Raises:
@@ -60,7 +61,7 @@ def check_before_run(scene: Scene) -> None:
 
 
 def check_choices(scene: Scene) -> None:
-    """Refuse choices that mean nothing. Numbers are not looked at, so a traced scene passes as well.
+    """Refuse unknown or contradictory choices. Numbers are not checked, so a traced scene passes as well.
 
     Raises:
         InputError: unknown choices; a load or motion given twice, not at all, of wrong shape.
@@ -82,10 +83,10 @@ def check_choices(scene: Scene) -> None:
         _refuse_what_moves_in_time(scene)
     _loaded(scene)
     if scene.solve.linear_solver == "direct" and any(load.pressure is not None for load in scene.traction):
-        raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg where a pressure follows")
+        raise InputError("[solve] linear_solver = 'direct' is for symmetric forces: use cg if a pressure follows")
     if scene.solve.linear_solver == "direct" and any(physics.ties for physics in scene.physics):
         raise InputError(
-            "[solve] linear_solver = 'direct' knows no nodes that move together: use cg with a rigid plate"
+            "[solve] linear_solver = 'direct' cannot treat nodes that move together: use cg with a rigid plate"
         )
     if scene.solve.volumetric in ("nodal", "mixed"):
         _own_volumes(scene)
@@ -105,10 +106,10 @@ def check_choices(scene: Scene) -> None:
 
 
 def _known_nodes(scene: Scene) -> None:
-    """Refuse node numbers that are not in the mesh, and elements that are inside out; what is traced passes."""
-    mesh, named = scene.mesh, {}
-    for kind, several in (("fixed", scene.fixed), ("displaced", scene.displaced)):
-        named |= {f"{kind}.{k}.nodes": condition.nodes for k, condition in enumerate(several)}
+    """Refuse node numbers that are not in the mesh, and inverted elements; traced arrays pass."""
+    mesh = scene.mesh
+    named: dict[str, object] = {f"fixed.{k}.nodes": hold.nodes for k, hold in enumerate(scene.fixed)}
+    named |= {f"displaced.{k}.nodes": motion.nodes for k, motion in enumerate(scene.displaced)}
     named |= {f"traction.{k}.triangles": load.triangles for k, load in enumerate(scene.traction)}
     if scene.porosity is not None:
         named["porosity.drained"] = scene.porosity.drained
@@ -141,7 +142,7 @@ def _refuse_what_moves_in_time(scene: Scene) -> None:
 
 
 def _check_kinds(scene: Scene) -> None:
-    """Refuse parts that are something else, such as numbers of nodes in place of `Fixed`."""
+    """Refuse parts of a wrong type, such as numbers of nodes in place of `Fixed`."""
     for key, kind in PARTS.items():
         own = getattr(scene, key)
         if own is not None and not isinstance(own, kind):
@@ -156,7 +157,7 @@ def _check_kinds(scene: Scene) -> None:
 
 
 def _remedy(kind: type) -> str:
-    """What a user writes for a value of a type."""
+    """Words for a message: how a user writes a value of this type."""
     families: dict[object, str] = {laws.Law: "a law of lj.laws", Physics: "a physics, such as lj.Obstacle"}
     return families.get(kind, f"an lj.{kind.__name__}")
 
@@ -165,7 +166,7 @@ def _loaded(scene: Scene) -> None:
     if scene.points_are not in ("reference", "loaded"):
         raise InputError(f"[mesh] is = {scene.points_are!r} is not known: use reference or loaded")
     if scene.points_are == "loaded" and scene.porosity is not None:
-        raise InputError('[mesh] is = "loaded" does not know the pressure of a fluid: leave [porosity] out')
+        raise InputError('[mesh] is = "loaded" cannot have the pressure of a fluid: leave [porosity] out')
     if scene.points_are == "loaded" and any(physics.ties for physics in scene.physics):
         raise InputError('[mesh] is = "loaded" cannot have nodes that move together: leave the rigid plate out')
 
@@ -186,9 +187,10 @@ def _check_traction(load: Traction, name: str) -> None:
 def _check_motion(motion: Displaced, name: str) -> None:
     history.check(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
     check_axes(motion.axes, name)
-    # Of a tuple of traced numbers NumPy knows no shape.
-    shape = (len(motion.by),) if isinstance(motion.by, tuple | list) and len(motion.by) == 3 else np.shape(motion.by)
-    if motion.by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
+    # NumPy cannot tell the shape of a tuple of traced numbers.
+    by: Any = motion.by
+    shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
+    if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
         raise InputError(f"{name} by has shape {shape}: give three numbers in m, or three a node")
     if motion.by is None and motion.history is None:
         raise InputError(f"{name} needs either by (3,) or times and history: give one of them")
@@ -197,11 +199,11 @@ def _check_motion(motion: Displaced, name: str) -> None:
 def _body(body: Body, nodes: int) -> None:
     if body.mass not in MASSES:
         raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
-    # Of a tuple of traced numbers NumPy knows no shape.
+    # NumPy cannot tell the shape of a tuple of traced numbers.
     gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
     density = np.shape(body.density)
     if density not in ((), (nodes,)):
-        raise InputError(f"body density has shape {density}: give one number, or one a node ({nodes},), in kg/m^3")
+        raise InputError(f"body density has shape {density}: give one number or one per node ({nodes},), in kg/m^3")
     history.check(body.times, body.history, "body")
     if gravity != (3,):
         raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")
@@ -216,17 +218,17 @@ def _mixed(scene: Scene) -> None:
 def _own_volumes(scene: Scene) -> None:
     name = f"[solve] volumetric = {scene.solve.volumetric!r}"
     if scene.porosity is not None:
-        raise InputError(f"{name} holds a law's own volumetric energy, a sponge has another: use 'element'")
+        raise InputError(f"{name} is for a law's own volumetric energy, which a sponge replaces: use 'element'")
     several = laws_of(scene.law, scene.region)
     for law in several:
         if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
-            raise InputError(f"{name} needs a law with bulk apart from its shear, {type(law).__name__} is none")
+            raise InputError(f"{name} needs a law with bulk apart from its shear, unlike {type(law).__name__}")
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
         raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
 
 
 def check_bounds(scene: Scene) -> None:
-    """Refuse numbers out of bounds. Traced ones pass; `check_mesh` looks at the mesh. Compiles nothing.
+    """Refuse numbers out of bounds. Traced ones pass; `check_mesh` checks the mesh. Compiles nothing.
 
     Raises:
         InputError: one sentence with the number's dotted name, value, bound and remedy.
@@ -242,7 +244,7 @@ def check_bounds(scene: Scene) -> None:
 
 
 def check_numbers(scene: Scene) -> None:
-    """Refuse numbers that cannot be used, alone or together. The mesh is not looked at; host side.
+    """Refuse numbers that cannot be used, alone or together. The mesh is not checked; host side.
 
     Raises:
         InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.
@@ -263,7 +265,7 @@ def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
 
     Args:
         scene: `Scene`.
-        only: names of those to look at, like ``obstacle.0``; None: all.
+        only: names of the physics to check, like ``obstacle.0``; None: all.
 
     Raises:
         InputError: one sentence that begins with the name of the physics.
@@ -316,13 +318,13 @@ def check_scene(scene: Scene) -> None:
 
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
-    """How many directions of nodes each of the further physics holds at the beginning, by names as `check_physics`."""
+    """Name of each further physics (as in `check_physics`) -> number of nodal directions that it holds at first."""
     named = [(name, physics) for name, physics in _named_physics(scene) if only is None or name in only]
     return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
 
 
 def check_hold(scene: Scene, before: dict[str, int]) -> None:
-    """Refuse numbers if with them the physics hold a static body less than `before` (see `holding`) and not enough.
+    """Refuse numbers with which physics hold less than `before` (see `holding`), if a static body is then loose.
 
     Raises:
         InputError: nothing holds a connected piece any more.

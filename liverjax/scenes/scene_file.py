@@ -35,7 +35,7 @@ from liverjax.scenes.scene import Body, Scene, Solve
 from liverjax.scenes.scene_checks import CHOICES, check_scene
 from liverjax.scenes.springpots import SpringpotSeries
 
-#: Of a cylinder: what it needs, then what it may have.
+#: Keys of a cylinder: the required ones, then the optional ones.
 _CYLINDER = ("radius", "height", "cell_size", "rim_cell", "rings", "match_area")
 _KEYS = {
     "mesh": ("file", "unit", "order", "is", "shape", "size", "cells", *_CYLINDER),
@@ -67,7 +67,7 @@ _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
 
 
 def load_scene(path: str | Path) -> Scene:
-    """A scene from a TOML file; relative paths in it are relative to it.
+    """A scene from a TOML file; relative paths in it begin at its folder.
 
     Raises:
         InputError: unreadable file, unknown or missing keys, values that cannot be used, checked before any compile.
@@ -123,7 +123,7 @@ def output_of(content: Mapping[str, object]) -> tuple[list[str], bool]:
     """The [output] table of a scene file: names of fields, and whether reactions are written as a table.
 
     Raises:
-        InputError: keys or values of another kind.
+        InputError: unknown keys, or values of a wrong type.
     """
     table = _table("output", content.get("output", {}))
     names, reactions = table.get("fields", []), table.get("reactions", False)
@@ -144,7 +144,7 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
                 raise InputError(_of_two_kinds(name, own, [set(p.keys) for p in NAMED if p.section == section]))
             if not kinds:
                 known = " or ".join(", ".join(p.keys[2:]) for p in NAMED if p.section == section)
-                raise InputError(f"{name} has a place alone: give {known}")
+                raise InputError(f"{name} has only a place: give {known}")
             yield kinds[0].read(mesh, table, name)
 
 
@@ -152,7 +152,7 @@ def _of_two_kinds(name: str, given: set[str], kinds: list[set[str]]) -> str:
     """A sentence on keys that are known but do not go together."""
     first = min((given - keys for keys in kinds), key=len)
     other = min((given - keys for keys in kinds if first <= keys), key=len, default=given)
-    return f"{name} has {', '.join(sorted(first))} beside {', '.join(sorted(other))}: leave one of them out"
+    return f"{name} has {', '.join(sorted(first))} together with {', '.join(sorted(other))}: leave one out"
 
 
 def _with_paths(content: object, folder: Path) -> Any:
@@ -234,7 +234,7 @@ def _linear_mesh(table: dict, folder: Path) -> TetMesh:
 
 
 def _cylinder(table: dict, scale: float) -> TetMesh:
-    """A cylinder; its optional keys grade it to its rims and rings."""
+    """A cylinder; its optional keys refine it towards its rims and rings."""
     for key in ("radius", "height", "cell_size"):
         if key not in table:
             raise InputError(f"[mesh] shape = 'cylinder' needs {key}: give a length")
@@ -300,7 +300,7 @@ def _dotted(name: str, table: dict) -> list[tuple[str, float]]:
 def _prony(table: dict) -> Prony:
     for key in ("ratios", "relaxation_times"):
         if key not in table:
-            raise InputError(f"[viscosity] needs {key}: give a list of numbers, one a mode")
+            raise InputError(f"[viscosity] needs {key}: give a list of numbers, one per mode")
     g, tau = (jnp.asarray(_numbers(f"[viscosity] {k}", table[k])) for k in ("ratios", "relaxation_times"))
     return Prony(ratios=g, relaxation_times=tau, **{k: table[k] for k in ("part", "scheme") if k in table})
 
@@ -308,7 +308,7 @@ def _prony(table: dict) -> Prony:
 def _read_springpots(table: dict) -> SpringpotSeries:
     for key in ("times", "exponents"):
         if key not in table:
-            raise InputError(f"[springpots] needs {key}: give a list of numbers, one a springpot")
+            raise InputError(f"[springpots] needs {key}: give a list of numbers, one per springpot")
     values: Content = {k: table[k] for k in ("part",) if k in table}
     if "spring" in table:
         values["spring"] = _number("[springpots] spring", table["spring"])
@@ -354,7 +354,7 @@ def _inlet(mesh: TetMesh, name: str, table: object) -> Inlet:
 
 
 def _drained(mesh: TetMesh, given: Any) -> jax.Array:
-    """Nodes of one place, or of any place of a list."""
+    """Nodes of one place, or of all places in a list."""
     if given == []:
         raise InputError("porosity.drained = [] names no place: give [{z_max = 0.0}], or leave it out (sealed)")
     name = "porosity.drained"
@@ -379,7 +379,7 @@ def _read_body(table: dict) -> Body:
 
 
 def _history(name: str, table: dict, forms: tuple[int, ...] = (1, 3)) -> dict[str, jax.Array]:
-    """Times and numbers of a table's history, where it has one."""
+    """Times and numbers of a table's history; empty if it has none."""
     if "history" not in table:
         return {}
     times, numbers = history.read_history(table["history"], name, forms)
@@ -441,5 +441,5 @@ def _read_solve(table: dict) -> Solve:
     if "frequencies" in values:
         values["frequencies"] = jnp.asarray(_numbers("[solve] frequencies", values["frequencies"]))
     if not isinstance(values.get("reduced", ""), str):
-        raise InputError(f'[solve] reduced = {values["reduced"]!r} is no file: write reduced = "model.h5"')
+        raise InputError(f'[solve] reduced = {values["reduced"]!r} is not a file: write reduced = "model.h5"')
     return Solve(**values)

@@ -1,4 +1,4 @@
-"""Springpots beside the law, for harmonic motion: fractional models of soft tissue.
+"""Springpots for harmonic motion: fractional models of soft tissue, relative to the law's stiffness.
 
 A springpot has the complex modulus V (i omega)^alpha, between a spring (alpha = 0) and a dashpot (alpha = 1). With the
 law's stiffness G0,
@@ -6,7 +6,7 @@ law's stiffness G0,
     G* / G0 = spring + sum_k 1 / ((i omega tau_k)^-alpha_k + 1 / limit_k):
 
 with spring 0 and one springpot the springpot alone, with spring 1 the fractional Kelvin-Voigt model, with a limit (a
-spring in a row with the springpot) the fractional Zener model (Bagley and Torvik 1983, J. Rheol. 27, 201).
+spring in series with the springpot) the fractional Zener model (Bagley and Torvik 1983, J. Rheol. 27, 201).
 """
 
 from typing import Any
@@ -24,12 +24,12 @@ from liverjax.physics.viscosity import PARTS, Prony, check_part
 
 @struct
 class SpringpotSeries:
-    """The complex modulus over the law's own; of harmonic motion alone."""
+    """The complex modulus over the law's own; for harmonic motion only."""
 
-    times: Any = param("s", "tau_k (K,): there a springpot is as stiff as the law", above=0.0)
+    times: Any = param("s", "tau_k (K,): at omega = 1/tau_k a springpot is as stiff as the law", above=0.0)
     exponents: Any = param("1", "alpha_k (K,), 0 a spring, 1 a dashpot", lower=0.0, upper=1.0)
-    limits: Any = param("1", "stiffness over the law's of a spring in a row with each (K,)", above=0.0, default=None)
-    spring: Number = param("1", "what is left at frequency 0: 1 the law, 0 nothing", lower=0.0, default=1.0)
+    limits: Any = param("1", "stiffness over the law's of a spring in series with each (K,)", above=0.0, default=None)
+    spring: Number = param("1", "stiffness at frequency 0, over the law's", lower=0.0, default=1.0)
     part: str = static(default="all", about="all: of the whole stress; isochoric: of its isochoric part", words=PARTS)
 
 
@@ -37,15 +37,15 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     """Refuse springpots that give no modulus; host side.
 
     Raises:
-        InputError: lengths that differ, values out of bounds, an unknown part or one that the law has not, a viscosity
-            beside them.
+        InputError: lengths that differ, values out of bounds, an unknown part or one that the law does not have, a
+            viscosity in the same scene.
     """
     if viscosity is not None:
         raise InputError("the scene has [viscosity] and [springpots]: leave one of them out")
     bounds.check(own, "springpots")
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
-        raise InputError("springpots times, exponents and limits differ in length: give one of each a springpot")
+        raise InputError("springpots times, exponents and limits differ in length: give one each per springpot")
     check_part(own.part, law, "springpots")
 
 
@@ -57,7 +57,7 @@ def series_at_rest(own: SpringpotSeries) -> Prony:
 def springpot_factors(own: SpringpotSeries, omegas: jax.Array) -> jax.Array:
     """G*/G0 (F,) at angular frequencies (F,) [rad/s]."""
     times, alpha = jnp.atleast_1d(own.times)[:, None], jnp.atleast_1d(own.exponents)[:, None]
-    # (i omega tau)^-alpha, whose phase is a quarter turn a unit of alpha.
+    # (i omega tau)^-alpha, whose phase is a quarter turn per unit of alpha.
     compliance = jnp.exp(-alpha * (jnp.log(omegas[None] * times) + 0.5j * jnp.pi))
     if own.limits is not None:
         compliance = compliance + 1 / jnp.atleast_1d(own.limits)[:, None]

@@ -1,8 +1,8 @@
 """Which linear solver `linear_solver = "auto"` means: a rule on size and stiffness, measured in `experiments/`.
 
-Conjugate gradients; a factorisation for static bodies of at most 10,000 tetrahedra whose bulk modulus exceeds the shear
-modulus by more than a thousand, or whose worst element is a sliver, and where no pressure follows the body and nothing
-rubs.
+It means a factorisation for some static bodies of at most 10,000 tetrahedra, if no pressure follows the body and there
+is no friction: their bulk modulus is more than a thousand times the shear modulus, or their worst element is a sliver.
+For all others it means conjugate gradients.
 """
 
 import jax
@@ -50,9 +50,9 @@ def linear_solver(scene: Scene) -> str:
 
 
 def form_of_volumes(scene: Scene) -> str:
-    """The form for volume changes: mixed for quadratic elements where it can be, else element.
+    """The form for volume changes: mixed for quadratic elements if possible, else element.
 
-    Looks at no numbers: a run and its derivatives must be of one form.
+    It does not depend on numbers, since a run and its derivatives must have the same form.
     """
     name = scene.solve.volumetric
     if name != "auto":

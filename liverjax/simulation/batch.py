@@ -31,7 +31,7 @@ class Batch:
     strategy: str = static(
         default="map", about="map: one lane after another per device; vmap: all lanes of a device at once"
     )
-    devices: int = static(default=1, about="lanes were spread over so many")
+    devices: int = static(default=1, about="number of devices that shared the lanes")
 
 
 def strategy_for(platform: str) -> str:
@@ -48,7 +48,7 @@ def simulate_batch(
         scene: `Scene`.
         parameters: dotted names, as in `with_parameters` -> values with a leading axis of N lanes.
         strategy: "map" or "vmap"; None: by the platform.
-        devices: to spread the lanes over; None: all of the process.
+        devices: devices that share the lanes; None: all devices of the process.
 
     Raises:
         InputError: no parameters, different numbers of lanes, a name that the scene does not have; as `simulate`, with
@@ -74,7 +74,7 @@ def simulate_batch(
 
     number = min(len(devices), lanes)
     if number > 1:
-        # The last lane fills up, so that every device has as many.
+        # The last lane is repeated, so that all devices have equally many lanes.
         fill = -lanes % number
         parameters = {n: jnp.concatenate([v, jnp.repeat(v[-1:], fill, axis=0)]) for n, v in parameters.items()}
         spread = PartitionSpec("lane")
@@ -93,7 +93,7 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     first = next(iter(lengths))
     for name, length in lengths.items():
         if length is None or length == 0:
-            raise InputError(f"{name} has no lanes: give one value a lane, e.g. [700.0, 800.0]")
+            raise InputError(f"{name} has no lanes: give one value per lane, e.g. [700.0, 800.0]")
         if length != lengths[first]:
             raise InputError(f"{name} has {length} lanes and {first} has {lengths[first]}: give as many of each")
     return int(lengths[first] or 0)

@@ -17,13 +17,13 @@ from liverjax.simulation.run import Result
 LONGEST = 1.0
 #: No organ and no sample is shorter [m]: numbers in metres read as millimetres make a liver of 0.2 mm.
 SHORTEST = 1e-3
-#: A displacement below this part of the body's size is none.
+#: A displacement below this part of the body's size counts as none.
 _ROUNDOFF = 1e-13
-#: Vertices nearer to each other than this part of the body's size stand in one place.
+#: Vertices nearer to each other than this part of the body's size are at one place.
 SAME_PLACE = 1e-9
-#: An element with a hundredth of the volume of the regular one of the same edges: errors of its gradients grow as much.
+#: Quality (volume over that of a regular element of the same edges) below which gradients are a hundred times worse.
 SLIVER = 0.01
-#: A soft tissue is about four fifths fluid: below this J not even its solid has room. The reciprocal likewise.
+#: A soft tissue is about four fifths fluid: below this J its solid alone has no room. MOST_J is the reciprocal.
 LEAST_J, MOST_J = 0.2, 5.0
 
 
@@ -32,7 +32,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
 
     Args:
         scene: `Scene`, not traced.
-        result: what its run returned.
+        result: `Result` of its run.
     """
     return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_volumes(scene, result)]
 
@@ -50,7 +50,7 @@ _SMALL = 0.02
 
 
 def mesh_sentence(scene: Scene, result: Result) -> str:
-    """One line: what the mesh leaves out of the positions at the last step, and the remedy."""
+    """One line on the mesh error of the positions at the last step, with the remedy."""
     assert result.mesh_error is not None
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
@@ -82,7 +82,7 @@ def _of_mesh(mesh: TetMesh) -> list[str]:
     places = np.unique(np.rint(points[: mesh.number_of_vertices] / (SAME_PLACE * size)), axis=0)
     if len(places) < mesh.number_of_vertices:
         said.append(
-            f"{mesh.number_of_vertices - len(places)} nodes stand where another node stands: the body is not joined "
+            f"{mesh.number_of_vertices - len(places)} nodes are at the place of another node: the body is not joined "
             "there; merge them if it should be"
         )
     slivers = np.flatnonzero(quality < SLIVER)
@@ -95,7 +95,7 @@ def _of_mesh(mesh: TetMesh) -> list[str]:
     return said
 
 
-#: K/mu above which quadratic elements without pressures of their own lose a tenth or more (experiments/TABLES.md).
+#: K/mu above which quadratic elements without pressures as unknowns are 10 % off or more (experiments/TABLES.md).
 _LOCKING = 100.0
 
 

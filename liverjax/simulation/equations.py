@@ -23,14 +23,14 @@ class State(NamedTuple):
     """The state between two steps."""
 
     x: jax.Array  # (V, 3) [m]
-    memories: tuple  # one of every physics, in order; None where it remembers nothing
+    memories: tuple  # one of every physics, in order; None: it has no memory
 
 
 class Sizes(NamedTuple):
     """Sizes of nodal forces at rest, the same for all steps; without derivatives."""
 
-    unit_strain: jax.Array  # [N] of a stretch along x, per unit strain
-    roundoff: jax.Array  # [N] of positions rounded to their digits
+    unit_strain: jax.Array  # [N] size of the forces by a stretch along x, per unit strain
+    roundoff: jax.Array  # [N] size of the forces by rounded positions
 
 
 class Equations(NamedTuple):
@@ -38,12 +38,12 @@ class Equations(NamedTuple):
 
     scene: Scene
     physics: tuple[Physics, ...]
-    acting: tuple  # what acts of each of them, None where nothing does
+    acting: tuple  # the acting part of each physics; None: nothing acts
     state: State  # at the beginning
     k: Number  # number of the step, from 1
     free: Free
     noise: Number  # [N] below this, forces are roundoff: an unloaded equilibrium has converged
-    roundoff: jax.Array  # [N] of positions rounded to their digits
+    roundoff: jax.Array  # [N] size of the forces by rounded positions
     moved: tuple[jax.Array, jax.Array] | None  # (V, 3) [m] prescribed before and after the step
 
     @property
@@ -63,7 +63,7 @@ class Equations(NamedTuple):
 
     @property
     def mixed(self) -> Any:
-        """Physics whose pressures are unknowns beside the positions, or None."""
+        """The physics whose pressures are unknowns together with the positions, or None."""
         return self.volume if self.volume is not None and self.volume.unknown else None
 
     @property
@@ -88,7 +88,7 @@ class Forces(NamedTuple):
 
     @property
     def total(self) -> jax.Array:
-        """(V, 3) [N]."""
+        """Sum of all forces (V, 3) [N]."""
         return sum(self.nodal, self.internal)
 
 
@@ -120,7 +120,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
 
 
 def _forces_at_beginning(scene: Scene, x: jax.Array) -> jax.Array:
-    """Forces (V, 3) [N] of all physics but inertia at positions x (V, 3), with the memory of the reference."""
+    """Forces (V, 3) [N] of all physics except inertia at positions x (V, 3), with memories of the reference shape."""
     still = replace(scene, solve=replace(scene.solve, kind="static"))
     none = jnp.zeros((), x.dtype)
     at_rest = initial_state(still)._replace(x=x)
@@ -134,7 +134,7 @@ def _first_step(scene: Scene, x: jax.Array, free: Free) -> Step:
 
 
 def force_sizes(scene: Scene) -> Sizes:
-    """Sizes [N] of the forces by a stretch along x and by rounded positions: the tolerance without loads."""
+    """Sizes [N] of the forces by a stretch along x and by rounded positions: they set the tolerance without loads."""
     mesh, law = scene.mesh, law_at_rest(scene)
     dtype = mesh.points.dtype
     along = mesh.points * jnp.array([[1.0, 0.0, 0.0]], dtype)
@@ -150,9 +150,9 @@ def force_sizes(scene: Scene) -> Sizes:
 
 
 def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
-    """Size [N] of what stiff springs make of rounded positions, a motion (V, 3) [m], in the reference shape.
+    """Size [N] of the springs' forces by rounded positions, a motion (V, 3) [m], in the reference shape.
 
-    Contact is left out: what touches is not known before the step.
+    Contact is left out: the points of contact are not known before the step.
     """
     x = scene.mesh.points
     begin = _first_step(scene, x, free_directions(scene))
@@ -230,7 +230,7 @@ def unknowns(e: Equations, x: jax.Array, pressure: jax.Array | None = None) -> j
     """Unknowns q of a step at positions x (V, 3): the free ones (3 V,), then pressures that are unknown, in their unit.
 
     Args:
-        pressure: of the vertices (V,) [Pa], where they are unknown; default: those at the beginning of the step.
+        pressure: of the vertices (V,) [Pa], if they are unknowns; default: the pressures at the beginning of the step.
     """
     field = e.free._replace(tied=()).vectors(x)
     for nodes in e.free.tied:
@@ -248,7 +248,7 @@ def forces(
 ) -> Forces:
     """Forces of all physics at unknowns q (3 V,), at part s of the step.
 
-    Pressures that flow are solved for, from a `guess` where there is one, or are given as `pressure` (V,) [Pa].
+    Pressures of a flowing fluid are solved for, from `guess` if it is given, or are given as `pressure` (V,) [Pa].
     """
     x = positions(e, q, s)
     F = deformation_gradient(e.mesh, x)
@@ -267,26 +267,27 @@ def forces(
 
 
 def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
-    """(V,) [Pa] of the vertices."""
+    """Unknown pressures (V,) [Pa] of the vertices."""
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]
 
 
 def settled(e: Equations, q: jax.Array, s: Number | None = None) -> jax.Array:
-    """Unknowns q with the pressures that balance the volumes at part s of the step (its end), where they are
-    unknowns."""
+    """Unknowns q with the pressures that balance the volumes at part s of the step (default: its end), if pressures are
+    unknowns.
+    """
     n, x = 3 * e.mesh.number_of_nodes, positions(e, q, jnp.ones((), q.dtype) if s is None else s)
     pressure = e.mixed.settled(e.mesh, determinant(deformation_gradient(e.mesh, x)))
     return jnp.concatenate([q[:n], pressure / e.mixed.unit])
 
 
 def flowing_pressure(e: Equations, q: jax.Array, s: Number, guess: Guess) -> jax.Array:
-    """Pressures (V,) [Pa] that flow, at unknowns q (3 V,), from a guess of them."""
+    """Pressures (V,) [Pa] of a flowing fluid at unknowns q (3 V,), solved for from a guess."""
     assert e.volume is not None
     return e.volume.pressure(e.mesh, determinant(deformation_gradient(e.mesh, positions(e, q, s))), guess)
 
 
 def flowing_lack(e: Equations, q: jax.Array, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Out-of-balance forces (3 V,) [N] at the end of the step with pressures (V,) [Pa], and their own balance (V,)."""
+    """Out-of-balance forces (3 V,) [N] at the end of the step with pressures (V,) [Pa], and their residuals (V,)."""
     volume: Any = e.volume
     f = forces(e, q, jnp.ones((), q.dtype), None, volume.in_force(pressure))
     return flat(e.free.vectors(f.total, f.x)), volume.balance(e.mesh, pressure, determinant(f.F))
@@ -309,13 +310,13 @@ def residual(
 def energy(e: Equations, q: jax.Array, start: jax.Array) -> jax.Array:
     """The energy [J] that a step minimises: the sum of incremental potentials.
 
-    Its gradient at `start` is the residual; everywhere, where all forces have an energy.
+    Its gradient at `start` is the residual. If all forces have an energy, this is true at every q.
     """
     x, begin = positions(e, q, 1.0), positions(e, start, 1.0)
     F = deformation_gradient(e.mesh, x)
     total = jnp.sum(e.mesh.weights * sum(solid.energy(F) for solid in e.solids))
     if e.volume is not None:
-        total = total + e.volume.energy(e.mesh, determinant(F))  # of mixed bodies with the best pressures
+        total = total + e.volume.energy(e.mesh, determinant(F))  # of mixed bodies, with the best pressures
     return sum((a.energy_from(e.mesh, x, begin) for a in e.nodal), total)
 
 
@@ -326,7 +327,7 @@ def advanced(e: Equations, end: End) -> State:
 
 
 def outputs(scene: Scene, state: State) -> dict[str, jax.Array]:
-    """Results of the physics at a state, beside positions and reactions."""
+    """Further results of the physics at a state, besides positions and reactions."""
     shown: dict[str, jax.Array] = {}
     for physics, memory in zip(physics_of(scene), state.memories, strict=True):
         shown |= {name: on_middles(scene.mesh, field) for name, field in physics.output(memory).items()}

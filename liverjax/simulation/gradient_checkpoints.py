@@ -24,7 +24,7 @@ def number_kept(store: str | int, steps: int) -> int:
         store: "all", "sqrt", or a number above 0.
 
     Raises:
-        InputError: anything else.
+        InputError: another value.
     """
     if store == "all":
         return steps
@@ -48,7 +48,7 @@ def one_step(step: Callable) -> Callable:
 
 
 def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
-    """The outputs of `step` (carry, k) beside the carry, stacked over `numbers` (T,); the module explains `kept`."""
+    """The outputs of `step` (carry, k) without the carry, stacked over `numbers` (T,); see the module for `kept`."""
     steps = len(numbers)
     if kept >= steps:
         return jax.lax.scan(step, start, numbers)[1]
@@ -60,7 +60,7 @@ def scan(step: Callable, start: Any, numbers: jax.Array, kept: int) -> Any:
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, carry, k)[1])
         return jax.lax.cond(real, step, lambda carry, _: (carry, nothing), carry, k)
 
-    # Nothing of a segment but its beginning stays. Compiled once: the last one skips the steps beyond the run's end.
+    # Only a segment's beginning is kept. Compiled once: the last segment skips steps beyond the run's end.
     @jax.checkpoint
     def segment(carry, at):
         return jax.lax.scan(unless_over, carry, at) if beyond else jax.lax.scan(step, carry, at)

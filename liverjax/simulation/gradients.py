@@ -2,8 +2,8 @@
 
     found = lj.value_and_gradient(lambda result: loss(result.positions), scene, {"law.mu": 770.0})
 
-`jax.grad` through `simulate` gives the same numbers; this adds the code, the choice between reverse and forward mode
-and the memory known beforehand.
+`jax.grad` through `simulate` gives the same numbers; this adds a status code, the choice between reverse and forward
+mode, and a prediction of the memory.
 """
 
 import functools
@@ -24,7 +24,7 @@ from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import beginning
 
 MODES = ("reverse", "forward")
-#: The scene's positions at the beginning, beside the dotted names of `with_parameters`.
+#: Name of the positions at the beginning, in addition to the dotted names of `with_parameters`.
 START = "start"
 
 
@@ -53,7 +53,7 @@ def value_and_gradient(
             begin at, at rest.
         store: what reverse mode keeps: "all" steps, "sqrt" or a number of states (`checkpointing`, `memory`).
         mode: "reverse", at a cost that does not grow with the number of parameters; "forward", without memory for the
-            steps, at a run a parameter.
+            steps, at the cost of one run per parameter.
 
     Raises:
         InputError: unknown mode or store, no parameters, a name that the scene does not have; as `simulate`.
@@ -88,7 +88,7 @@ def _program_of_gradient(loss: Callable[[Result], jax.Array], store: str | int, 
     return jax.jit(both)
 
 
-#: Numbers a point of integration that one step's derivative works with, beside tangents; measured.
+#: Numbers per point of integration that one step's derivative needs in addition to tangents; measured.
 _WORK = 440
 
 
@@ -111,7 +111,7 @@ def memory(scene: Scene, store: str | int = "all") -> int:
     if kept >= steps:
         return steps * (state + root) + work
     count, length, rest = gradient_checkpoints.lengths(steps, kept)
-    # Beside the states, what the run returns; not all of it at once.
+    # In addition to the states, the result of the run; not all of it at once.
     return (count + (rest > 0)) * (state + tangent) + length * (state + root) + 3 * steps * root // 2 + work
 
 

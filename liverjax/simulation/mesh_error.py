@@ -1,20 +1,20 @@
 """Error of a run by its mesh: one linearised solve in each step in the next richer space of functions.
 
 The positions of a step, with nothing added, are put into quadratic elements (those of quadratic elements into cubic
-ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot show.
-A reaction changes by its derivative along du. Memories of viscosity, fluid and inertia go along with the richer run.
-A surface that touches an obstacle does so at other points in the richer space: there, solves go on until these are
-found. With only the contact points of the first solve, the stated error of a flat punch's force was 1/4; the true error
-was 1/100.
+ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot
+represent. A reaction changes by its derivative along du. Memories of viscosity, fluid and inertia are those of the
+richer run. In the richer space a surface touches an obstacle at other points: with contact, solves go on until these
+are found. With only the contact points of the first solve, the stated error of a flat punch's force was 1/4; the true
+error was 1/100.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
 moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds
 of the error, so du is multiplied by 1.5. It leaves out the errors of the body's shape, of the time steps and of the
 fluid's pressures.
 
-In motion the errors of steps add up. The richer run has consistent masses, so that the functions which it adds fall as
-the others do, and the inertia of the richer motion acts in both. Each of its steps is linearised where it stands,
-moved on by what the run moves in the step.
+In motion the errors of steps add up. The richer run has consistent masses, so that the functions which it adds fall
+like the others; the inertia of the richer motion acts on all of them. Each of its steps is linearised at its own
+positions, moved by the run's motion in this step.
 """
 
 from collections.abc import Callable
@@ -51,22 +51,22 @@ from liverjax.solvers.krylov import true_residual
 from liverjax.solvers.point_matrix import restricted
 from liverjax.solvers.problem import MOST_LINEAR_ITERATIONS
 
-#: Tolerance of the linear solve: to 1e-1 it finds only a fifth of what a slender beam of quadratic elements lacks. Then
-#: the same where pressures are unknown, the part of the error that du counts for, both of linear elements and of
-#: quadratic ones, and the bar beside a scalar, over the correction.
+#: Tolerance of the linear solve: 1e-1 finds only a fifth of the error of a slender beam of quadratic elements. Then
+#: the tolerance if pressures are unknowns, and the factor on du, both for linear elements and for
+#: quadratic ones; and the error bar of a number, over its correction.
 _TOLERANCE = 1e-2
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
 BAR = 1.25
-#: Where a surface touches: linear solves of a step at most, and the forces out of balance that end them, over all.
+#: With contact: most linear solves of a step, and the residual, over the forces at work, that ends them.
 _ROUNDS, _SETTLED = 24, 1e-3
-#: Halvings of such a solve that leaves more out of balance than before.
+#: Most halvings of such a solve, if it makes the residual larger.
 _HALVINGS = 4
 
 
 @struct
 class MeshError:
-    """Estimated error of a run: what a mesh without end would add to its result."""
+    """Estimated error of a run: what an infinitely fine mesh would add to its result."""
 
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3)")
@@ -86,11 +86,11 @@ def mesh_error_of(scene: Scene, positions: jax.Array, reactions: jax.Array) -> M
     """The estimate for a run from the reference positions; its node numbers may not be traced.
 
     Args:
-        scene: as it was run (`liverjax.simulation.run.prepared`).
+        scene: the scene that was run (`liverjax.simulation.run.prepared`).
         positions, reactions: of the run (T, V, 3).
 
     Raises:
-        InputError: a scene of another mesh; a scheme of one linear solve a step, whose error is not the mesh's alone.
+        InputError: a scene of another mesh; the one-step scheme, whose error is not only the mesh's.
     """
     if positions.shape[1] != scene.mesh.number_of_nodes:
         raise InputError(
@@ -108,24 +108,24 @@ def richer(scene: Scene) -> Scene:
     """
     refuse(scene)
     rich = enriched(scene)
-    # Linear elements lock: their error is that against elements which do not.
+    # Linear elements lock: their error is measured against elements that do not.
     volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
-    # Under an indenter the iterations of mixed cubic elements do not end: who asks for a factorisation has one.
+    # Under an indenter the iterations of mixed cubic elements do not end: factorise if the user has chosen it.
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
     solve = replace(rich.solve, linear_solver=linear, robust="off", volumetric=volumetric)
     sponge = None if rich.porosity is None else sponge_at_points(rich.porosity, rich.mesh)
-    # With lumped masses the functions that the richer space adds would fall otherwise than the others.
+    # With lumped masses the functions that the richer space adds would fall differently from the others.
     body = None if rich.body is None else replace(rich.body, mass="consistent")
     rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, body=body, solve=solve)
     return replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
 
 
 def refuse(scene: Scene) -> None:
-    """Refuse a scene for which this estimate is not made.
+    """Refuse a scene for which this estimate cannot be made.
 
     Raises:
-        InputError: a scheme of one linear solve a step.
+        InputError: the one-step scheme.
     """
     if scene.solve.newton == "one_step":
         raise InputError("solve.newton = 'one_step' leaves an error of its own: estimate that of a converged run")
@@ -149,14 +149,14 @@ def _step(scene: Scene, rich: Scene, sizes: Sizes, state: State, given: Any) -> 
     q = unknowns(e, padded(rich.mesh, x))
     begin = q
     if scene.solve.kind == "dynamic":
-        # Errors of a motion add up: the richer run goes on from where it is, by what the other moves in the step.
+        # Errors of a motion add up: the richer run goes on from its own positions, by the run's motion in the step.
         begin = q + unknowns(e, state.x) - unknowns(e, padded(rich.mesh, before))
     near, (dq, iterations, positive) = _found_near(scene, e, begin)
     f, along = jax.linearize(lambda q: forces(e, q, one), near)
     whole = f.total + along(dq).total
     reaction = whole - e.free.vectors(whole)
     dq = near + dq - q
-    # Where du turns elements inside out, the richer run goes on from the positions of the other.
+    # If du inverts elements, the richer run goes on from the positions of the run.
     sound = jnp.all(volume_ratios(rich.mesh, positions(e, q + dq, one)) > 0) & jnp.all(jnp.isfinite(dq))
     end = forces(e, jnp.where(sound, q + dq, q), one)
     found = sound & positive & (iterations < MOST_LINEAR_ITERATIONS)
@@ -173,14 +173,14 @@ _Solved = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _Solved]:
-    """Where the last linear solve begins, and what it finds.
+    """The point where the last linear solve begins, and its result.
 
-    One solve from q, unless a surface may touch: it does so at other points in the richer space, which take some more.
+    One solve from q, unless there may be contact: more solves find its points in the richer space.
     """
     one = jnp.ones((), q.dtype)
     tolerance = _TOLERANCE
     if e.volume is not None and e.volume.unknown:
-        # Pressures begin where the step did, far from those of its end: the load is much more than the mesh's error.
+        # Pressures begin at the step's beginning, far from its end: the load is much larger than the mesh's error.
         tolerance = _WITH_PRESSURES[scene.mesh.order]
 
     def solved(q: jax.Array) -> _Solved:
@@ -188,7 +188,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
         K = tangent.tangent(e, f.pressure, f.x, one)
         load = -residual(e, q, one)[0]
         dq, iterations, positive = tangent.solve(e, K, load, tolerance, MOST_LINEAR_ITERATIONS)
-        # An iteration may break off without a word.
+        # Iterations may break off without a sign.
         ended = true_residual(tangent.product(e, K), load, dq) <= 10 * tolerance
         return dq, iterations, positive & ended
 
@@ -216,7 +216,7 @@ def _found_near(scene: Scene, e: Equations, q: jax.Array) -> tuple[jax.Array, _S
 
 
 def _shortened(size: Callable[[jax.Array], jax.Array], q: jax.Array, dq: jax.Array) -> jax.Array:
-    """The part of dq, halved `_HALVINGS` times at most, that leaves less out of balance than there is at q."""
+    """The part of dq, halved `_HALVINGS` times at most, that leaves a smaller residual than at q."""
     before = size(q)
 
     def go_on(t: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ from liverjax.solvers.krylov import chebyshev
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.matrices import Matrix, scale
 
-#: Of the polynomial that stands for the inverse of the pressures' matrix: it is right to 1 %.
+#: Degree of the polynomial that replaces the inverse of the pressures' matrix: its error is 1 %.
 _DEGREE = 6
 
 
@@ -57,7 +57,7 @@ def coupled(
 def balances(
     mesh: TetMesh, A: block_matrix.BlockMatrix | PointMatrix, motion: Sequence[jax.Array]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-    """Forces, columns (V,), of a motion (V,) at given pressures, and the balance of volumes (V,) that it leaves."""
+    """Forces, columns (V,), of a motion (V,) at given pressures, and the change of the volumes' balance (V,)."""
     if isinstance(A, PointMatrix):
         return point_matrix.product(mesh, A, motion), -point_matrix.volume_changes(mesh, A, motion)
     *forces, balance = block_matrix.product(A, motion)
@@ -71,7 +71,7 @@ def pressure_change(
     balance: jax.Array,
     exactly: bool = False,
 ) -> jax.Array:
-    """Change of pressures (V,) that answers a balance of volumes (V,).
+    """Change of pressures (V,) that brings a balance of volumes (V,) back to 0.
 
     Without `flow` the matrix of the pressures is diagonal. With `flow` their equation is solved approximately, or, if
     `exactly` is set, to its tolerance.
@@ -92,7 +92,7 @@ def with_pressures(
     """Forces, columns (V,), and balance of unknown pressures (V,) in their unit, of a change (motion, pressures)."""
     motion, dp = both
     if isinstance(A, block_matrix.BlockMatrix):
-        # The coupled matrix is of pressures that push inwards, and of minus the balance.
+        # In the coupled matrix pressures push inwards, and the balance has a minus sign.
         every = block_matrix.product(A, (*motion, -volume.unit * dp))
         return every[:3], -volume.unit * every[3]
     forces, outwards = point_matrix.product(mesh, A, motion), pulled(mesh, A, volume.unit * dp)
@@ -101,7 +101,7 @@ def with_pressures(
 
 
 def without_pressures(mesh: TetMesh, volume: Any, A: PointMatrix, motion: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), of a motion with the unknown pressures that answer it, for quadratic elements.
+    """Forces, columns (V,), of a motion with the unknown pressures that follow from it, for quadratic elements.
 
     The matrix of the pressures is inverted by a polynomial, so that this stays symmetric: over its diagonal it has
     eigenvalues between 1/2 and 5/2 in tetrahedra (Wathen 1987).
@@ -121,7 +121,7 @@ def pulled(mesh: TetMesh, A: PointMatrix | block_matrix.BlockMatrix, pressures: 
 
 
 def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> jax.Array:
-    """Stiffness [Pa/m^3] of every point against a change of its volume where nothing flows between elements.
+    """Stiffness [Pa/m^3] of every point against a change of its volume if nothing flows between elements.
 
     C is the matrix of the pressures. Its diagonal is divided among the elements in proportion to their volumes, so that
     their sum is not softer than the true matrix.
@@ -131,7 +131,7 @@ def undrained_bulk(mesh: TetMesh, C: block_matrix.BlockMatrix, mask: Number) -> 
 
 
 def undrained_diagonal(A: block_matrix.BlockMatrix, mask: Number) -> block_matrix.Block:
-    """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the pressure's matrix: right where nothing flows."""
+    """Diagonal blocks of K + G^T D^-1 G, with D the diagonal of the pressure's matrix: exact if nothing flows."""
     soft = -mask / A.diagonal[3][3]
     near = soft[A.nodes]
 

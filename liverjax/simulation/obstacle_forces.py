@@ -17,14 +17,14 @@ class ObstacleForces(NamedTuple):
 
     force: jax.Array  # (obstacles, T, 3) [N] of the body on the obstacle
     depth: jax.Array  # (obstacles, T) [m] largest depth of the surface in it
-    displacement: jax.Array  # (obstacles, T, 3) [m] of the obstacle: where a force has pressed it, or as it was given
+    displacement: jax.Array  # (obstacles, T, 3) [m] of the obstacle: by a force, or as prescribed
 
 
 def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
     """Forces on the obstacles of a scene, and the depths that the contact leaves; differentiable.
 
     Args:
-        scene: as it was run.
+        scene: the scene that was run.
         result: `Result` of `liverjax.simulate` from the reference positions, all steps stored.
     """
     scene = prepared(scene)  # as it was run: numbers of regions by element, in its precision
@@ -34,7 +34,7 @@ def obstacle_forces(scene: Scene, result: Result) -> ObstacleForces:
     found = [p.in_body(scene.mesh, scene.law) for p in scene.physics if isinstance(p, Obstacle)]
 
     def one(obstacle: Obstacle) -> tuple[jax.Array, jax.Array, jax.Array]:
-        # What sticks remembers where it was: the steps are gone through in order.
+        # Friction has a memory: the steps are computed in order.
         def at(carry: Any, given: Any) -> tuple[Any, tuple[jax.Array, jax.Array, jax.Array]]:
             (memory, before), (k, x) = carry, given
             acting = obstacle.freeze(memory, Step(mesh, before, k, steps, dt, False, None, free))

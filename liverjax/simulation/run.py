@@ -27,16 +27,16 @@ from liverjax.solvers.problem import StepStatistics
 class Result:
     """Result of a run: arrays over the T steps. All but the statistics are differentiable."""
 
-    times: jax.Array = param("s", "(T,); the number of the load step where there is no time")
+    times: jax.Array = param("s", "(T,); the number of the load step if there is no time")
     positions: jax.Array = param("m", "(T, V, 3)")
     reactions: jax.Array = param("N", "(T, V, 3), force of the support on the body, 0 where nothing is prescribed")
     status: jax.Array = param("1", "(T,) result codes of `liverjax.core.status`")
     pressure: jax.Array | None = param("Pa", "(T, V), of a porous scene", default=None)
     statistics: StepStatistics = param("1", "per step: Newton and CG iterations, cuts, residual")
-    mesh_error: MeshError | None = param("1", "estimate of what the mesh leaves out, where asked for", default=None)
+    mesh_error: MeshError | None = param("1", "estimated error of the mesh; None: not estimated", default=None)
 
     def check(self) -> "Result":
-        """The result itself, or `RuntimeError` with advice where a step failed; host side."""
+        """The result itself, or `RuntimeError` with advice if a step failed; host side."""
         codes = np.asarray(self.status)
         if np.any(codes != status.CONVERGED):
             step = int(np.argmax(codes != status.CONVERGED))
@@ -52,7 +52,7 @@ def _step_by_step(
     def physics(carry, k):
         state, kept = carry
         new, reactions, statistics, kept = step(equations(scene, state, k, sizes), kept, near, differentiable)
-        # A state that is not finite spoils nothing further: the run stays where it last was.
+        # If a state is not finite, the run stays at the last finite state.
         finite = jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, reactions))]).all()
         good = finite & (statistics.status != status.NOT_FINITE)
         statistics = statistics._replace(status=jnp.where(finite, statistics.status, status.NOT_FINITE))
@@ -85,7 +85,7 @@ def _run(scene: Scene, begin: jax.Array | None, report: Callable[[int], None] | 
     numbers = jnp.arange(1, steps + 1, dtype=dtype)
     start = initial_state(scene, begin)
     first = equations(scene, start, numbers[0], sizes)
-    # Derivatives take their coarse space from a longer run's beginning: made once. A run without them does not make it.
+    # In runs of several steps derivatives use the coarse space of the beginning; it is made only for derivatives.
     kept, near = beginning(first, tangent_too=steps > 1)
     advance = _step_by_step(scene, sizes, report, near)
     return _result(scene, numbers, gradient_checkpoints.scan(advance, (start, kept), numbers, store))
@@ -119,20 +119,20 @@ def simulate(
     Args:
         scene: `Scene`.
         start: positions (V, 3) [m] to begin at, at rest, as if brought there from the reference at this moment: no
-            stress has relaxed yet, and the fluid answers to the change of volume in the first step; None: the
+            stress has relaxed yet, and the fluid responds to the change of volume in the first step; None: the
             reference positions. Inverted elements need robust = "projected". A static scene then takes the start as
             a guess. If the guess is inverted or leads nowhere, the run begins at the reference positions.
         report: called on the host with the number of every finished step, for progress.
-        store: of a derivative in reverse mode: "all" keeps what every step ended with; "sqrt", or a number, keeps as
-            many states (the root of the number of steps) and runs what lies between a second time. Without a
-            derivative it does nothing. See `liverjax.simulation.gradients`.
-        mesh_error: whether to estimate what the mesh leaves out (`liverjax.simulation.mesh_error`), for a run that
+        store: what reverse mode keeps. "all" keeps the end of every step. A number keeps so many states, "sqrt" the
+            root of the number of steps; the steps between them run a second time. Without a derivative it has no
+            effect. See `liverjax.simulation.gradients`.
+        mesh_error: whether to estimate the error of the mesh (`liverjax.simulation.mesh_error`), for a run that
             begins in the reference positions.
 
     Raises:
-        InputError: choices that mean nothing; numbers out of bounds, unless traced; a loaded mesh without a reference
-            shape (traced: its points are NaN, its steps NOT_FINITE); precision "float64" where JAX's 64-bit mode is
-            off. `check_scene` checks more, the mesh above all; reading a scene file calls it.
+        InputError: unknown choices; numbers out of bounds, unless traced; a loaded mesh without a reference shape
+            (traced: its points are NaN, its steps NOT_FINITE); precision "float64" if JAX's 64-bit mode is off.
+            `check_scene` checks more, the mesh above all; reading a scene file calls it.
     """
     scene = prepared(scene)
     if start is not None:
@@ -156,16 +156,16 @@ def simulate_part(
     count: int,
     report: Callable[[int], None] | None = None,
 ) -> tuple[Result, State]:
-    """Some steps of a run, and the state to go on from, so that a long run can be kept in parts. Not differentiable.
+    """Some steps of a run, and the state to continue from, so that a long run can be kept in parts. Not differentiable.
 
     Args:
         scene: `Scene`.
-        state: what the steps before left; `initial_state(prepared(scene))` at the beginning.
+        state: the state after the steps before; `initial_state(prepared(scene))` at the beginning.
         first: number of the first step, from 1; may be traced.
         count: how many steps. Those beyond the last of the scene are skipped; their rows are zeros.
         report: as in `simulate`.
 
-    A part begins with a tangent of its own, so that going on from a state that was stored changes no bit.
+    Every part begins with a new tangent, so that a run continued from a stored state has the same bits.
 
     Raises:
         InputError: as `simulate`.

@@ -41,7 +41,7 @@ from liverjax.tensors.matrices import deformation_gradient, determinant
 
 
 def problem_of(e: Equations) -> Problem:
-    """How `step_cutting.solve` finds the end of the step."""
+    """The problem that `step_cutting.solve` solves to find the end of the step."""
     potential = None
     if e.scene.solve.robust != "off":
         potential = Potential(
@@ -72,7 +72,7 @@ def problem_of(e: Equations) -> Problem:
 
 
 def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangent.Tangent | None]:
-    """The empty `Kept` of a run that begins with these equations, and the tangent at its beginning where asked for."""
+    """The empty `Kept` of a run that begins with these equations, and with `tangent_too` the first tangent."""
     method, q = problem_of(first), unknowns(first, first.state.x)
     kept = step_cutting.nothing_kept(method, q)
     if not tangent_too:
@@ -82,7 +82,7 @@ def beginning(first: Equations, tangent_too: bool = False) -> tuple[Kept, tangen
 
 
 def _flowing(e: Equations) -> Beside | None:
-    """Pressures that flow, where they depend on motion."""
+    """The pressures of a flowing fluid that depend on the motion; None: there are none."""
     volume: Any = e.volume
     if volume is None or volume.flow is None:
         return None
@@ -109,7 +109,7 @@ def _rest(e: Equations) -> tuple[jax.Array, jax.Array]:
 
 
 def _finite(e: Equations) -> Equations:
-    """The same body of stable neo-Hookean material. Of the other physics it keeps those that act at nodes."""
+    """The same body of stable neo-Hookean material. It keeps the other physics that act at nodes."""
     law = e.scene.law
     mu = law.shear_modulus()
     own = [p.bulk_modulus() for p in e.physics if p.bulk_modulus() is not None]
@@ -122,9 +122,9 @@ def _finite(e: Equations) -> Equations:
 def step(
     e: Equations, kept: Kept | None = None, near: Any = None, differentiable: bool = True
 ) -> tuple[State, jax.Array, StepStatistics, Kept]:
-    """The next state, the reactions (V, 3) [N], what the solve took and the tangent for the next step.
+    """The next state, the reactions (V, 3) [N], statistics of the solve and the tangent for the next step.
 
-    `kept` is the tangent of the last step; derivatives, where there are any, may take the coarse space of `near`.
+    `kept` is the tangent of the last step; derivatives may use the coarse space of `near`.
     """
     scene, x, solve = e.scene, e.state.x, e.scene.solve
     options = StepOptions(
@@ -133,7 +133,7 @@ def step(
         one_step=solve.newton == "one_step",
         differentiable=differentiable,
     )
-    # Straight on where there is inertia; one step of Newton starts at x, as printed.
+    # With inertia the guess is a motion at constant velocity; a one-step solve starts at x, as in the chapter.
     ahead = [guess for guess in (a.predicted() for a in e.nodal) if guess is not None]
     guess = unknowns(e, ahead[0]) if ahead and not scene.displaced and not options.one_step else None
     problem = problem_of(e)
@@ -158,8 +158,8 @@ def adjoint(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solve K x = b with the pressures, for derivatives. Return x, its load (3 V,) and its residual over |b|.
 
-    Where pressures flow, b and x hold them too: of forces and of minus the balance of volumes. The load has their
-    balance eliminated. Iterations begin with `earlier` solves where that helps. No load follows the body here.
+    With a flowing fluid, b and x contain its pressures too: b has forces and minus the balance of volumes. In the load
+    this balance is eliminated. Iterations begin with `earlier` solves if that helps. No load may follow the body.
     """
     volume = tangent.volume_with_pressures(e)
     flows = e.mixed is None and volume is not None and volume.flow is not None
@@ -182,22 +182,22 @@ def adjoint(
     return x, b, residual
 
 
-#: Of `_with_flow`: tolerance of its solves for motions and for pressures, how often at most, and how often in a row
-#: without a gain: a loose solve for pressures far off may leave more forces out of balance than there were.
+#: In `_with_flow`: tolerances of its solves for motions and for pressures, most refinements, and most of them in a row
+#: without a gain: a loose solve for pressures far off may make the residual larger.
 _INNER, _INNER_PRESSURE, _REFINEMENTS, _VAIN = 5e-2, 1e-2, 60, 3
 
 
 def _with_flow(
     e: Equations, K: tangent.Tangent, b: jax.Array, limits: tuple[Number, int], earlier: Earlier | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`adjoint` of the mixed system where pressures flow, by iterative refinement.
+    """`adjoint` of the mixed system with a flowing fluid, by iterative refinement.
 
     Motions and pressures are refined together, so no solve for pressures is more accurate than needed.
     """
     volume: Any = tangent.volume_with_pressures(e)
     n, flow, (tolerance, max_iterations) = 3 * e.mesh.number_of_nodes, volume.flow, limits
     loose = flow._replace(tolerance=_INNER_PRESSURE)
-    given = (flow.mask - 1) * b[n:]  # pressures that are given answer for themselves
+    given = (flow.mask - 1) * b[n:]  # the solution's rows of given pressures
 
     def left(x: jax.Array, P: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The forces still out of balance after the pressures balance the volumes, and the change of pressures for
@@ -216,7 +216,7 @@ def _with_flow(
     def step(c):
         x, P, r, dP, least, vain, k = c
         size = jnp.linalg.norm(r)
-        # The last refinement does no more than is asked for.
+        # The last refinement is only as accurate as needed.
         inner = jnp.clip(0.3 * tolerance * scale / size, _INNER, 0.5)
         x, P = x + tangent.solve(e, K, r, inner, max_iterations)[0], P + dP
         r, dP = left(x, P)

@@ -46,12 +46,12 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 #: How the stiffness of elements is made: true, without negative eigenvalues, or as in the chapter's section 4.1.2 iii.
 KINDS = ("true", "projected", "regularised")
 
-#: One of `KINDS`; or one of the last two and whether to take it, known when the program runs: else the true one.
+#: One of `KINDS`; or one of the last two with a flag of the running program: if it is false, the true one is used.
 Kind = str | tuple[str, jax.Array]
 
 
 def _of_kind(kind: Kind, make: Callable[[str], Any]) -> Any:
-    """Call `make` for a kind. A kind chosen at run time puts both into the program, and what follows once."""
+    """Call `make` for a kind. For a kind chosen at run time the program contains both kinds."""
     if isinstance(kind, str):
         return make(kind)
     name, taken = kind
@@ -108,7 +108,7 @@ def node_blocks(e: Equations) -> Block | None:
 
 
 def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Between, ...]:
-    """Stiffness of the physics' elements between nodes, and its losses by numbers that adapt."""
+    """Stiffness of the physics' elements between nodes, and its losses (`GivesWay`)."""
 
     def of(kind: str) -> tuple[Between, ...]:
         found: list[Between | None] = []
@@ -121,8 +121,9 @@ def _attached(e: Equations, x: jax.Array, s: Number, kind: Kind) -> tuple[Betwee
 
 
 def _symmetric(e: Equations, more: tuple[Between, ...]) -> tuple[Attached, ...]:
-    """The part of elements between nodes that a preconditioner uses: the symmetric one, since friction has a stiffness
-    without symmetry."""
+    """The part of elements between nodes that a preconditioner uses: the symmetric one, since the stiffness of friction
+    is not symmetric.
+    """
     elements = tuple(own for own in more if isinstance(own, Attached))
     return elements if e.conservative else tuple(attached.symmetric_part(own) for own in elements)
 
@@ -140,7 +141,7 @@ def _shift(e: Equations) -> jax.Array | None:
 
 
 def volume_with_pressures(e: Equations) -> VolumeStress | None:
-    """The physics whose pressures are unknowns beside the positions."""
+    """The physics whose pressures are unknowns together with the positions; None: there is none."""
     return e.volume if e.volume is not None and e.volume.coupled else None
 
 
@@ -151,11 +152,11 @@ class Tangent(NamedTuple):
     inverse: Inverses  # of its diagonal blocks
     vertices: Inverses | None  # of quadratic elements: of the diagonal blocks of the vertices' linear elements
     slow: Coarse
-    x: jax.Array | None  # (V, 3) where it was made, for loads that follow
+    x: jax.Array | None  # (V, 3) where it was made, for loads that follow the body
     s: Any  # part of the step there
-    follows: jax.Array | None  # 1 where these loads count, 0 in a tangent without negative eigenvalues
+    follows: jax.Array | None  # 1 if these loads count, 0 in a tangent without negative eigenvalues
     attached: tuple[Between, ...] = ()  # elements between nodes, not in the matrix
-    pressures: Coarse | None = None  # of unknown pressures in thin cells
+    pressures: Coarse | None = None  # coarse space of unknown pressures in thin cells
     #: Whether `solve` eliminates unknown pressures first; None: it never does.
     eliminates: jax.Array | None = None
 
@@ -170,8 +171,8 @@ def tangent(
 ) -> Tangent:
     """The derivative of the forces at positions x (V, 3) [m], at part s of the step.
 
-    `pressure` (V,) [Pa] is that of the nodes, or None; `near` a flag and a tangent whose coarse space will do where the
-    flag is set; `kind` is a `Kind`. Everything in the result is without derivative.
+    `pressure` (V,) [Pa] is that of the nodes, or None; `near` a flag, and a tangent whose coarse space is used if the
+    flag is true; `kind` is a `Kind`. Everything in the result is without derivative.
     """
     e, pressure, x, s = jax.lax.stop_gradient((e, pressure, x, s))
     name, taken = (kind, None) if isinstance(kind, str) else kind
@@ -181,7 +182,7 @@ def tangent(
         return _coarse(e, A)
 
     slow = new() if near is None else jax.lax.cond(near[0], lambda: near[1].slow, new)
-    # Loads that follow the body need to know where.
+    # Loads that follow the body need the place where the tangent was made.
     where, part, follows = (None, None, None) if e.conservative else (x, s, _true(kind, x.dtype))
     eliminates = ~_true(kind, bool) if kind != "true" and eliminates_pressures(e) else None
     K = Tangent(matrix, inverse, below, slow, where, part, follows, more, eliminates=eliminates)
@@ -198,8 +199,8 @@ def tangent(
 def eliminates_pressures(e: Equations) -> bool:
     """Whether a tangent without negative eigenvalues is solved with its unknown pressures eliminated.
 
-    Far from a solution pressures are as large as the bulk modulus, and so is the stiffness that they give. An iteration
-    for positions and pressures together, which goes by the shear modulus, does not end there; positions alone have a
+    Far from a solution pressures are as large as the bulk modulus, and so is the stiffness that they give. Iterations
+    for positions and pressures together are scaled by the shear modulus and do not end there; positions alone have a
     positive matrix. The matrix of the pressures of linear elements has no simple inverse.
     """
     return e.mixed is not None and e.mesh.order > 1 and e.scene.solve.linear_solver != "direct"
@@ -208,16 +209,17 @@ def eliminates_pressures(e: Equations) -> bool:
 def _thin(e: Equations) -> bool:
     """Whether pressures are unknown in thin cells of linear elements.
 
-    In quadratic ones, squeezed far, their coarse space makes the iterations more, not less.
+    In strongly compressed quadratic elements their coarse space increases the number of iterations.
     """
     return e.mixed is not None and e.mesh.order == 1 and _groups_in_use(e, e.mesh.pattern.clusters) is not None
 
 
 @jax.jit
 def _slow_pressures(e: Equations, K: Tangent) -> Coarse:
-    """The coarse space of the pressures, motions eliminated roughly.
+    """The coarse space of the pressures, with motions eliminated approximately.
 
-    In a layer between plates, pressures that vary slowly along it move much less than their mass tells.
+    In a layer between plates, pressures that vary slowly along it cause much less motion than their mass matrix
+    suggests.
     """
     motions, volume = _motions(e, K), e.mixed
 
@@ -237,7 +239,7 @@ def _true(kind: Kind, dtype: Any) -> jax.Array:
 #: Matrix, inverse and vertices of a `Tangent`, the matrix that its coarse space is made of, and elements between nodes.
 _Assembled = tuple[BlockMatrix | PointMatrix, Inverses, Inverses | None, BlockMatrix, tuple[Between, ...]]
 
-# A program has the two functions below several times: within jit they are traced once.
+# The two functions below occur several times in a program: within jit they are traced once.
 
 
 @partial(jax.jit, static_argnames="name")
@@ -277,7 +279,7 @@ def _vertex_inverses(e: Equations, free: Free, A: BlockMatrix, diagonal: Block) 
 
 
 def _groups_in_use(e: Equations, groups: Any) -> Any:
-    """Clusters if they are used: a factorisation wants none, and nodes that slide on oblique planes have none."""
+    """Clusters if they are used: not with a factorisation, nor with nodes that slide on oblique planes."""
     return None if e.free.normals is not None or e.scene.solve.linear_solver == "direct" else groups
 
 
@@ -340,7 +342,7 @@ def preconditioner(e: Equations, K: Tangent) -> Callable[[jax.Array], jax.Array]
 
 
 def _motions(e: Equations, K: Tangent) -> Callable:
-    """The part for the motions, as a function of columns (V,)."""
+    """The preconditioner of the motions, as a function of columns (V,)."""
     mesh = e.mesh
     vertices = _groups_in_use(e, mesh.pattern.clusters)
     nodes = vertices if mesh.order == 1 else _groups_in_use(e, mesh.clusters)
@@ -367,7 +369,7 @@ def _motions(e: Equations, K: Tangent) -> Callable:
 
 
 def _with_pressures(e: Equations, K: Tangent, motions: Callable) -> Callable[[jax.Array], jax.Array]:
-    """A preconditioner of columns (V,) as a function of flat vectors, with pressures where these are unknown."""
+    """A preconditioner of columns (V,) as a function of flat vectors, with pressures if these are unknowns."""
     if e.mixed is None:
         return lambda r: flat_free(e, motions(block_matrix.columns(r)))
     volume, n = e.mixed, 3 * e.mesh.number_of_nodes
@@ -395,7 +397,7 @@ def flat_free(e: Equations, columns: Any) -> jax.Array:
 
 
 def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Array], jax.Array]:
-    """K as a function of flat vectors (3 V,). Pressures that follow motion are solved roughly, or `exactly`."""
+    """K as a function of flat vectors (3 V,). Pressures that depend on motion are solved roughly, or `exactly`."""
     A, volume, n = K.matrix, volume_with_pressures(e), 3 * e.mesh.number_of_nodes
 
     def apply(v: jax.Array) -> jax.Array:
@@ -419,7 +421,7 @@ def product(e: Equations, K: Tangent, exactly: bool = False) -> Callable[[jax.Ar
 def with_nodal_products(
     e: Equations, K: Tangent, motion: Sequence[jax.Array], force: Sequence[jax.Array]
 ) -> tuple[jax.Array, ...]:
-    """Forces, columns (V,), with those of elements between nodes and of loads that follow a motion."""
+    """Forces, columns (V,), plus forces of elements between nodes and of loads that follow the body, for a motion."""
     for own in K.attached:
         force = block_matrix.sums(force, attached.product(own, motion))
     following = [a for a in e.nodal if not a.conservative]
@@ -451,7 +453,7 @@ def solve(
 def _one_of_both(
     e: Equations, K: Tangent, flag: jax.Array, b: jax.Array, limits: tuple[Number, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`solve` where a flag tells if pressures are eliminated: the other way has nothing to do, so it ends at once."""
+    """`solve`, where `flag` says whether pressures are eliminated; the other solve has the load 0 and ends at once."""
     n, A, motions = 3 * e.mesh.number_of_nodes, K.matrix, _motions(e, K)
     assert isinstance(A, PointMatrix)
 
@@ -471,9 +473,9 @@ def _one_of_both(
 
 
 def factorised_solution(e: Equations, K: Tangent, b: jax.Array) -> jax.Array:
-    """Solve K dq = b by a factorisation, of the coupled matrix if pressures depend on the motion (b may have them)."""
+    """Solve K dq = b by a factorisation, of the coupled matrix if pressures depend on motion (b may contain them)."""
     n, volume, nothing = 3 * e.mesh.number_of_nodes, volume_with_pressures(e), jnp.ones(0)
-    # The factorised matrix is of pressures that push inwards, and of minus their balance.
+    # In the factorised matrix pressures push inwards, and their balance has a minus sign.
     unit = 1.0 if e.mixed is None else -e.mixed.unit
     free, load, balance = e.free.mask.T, b[:n].reshape(3, -1), b[n:] / unit
     if isinstance(K.matrix, PointMatrix):

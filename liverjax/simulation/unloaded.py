@@ -1,8 +1,8 @@
-"""The shape before the load: reference positions from which the loads lead to the given ones.
+"""The unloaded shape: reference positions from which the loads lead to the given positions.
 
 The unknowns are the displacements u. The vertices of the reference shape are X = x - u, with x the given positions.
 Quadratic elements are straight there, so the middles of their edges follow from the vertices; they move by
-displacements of their own. What must vanish are the out-of-balance forces of the body with reference shape X at X + u.
+displacements of their own. The out-of-balance forces of the body with reference shape X must vanish at X + u.
 For small u their derivative is the stiffness K, so K's preconditioner serves Newton's method with BiCGSTAB.
 
 Source: Govindjee and Mihalic 1996, "Computational methods for inverse finite elastostatics"; here the same problem on
@@ -37,7 +37,7 @@ class Unloaded(NamedTuple):
     """A reference shape, its status and its residual."""
 
     scene: Scene  # with the reference shape
-    status: jax.Array  # of `liverjax.core.status`; the points are NaN where it is not CONVERGED
+    status: jax.Array  # of `liverjax.core.status`; the points are NaN if it is not CONVERGED
     residual: jax.Array  # |r| over the forces at work
 
 
@@ -53,7 +53,7 @@ def unload(scene: Scene) -> Unloaded:
             '[mesh] is = "loaded": no reference shape was found that these loads bring to the given one (the rest is '
             f"{float(relative):.1g} of the forces): take a stiffer law, smaller loads or a better mesh"
         )
-    # Under jit a shape that was not found passes for none.
+    # Under jit the points are NaN if no shape was found.
     mesh = with_points(scene.mesh, jnp.where(code == status.CONVERGED, points, jnp.nan))
     return Unloaded(replace(scene, mesh=mesh, points_are="reference"), code, relative)
 
@@ -84,13 +84,13 @@ def _found_shape(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array]:
     sizes = force_sizes(scene)
     first = jax.lax.stop_gradient(equations(scene, initial_state(scene), one, sizes))
     q = unknowns(first, given)
-    # All that acts on the given shape where it is not strained: the size that the residual is small against.
+    # All forces on the given shape without strain: the residual is compared with their size.
     _, loads, pressure = jax.lax.stop_gradient(residual(first, q, one))
     K = tangent.tangent(first, pressure, given, one)
 
     def held(z: jax.Array) -> jax.Array:
         e, q = _with_displacements(scene, given, z, sizes)
-        # Where nothing is free the unknown itself must vanish: a matrix without empty rows.
+        # Unknowns that are not free must vanish themselves, so that the matrix has no empty rows.
         return residual(e, q, one)[0] + (z - _free_part(first, z))
 
     options = _OPTIONS._replace(tolerance=jax.lax.stop_gradient(scene.solve.tolerance))

@@ -16,26 +16,26 @@ class Attached(NamedTuple):
     """Stiffness of m elements between n nodes each."""
 
     nodes: jax.Array  # (n, m)
-    blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric but for friction
+    blocks: jax.Array  # (n, 3, n, 3, m) [N/m], symmetric unless there is friction
 
 
 class GivesWay(NamedTuple):
-    """The change -h h^T / size of a stiffness by one number that adapts to the motion."""
+    """The change -h h^T / size of a stiffness by one unknown that follows the motion, such as an obstacle's travel."""
 
-    h: jax.Array  # (V, 3) [N/m] force of the nodes for a unit of the number
-    size: jax.Array  # () [N/m] stiffness of the number by itself
+    h: jax.Array  # (V, 3) [N/m] forces of the nodes per unit of this unknown
+    size: jax.Array  # () [N/m] stiffness of this unknown alone
 
 
 class Masses(NamedTuple):
-    """What the mass of the elements has beside a diagonal mass, or the stiffness that it gives in a time step."""
+    """The rest of the elements' consistent mass without the nodes' diagonal masses, or its stiffness in a time step."""
 
     nodes: jax.Array  # (n, E)
-    signs: jax.Array  # (n, E) of functions that have a direction
+    signs: jax.Array  # (n, E) signs of functions that have a direction
     matrix: jax.Array  # (n, n) symmetric
     size: jax.Array  # (E,) [kg] or [N/m]
 
 
-#: What acts between nodes beside a matrix.
+#: Stiffness between nodes that is not part of an assembled matrix.
 Between = Attached | GivesWay | Masses
 
 
@@ -67,7 +67,7 @@ def product(A: Between, columns: Sequence[jax.Array]) -> tuple[jax.Array, ...]:
 
 def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
     """Diagonal blocks, 3 x 3 of (V,)."""
-    # Where two places of an element are one node, what lies between them is on the diagonal too.
+    # If two places of an element are the same node, the blocks between them are on the diagonal too.
     same = A.nodes[:, None] == A.nodes[None]
     own = jnp.sum(jnp.where(same[:, None, :, None], A.blocks, 0.0), axis=2)  # (n, 3, 3, m)
     own = jnp.zeros((number_of_nodes, 3, 3), own.dtype).at[A.nodes].add(jnp.transpose(own, (0, 3, 1, 2)))
@@ -75,7 +75,7 @@ def own_diagonal(A: Attached, number_of_nodes: int) -> Block:
 
 
 def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -> BlockMatrix:
-    """A matrix of the vertices with elements added where their vertices are neighbours in the body."""
+    """The matrix of the vertices plus the elements' blocks between vertices that are neighbours in the body."""
     if not attached:
         return A
     rows = jnp.stack([jnp.stack(row[:3]) for row in A.rows[:3]])
@@ -93,7 +93,7 @@ def with_attached(mesh: TetMesh, A: BlockMatrix, attached: Sequence[Attached]) -
 
 
 def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
-    """The same for motions that are linear in every element: the middle of an edge moves by the mean of its ends."""
+    """The elements for motions that are linear along edges: the middle of an edge moves by the mean of its ends."""
     V, (low, high) = mesh.number_of_vertices, mesh.pattern.edges
     edge = jnp.clip(A.nodes - V, 0, low.shape[0] - 1)
     is_vertex = A.nodes < V
@@ -104,12 +104,12 @@ def on_vertices(mesh: TetMesh, A: Attached) -> Attached:
 
 
 def symmetric_part(A: Attached) -> Attached:
-    """The symmetric part."""
+    """The elements with the symmetric part of their matrices."""
     return Attached(A.nodes, 0.5 * (A.blocks + jnp.transpose(A.blocks, (2, 3, 0, 1, 4))))
 
 
 def definite(A: Attached) -> Attached:
-    """The matrix without its negative eigenvalues."""
+    """The elements with negative eigenvalues of their matrices set to 0."""
     n, m = A.nodes.shape
     K = jnp.moveaxis(A.blocks.reshape(3 * n, 3 * n, m), -1, 0)
     size, axes = jnp.linalg.eigh(0.5 * (K + jnp.swapaxes(K, 1, 2)))

@@ -7,7 +7,7 @@ from threadpoolctl import ThreadpoolController
 
 
 def one_blas_thread() -> AbstractContextManager:
-    """Let BLAS have one thread within a `with`: where threads of our own run beside, or matrices are small.
+    """Limit BLAS to one thread inside a `with` block, for code with threads of its own or with small matrices.
 
     Its threads would wait for ours: a factorisation took three times as long, the step of a reduced model twice.
     """

@@ -1,7 +1,7 @@
 """Symmetric matrices of node blocks in padded rows: assembled from element blocks, multiplied without a search.
 
 Each block of an edge is scattered once. Forces do not change under translation, so a diagonal block is minus the sum of
-the other blocks in its row. Callers give what else belongs on the diagonal.
+the other blocks in its row. Callers give the other terms of the diagonal.
 """
 
 from collections.abc import Iterable, Sequence
@@ -35,7 +35,7 @@ def off_diagonal(mesh: TetMesh, blocks: dict[tuple[int, int], Block]) -> Block:
     """
     pattern: Pattern = mesh.pattern
     m = len(blocks[PAIRS[0]])
-    # Without that XLA:CPU computes every entry again in each of its scatters.
+    # Otherwise XLA:CPU computes every entry again in each of its scatters.
     blocks = stored(blocks)
     number = pattern.edges.shape[1]
     swapped = {(a, b): mesh.tetrahedra[:, a] > mesh.tetrahedra[:, b] for a, b in PAIRS}
@@ -65,12 +65,12 @@ def row_sums(rows: Block) -> Block:
 
 
 def force_matrix(mesh: TetMesh, blocks: dict[tuple[int, int], Block], own: Block | None = None) -> BlockMatrix:
-    """The matrix of forces: 3 x 3 blocks of elements, without their own diagonal ones, and blocks that nodes add.
+    """The stiffness matrix, from the elements' 3 x 3 blocks between different nodes and from blocks that nodes add.
 
     Args:
         mesh: `TetMesh`.
-        blocks: of `PAIRS` of every element, of (E,).
-        own: of (V,), added to the diagonal; an entry None where it is 0.
+        blocks: blocks of every element for `PAIRS`, with entries (E,).
+        own: blocks with entries (V,), added to the diagonal; an entry may be None for 0.
     """
     rows = off_diagonal(mesh, blocks)
     sums = row_sums(rows)
@@ -91,7 +91,7 @@ def inverse_blocks(diagonal: Block, mask: jax.Array, normals: jax.Array | None =
     """Inverse 3 x 3 blocks: unit rows where `mask` (V, 3) is 0, the inverse mean where a block is not positive
     definite.
 
-    Along `normals` (V, 3), unit vectors or 0, nothing moves: their part of a block is its mean.
+    Nodes do not move along `normals` (V, 3), unit vectors or 0: there a block is replaced by its mean.
     """
     if normals is not None:
         diagonal = _across(diagonal, normals)
@@ -132,7 +132,7 @@ def product(A: BlockMatrix, columns: Sequence[jax.Array]) -> tuple[jax.Array, ..
         near = [taken(column, A.nodes[slot]) for column in columns]
         return tuple(t + _row([e[slot] for e in row], near) for t, row in zip(total, A.rows, strict=True))
 
-    # One neighbour after the other, in a loop: what is gathered stays in cache.
+    # One neighbour after the other, in a loop, so that gathered values stay in cache.
     return jax.lax.fori_loop(0, A.nodes.shape[0], add, applied(A.diagonal, columns))
 
 

@@ -1,7 +1,7 @@
 """Dense inverse blocks of clusters of near nodes: a part of the preconditioner of meshes with thin cells.
 
 In a thin cell the nodes across it are coupled much more strongly than those along it, and block-Jacobi spreads a motion
-across by one node an iteration. So chains of near nodes (`liverjax.mesh.adjacency.Clusters`) are one block each.
+across by one node per iteration. So chains of near nodes (`liverjax.mesh.adjacency.Clusters`) are one block each.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from liverjax.solvers.block_matrix import Block, BlockMatrix
 from liverjax.solvers.point_matrix import PointMatrix
 from liverjax.tensors.places import given, taken
 
-#: Entries between nodes that are made at once, of quadratic elements.
+#: Number of entries between nodes that are computed at once, for quadratic elements.
 _AT_ONCE = 2048
 
 
 class Inverses(NamedTuple):
-    """Inverse blocks of single nodes, 0 of those in clusters, and of clusters of M nodes."""
+    """Inverse blocks of single nodes (0 for nodes in clusters), and of clusters of M nodes."""
 
     nodes: Block  # 3 x 3 of (V,)
     clusters: jax.Array | None = None  # (G, 3 M, 3 M)
@@ -31,11 +31,11 @@ class Inverses(NamedTuple):
 def inverses(
     clusters: Clusters | None, entries: jax.Array | None, diagonal: Block, mask: jax.Array, single: Block
 ) -> Inverses:
-    """Inverse blocks of clusters, beside those of single nodes; a cluster that is not positive definite has none.
+    """Inverse blocks of clusters and of single nodes; a cluster that is not positive definite counts as single nodes.
 
     Args:
         clusters: of the mesh; None: there are none.
-        entries: (n, 3, 3) blocks of the matrix, by the sources of the clusters.
+        entries: (n, 3, 3) blocks of the matrix, one for each source of the clusters.
         diagonal: 3 x 3 of (V,), blocks of the matrix.
         mask: (V, 3) 1 where free.
         single: inverse blocks of single nodes, 3 x 3 of (V,).
@@ -72,7 +72,7 @@ def smoothed(clusters: Clusters | None, A: Inverses, columns: Sequence[jax.Array
 
 
 def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) -> jax.Array | None:
-    """Blocks (n, 3, 3) of a matrix of the vertices, by the sources of their clusters."""
+    """Blocks (n, 3, 3) of a matrix of the vertices, one for each source of their clusters."""
     if clusters is None:
         return None
     slots = taken(edge_slots, clusters.sources[0])
@@ -81,13 +81,13 @@ def of_rows(clusters: Clusters | None, edge_slots: jax.Array, A: BlockMatrix) ->
 
 
 def of_points(clusters: Clusters | None, order: int, A: PointMatrix) -> jax.Array | None:
-    """The same (n, 3, 3) of all functions of elements: sum over q, k and l of c_ak K_kl c_bl."""
+    """Blocks (n, 3, 3) between all functions of elements, one for each source: sum over q, k, l of c_ak K_kl c_bl."""
     if clusters is None:
         return None
     c = basis(order).c
     slopes = jnp.asarray(c[:, 1:] - c[:, :1], A.blocks[1, 1][0][0].dtype)  # (n, 3, Q)
     pairs = sorted(A.blocks)
-    # By element: what one needs lies together.
+    # Element by element, so that the numbers of one element lie together in memory.
     K = jnp.stack([jnp.stack([jnp.stack(row) for row in A.blocks[pair]]) for pair in pairs])
     K = jnp.moveaxis(K, -1, 0)  # (E, 6, 3, 3, Q)
 

@@ -1,4 +1,4 @@
-"""Linear solves by a sparse factorisation on the host, for matrices too ill-conditioned to iterate on.
+"""Linear solves by a sparse factorisation on the host, for matrices that are too ill-conditioned for iterations.
 
 SciPy's SuperLU: time and memory grow faster than the mesh (n^1.5 to n^2), so this is for bodies of some thousand nodes.
 """
@@ -46,7 +46,7 @@ def solve_points(
     normals: Number | None = None,
     attached: tuple[Between, ...] = (),
 ) -> jax.Array:
-    """The same of quadratic elements, flat: positions (3 V,), and pressures of the vertices where A has them.
+    """`solve` for quadratic elements, as a flat vector: positions (3 V,), then pressures of vertices if A has them.
 
     `free` and `b` are two arrays each, of positions (3, V) and of pressures. Empty arrays for the pressures mean that
     all are free and that their part of `b` is 0.
@@ -71,8 +71,8 @@ def _filled(blocks: Block, like: jax.Array) -> jax.Array:
 
 
 def across(normals: np.ndarray, size: int) -> "scipy.sparse.csr_array":
-    """n n^T of every node, in the order of the unknowns, (size, size)."""
-    import scipy.sparse  # a fifth of the time that importing the package takes: here and below only where it is used
+    """Matrix (size, size) with the block n n^T of every node, in the order of the unknowns."""
+    import scipy.sparse  # slow to import (a fifth of the package), so here and below only where it is used
 
     number, own = len(normals), np.arange(len(normals))
     entries = [
@@ -118,7 +118,7 @@ def _solve(*given: object) -> np.ndarray:
 
 
 def _given_ways(attached: tuple[Between, ...], size: int) -> tuple[np.ndarray, np.ndarray]:
-    """h (size, n) of all numbers that adapt, in the order of the unknowns, and the stiffness (n,) of each."""
+    """h (size, n) of every `GivesWay`, in the order of the unknowns, and the stiffness (n,) of each."""
     found = [own for own in attached if isinstance(own, GivesWay)]
     H = np.zeros((size, len(found)))
     for column, own in zip(H.T, found, strict=True):
@@ -165,9 +165,9 @@ def _solve_points(order: int, *given: object) -> np.ndarray:
 
 
 def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: tuple) -> np.ndarray:
-    """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0, for `ways` H and S.
+    """Solution (n,) of (A - H S^-1 H^T) x = b where `free` (n,) is not 0, for `ways`: H and the diagonal of S.
 
-    `along`: normals along which x is 0, or None, and the numbers that replace A along them.
+    `along`: normals along which x is 0, or None, and the number that replaces A along them.
     """
     import scipy.sparse.linalg
 
@@ -180,7 +180,7 @@ def _one_solution(A: Any, free: np.ndarray, b: np.ndarray, along: tuple, ways: t
     A = A[keep][:, keep].tocsc()
     x = np.zeros_like(b)
     try:
-        # The pattern is symmetric and so, nearly, is the best order of the unknowns.
+        # The pattern is symmetric, so an order that is good for A + A^T is nearly the best.
         factor = scipy.sparse.linalg.splu(A, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         x[keep] = factor.solve(b[keep])
         if len(size):  # Sherman, Morrison and Woodbury

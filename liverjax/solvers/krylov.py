@@ -15,7 +15,7 @@ class LinearStatistics(NamedTuple):
 
     iterations: jax.Array
     residual: jax.Array  # |b - A x| / |b|, recomputed at the end
-    positive: jax.Array  # False: a direction of no positive curvature was met
+    positive: jax.Array  # False: a direction without positive curvature was met
 
 
 def conjugate_gradients(
@@ -25,14 +25,14 @@ def conjugate_gradients(
     tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
-    """Solve A x = b for symmetric positive definite A, both given as functions of a flat vector (n,).
+    """Solve A x = b for symmetric positive definite A, given as a function of a flat vector (n,).
 
     Args:
         matvec, precondition: A and an approximation of its inverse.
         tolerance: of the recursive residual relative to |b|.
         max_iterations: the solve ends after so many iterations.
 
-    It also stops at a direction without positive curvature. The statistics hold the true residual.
+    It also stops at a direction without positive curvature. The statistics contain the true residual.
     """
     goal = tolerance * jnp.linalg.norm(b)
 
@@ -42,14 +42,14 @@ def conjugate_gradients(
 
     def step(c):
         x, r, p, rz_before, k, _ = c
-        z = precondition(r)  # here alone, so that the program has it once
+        z = precondition(r)  # called only here, so that the program has it once
         rz = jnp.vdot(r, z)
         p = z + rz / rz_before * p
         Ap = matvec(p)
         curvature = jnp.vdot(p, Ap)
         positive = (curvature > 0) & (rz > 0)
         alpha = jnp.where(positive, rz / jnp.where(positive, curvature, 1.0), 0.0)
-        # What is not finite stays out of x.
+        # Values that are not finite are not added to x.
         return jnp.where(positive, x + alpha * p, x), r - alpha * Ap, p, rz, k + 1, positive
 
     zero = jnp.zeros_like(b)
@@ -65,7 +65,7 @@ def chebyshev(
     bounds: tuple[Number, Number],
     degree: Number,
 ) -> jax.Array:
-    """A polynomial in D^-1 A applied to D^-1 b, near A^-1 b: symmetric, positive definite (Saad 2003, 12.3).
+    """Approximate A^-1 b by a polynomial in D^-1 A times D^-1 b: symmetric and positive definite (Saad 2003, 12.3).
 
     Args:
         matvec, diagonal: A and its diagonal D.
@@ -93,7 +93,7 @@ def stabilised_biconjugate_gradients(
     tolerance: Number,
     max_iterations: int,
 ) -> tuple[jax.Array, LinearStatistics]:
-    """The same for a matrix without symmetry: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
+    """The solve for an unsymmetric matrix: BiCGSTAB (van der Vorst 1992), two products in each iteration."""
     goal = tolerance * jnp.linalg.norm(b)
     one = jnp.ones((), b.dtype)
 
@@ -123,13 +123,13 @@ def stabilised_biconjugate_gradients(
     return x, LinearStatistics(k, true_residual(matvec, b, x), jnp.array(True))
 
 
-#: Earlier solves that a solve of a sequence begins with, and the part of a load, less what newer ones make of it, below
-#: which it says nothing new: their solutions are as exact as this.
+#: Number of earlier solves from which a solve begins. An earlier load is skipped if newer loads represent it up to this
+#: part of its size: solutions are only as exact as this.
 EARLIER, _NEW = 6, 1e-7
 
 
 class Earlier(NamedTuple):
-    """Loads and solutions of earlier solves, the latest first; zeros where there were none."""
+    """Loads and solutions of earlier solves, the latest first; zeros if there were fewer."""
 
     loads: jax.Array  # (EARLIER, n)
     solutions: jax.Array  # (EARLIER, m)
@@ -154,13 +154,13 @@ class Earlier(NamedTuple):
         return jax.lax.scan(add, start, (self.loads, self.solutions))[0][3]
 
     def with_latest(self, load: jax.Array, solution: jax.Array) -> "Earlier":
-        """The same with one more; the oldest is left out."""
+        """The earlier solves with a new one; the oldest is left out."""
         pairs = ((self.loads, load), (self.solutions, solution))
         return Earlier(*(jnp.concatenate([new[None], old[:-1]]) for old, new in pairs))
 
 
 def no_earlier(load: jax.Array, solution: jax.Array) -> Earlier:
-    """Nothing yet, for loads and solutions like these."""
+    """An empty `Earlier` for loads and solutions of these sizes."""
     return Earlier(*(jnp.zeros((EARLIER, len(each)), each.dtype) for each in (load, solution)))
 
 
@@ -174,18 +174,18 @@ def symmetric_solve(
     solver: Callable[[jax.Array, Earlier], tuple[jax.Array, jax.Array, jax.Array]],
     tolerance: Number,
 ) -> WithEarlier:
-    """The solution of A x = b for symmetric A, as a linear map of b; then the earlier solves with this one.
+    """The solution of A x = b for symmetric A, as a linear map of b; and the earlier solves with this one added.
 
-    Its derivatives are solves as well, in both modes. NaN as in `differentiable_solve`.
+    Its derivatives are solves as well, in both modes. The solution is NaN in the cases of `differentiable_solve`.
 
     Args:
         matvec: (x, earlier) -> (A x, the same earlier).
-        both: b, and earlier solves, for this one to begin with.
-        solver: (b, earlier) -> solution, its load (b, or what is left of it where unknowns are eliminated), and the
+        both: b, and the earlier solves from which this one begins.
+        solver: (b, earlier) -> solution, its load (b, or the rest of b after unknowns are eliminated), and the
             true residual over |b|.
         tolerance: of the solver.
     """
-    # One vector of all: a derivative by one part alone has no cotangents of the others, which JAX does not take.
+    # All in one vector: a derivative by one part alone has no cotangents for the others, which JAX refuses.
     joined, parted = ravel_pytree(both)
 
     def solve(_, vector):
@@ -211,11 +211,11 @@ def started(
     near: jax.Array,
     tolerance: Number,
 ) -> tuple[jax.Array, jax.Array]:
-    """Solution of A x = b. It begins at `near` if that is nearer to the solution than 0, so that the solver has less to
-    do.
+    """Solution of A x = b. It begins at `near` if the residual there is smaller than at 0, so that the solver has less
+    to do.
 
-    `solver` is (b, tolerance) -> solution and its residual over |b|, `tolerance` that of |b - A x| over |b|. Returns
-    the solution and its residual over |b|.
+    `solver` is (b, tolerance) -> solution and its residual over |b|, `tolerance` the bound on |b - A x| over |b|.
+    Returns the solution and its residual over |b|.
     """
     left, size = b - matvec(near), jnp.linalg.norm(b)
     helps = jnp.linalg.norm(left) < size
@@ -235,9 +235,9 @@ class Known(NamedTuple):
     """Known properties of the matrix A of `differentiable_solve`."""
 
     symmetric: bool = True
-    #: b -> solution for a symmetric A, and the true residual over |b|; None: iterations find it.
+    #: b -> solution for a symmetric A, and the true residual over |b|; None: solve by iterations.
     solver: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
-    diagonal: jax.Array | None = None  # of an A whose entries beside it add up to no more
+    diagonal: jax.Array | None = None  # diagonal of a diagonally dominant A
 
 
 def differentiable_solve(
@@ -250,7 +250,7 @@ def differentiable_solve(
 ) -> jax.Array:
     """A solve as a linear map of `b`: its derivatives are solves as well, not derivatives of the iterations.
 
-    It takes conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the
+    It uses conjugate gradients for a symmetric positive definite A, otherwise BiCGSTAB. The solution is NaN if the
     true residual stays above 6e-6 |b| (float32: 1e-3) and above ten times the tolerance. A residual below 4 eps |D x|
     is accepted too, with the `diagonal` D of a diagonally dominant A: rounding x alone causes eps |D x|.
     """

@@ -1,14 +1,14 @@
 """Minimise the energy of a step. This serves steps that begin inverted, or whose load could not be followed.
 
 The true tangent is used if conjugate gradients find no negative curvature in it. Otherwise a tangent without negative
-eigenvalues serves (`liverjax.elements.projection`). Every step is shortened until the energy falls (Armijo). So the
+eigenvalues is used (`liverjax.elements.projection`). Every step is shortened until the energy falls (Armijo). So the
 energy falls from point to point, and near the minimum convergence is quadratic. A start with inverted elements is first
 untangled as a stable neo-Hookean body of the same moduli, whose energy is finite everywhere: so any law may start
 there.
 
-Where pressures are unknowns of their own, the solution is a saddle of the energy of both. With the pressures that are
-best for the positions it is a minimum again: so the positions are what is varied, and the pressures follow. In
-quadratic elements a tangent without negative eigenvalues has them eliminated: it is positive then.
+If pressures are unknowns of their own, the solution is a saddle point of the energy. With the pressures that are best
+for the positions it is a minimum again: so only positions are varied, and the pressures follow. In quadratic elements
+the pressures are eliminated from a tangent without negative eigenvalues, so that it is positive.
 
 Forces without an energy, such as friction, are held constant during each iteration. So they have an energy for that
 iteration, whose gradient at its beginning is the residual.
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from liverjax.core import status
 from liverjax.solvers.problem import LINEAR_TOLERANCE, MOST_LINEAR_ITERATIONS, Potential, Problem, StepOptions
 
-#: Fall of the energy asked for, over that of its slope (Armijo; Nocedal and Wright 2006, 3.1).
+#: Required fall of the energy, over the fall that its slope predicts (Armijo; Nocedal and Wright 2006, 3.1).
 _FALL = 1e-4
 #: Differences of energies below so many times the precision are roundoff: there the residual must fall instead.
 _ROUNDOFF = 5e3
@@ -30,17 +30,17 @@ _ROUNDOFF = 5e3
 _PATIENCE = 8
 #: Most iterations on the energy, and most shortenings of one of them.
 _MOST_ITERATIONS, _MOST_SHORTENINGS = 300, 30
-#: Farther away than this, over the forces at work, a true tangent without symmetry is not tried: BiCGSTAB does not tell
+#: With a residual above this, over the forces at work, an unsymmetric true tangent is not tried: BiCGSTAB does not tell
 #: that it is not positive, and takes all its iterations.
 _NEAR = 0.1
-#: Tolerance of directions where pressures follow positions: what is left of their balance counts K/mu times.
+#: Tolerance of directions if pressures follow positions: errors of their balance are amplified by K/mu.
 _WITH_PRESSURES = 1e-6
 #: Residual at which a surrogate body is untangled enough.
 _UNTANGLED = 1e-4
 
 
 class Minimum(NamedTuple):
-    """The point reached."""
+    """The point that the minimisation has reached."""
 
     q: jax.Array
     code: jax.Array
@@ -55,8 +55,8 @@ class _Descent(NamedTuple):
     r: jax.Array
     relative: jax.Array
     by: jax.Array
-    definite: jax.Array  # so many times more a tangent without negative eigenvalues, then the true one is tried
-    patience: jax.Array  # how many times it will be if that fails again
+    definite: jax.Array  # how often a definite tangent is still used before the true one is tried
+    patience: jax.Array  # the next value of `definite`, if the true tangent fails again
     indefinite: jax.Array  # the last true tangent was not positive
     stuck: jax.Array
     iterations: jax.Array
@@ -68,7 +68,7 @@ def minimise(problem: Problem, start: jax.Array, options: StepOptions) -> Minimu
 
     Args:
         problem: `liverjax.solvers.problem.Problem` with a potential.
-        start: flat vector of unknowns; inverted elements will do where the energy is finite.
+        start: flat vector of unknowns; elements may be inverted if the energy is finite there.
         options: `liverjax.solvers.problem.StepOptions`.
     """
 
@@ -103,7 +103,7 @@ def untangled(problem: Problem, start: jax.Array, options: StepOptions) -> tuple
         return start, zero, zero
 
     def away():
-        # Its unknowns are positions alone.
+        # The surrogate's unknowns are positions only.
         n = len(start) if potential.positions is None else potential.positions
         least = minimise(surrogate, start[:n], options._replace(tolerance=_UNTANGLED))
         return jnp.concatenate([least.q, start[n:]]), least.iterations, least.linear_iterations

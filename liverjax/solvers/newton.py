@@ -1,6 +1,6 @@
 """Newton's method with a line search and conjugate gradients, differentiated implicitly at its root.
 
-The steps of a scene follow their load in parts as well: `liverjax.solvers.step_cutting`.
+For steps of a scene, which may follow their load in parts, see `liverjax.solvers.step_cutting`.
 """
 
 from collections.abc import Callable
@@ -29,15 +29,15 @@ class NewtonStatistics(NamedTuple):
 
 
 class NewtonOptions(NamedTuple):
-    """Tolerances and limits; all but the tolerance fixed when compiled."""
+    """Tolerances and limits; all except the tolerance are fixed when compiled."""
 
     tolerance: float = 1e-8  # of |r| relative to the scale given
     max_iterations: int = 25
     linear_tolerance: float = 1e-4  # of each Newton step
-    adjoint_tolerance: float = 1e-10  # of the solves that carry derivatives
+    adjoint_tolerance: float = 1e-10  # of the solves for derivatives
     max_linear_iterations: int = 2000
     max_halvings: int = 10
-    symmetric: bool = True  # whether the derivative is: if not, BiCGSTAB solves the linear systems
+    symmetric: bool = True  # whether the derivative is symmetric: if not, BiCGSTAB solves the linear systems
 
 
 def newton_root(
@@ -52,8 +52,8 @@ def newton_root(
     Args:
         residual: may close over traced parameters; derivatives with respect to them are exact at the root (implicit
             function theorem with the true tangent).
-        start: first guess; carries no derivative.
-        precondition: approximate inverse of the tangent; carries no derivative.
+        start: first guess; it has no derivative.
+        precondition: approximate inverse of the tangent; it has no derivative.
         scale: force [N] that the tolerance is relative to.
         options: tolerances and limits.
     """
@@ -101,7 +101,7 @@ def _halving_newton(residual, start, precondition, scale, options):
         converged = norm(r) <= goal
         spent = (c.iterations > options.max_iterations) | (halvings > options.max_halvings)
         done = converged | spent | ~jnp.isfinite(norm(r))
-        # No more accurate than the last Newton step can use, no less than the forcing term.
+        # No stricter than the last Newton step can use, no looser than the linear tolerance.
         forcing = jnp.clip(0.1 * goal / norm(r), 1e-12, options.linear_tolerance)
         load = jnp.where(better & ~done, -r, jnp.zeros_like(r))  # a zero load costs no iteration
         dq, s = method(matvec, load, precondition, forcing, options.max_linear_iterations)

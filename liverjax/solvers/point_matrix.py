@@ -1,8 +1,8 @@
 """Symmetric matrices of quadratic elements, kept as moduli at their points: multiplied without assembly.
 
-At every point an element is a linear one with corners of its own (`liverjax.mesh.shape_functions`), so 45 numbers a
-point are its stiffness. A product takes motions to the corners, multiplies, and takes forces back. The vertices alone,
-as linear elements, have an assembled matrix: the second level of the preconditioner.
+At every point an element is a linear one with corners of its own (`liverjax.mesh.shape_functions`), so its stiffness is
+45 numbers per point. A product takes motions to the corners, multiplies, and takes forces back. The vertices alone, as
+linear elements, have an assembled matrix: the second level of the preconditioner.
 """
 
 from collections.abc import Sequence
@@ -26,10 +26,10 @@ from liverjax.tensors.places import given
 
 
 class PointMatrix(NamedTuple):
-    """Derivative of forces, and of minus the balance of nodal volumes where there are pressures."""
+    """Derivative of the forces and, if there are pressures, of minus the balance of nodal volumes."""
 
     blocks: dict[tuple[int, int], Matrix]  # of corners 1 <= a <= b <= 3, of (Q, E) [N/m]
-    own: Block | None  # 3 x 3 of (V,) that nodes add, entries None where 0
+    own: Block | None  # 3 x 3 of (V,) that nodes add; entries that are 0 are None
     border: list[Vector] | None  # change of a point's volume with its corners 1, 2, 3, of (Q, E) [m^2]
     pressures: BlockMatrix | None  # of the pressures of the vertices [m^3/Pa]
 

@@ -15,15 +15,15 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.solvers.block_matrix import BlockMatrix
 from liverjax.tensors.places import given, taken
 
-#: A vector, one array (V,) a component.
+#: A vector, one array (V,) per component.
 Columns = Sequence[jax.Array]
 
 
 class Coarse(NamedTuple):
-    """The inverse of a matrix, restricted to the coarse space."""
+    """The inverse of a matrix that is restricted to the coarse space."""
 
     inverse: jax.Array  # (4 m P, 4 m P)
-    used: jax.Array  # False: left out
+    used: jax.Array  # False: the coarse space is left out
 
 
 def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coarse:
@@ -32,7 +32,7 @@ def coarse(mesh: TetMesh, A: BlockMatrix, mask: jax.Array, used: Number) -> Coar
 
     Args:
         mesh: `TetMesh`.
-        A: the matrix; carries no derivative.
+        A: the matrix; it has no derivative.
         mask: (V, m) 1 where free: m = 3 for forces, 1 for a pressure.
         used: whether it is worth its cost (see `worthwhile`).
     """
@@ -57,7 +57,7 @@ def _inverse(E: jax.Array) -> jax.Array:
 
 
 def coarse_of_product(mesh: TetMesh, product: Callable[[jax.Array], jax.Array]) -> Coarse:
-    """The coarse space of a symmetric matrix of the vertices, given as a function of (V,): a product a function."""
+    """The coarse space of a symmetric matrix of the vertices, given as a function of (V,); one product per function."""
     f, patch, number = mesh.pattern.patch_functions, mesh.pattern.patches, mesh.pattern.number_of_patches
 
     def column(k: jax.Array) -> jax.Array:
@@ -95,7 +95,7 @@ def correction(mesh: TetMesh, coarse: Coarse, mask: jax.Array) -> Callable[[Colu
 def corrected(
     mesh: TetMesh, coarse: Coarse, mask: jax.Array, fine: Callable[[Columns], Columns]
 ) -> Callable[[Columns], Columns]:
-    """Add the coarse solution, where it is used, to the preconditioner `fine` of columns."""
+    """Add the coarse solution, if it is used, to the preconditioner `fine` of columns."""
     apply = correction(mesh, coarse, mask)
 
     def both(columns):

@@ -10,7 +10,7 @@ from liverjax.solvers.krylov import Earlier
 
 #: Most iterations of one linear solve.
 MOST_LINEAR_ITERATIONS = 3000
-#: Tolerance of the linear solve for a direction, the loosest.
+#: The loosest tolerance of the linear solve for a direction.
 LINEAR_TOLERANCE = 5e-2
 
 
@@ -28,8 +28,8 @@ class StepOptions(NamedTuple):
     """Limits of a step's solver; all except the tolerance are fixed when compiled."""
 
     tolerance: float = 1e-8  # of |r| relative to the forces at work
-    max_iterations: int = 25  # a part
-    one_step: bool = False  # one linear solve a step and no more; derivatives are not those of it
+    max_iterations: int = 25  # per part
+    one_step: bool = False  # only one linear solve per step; derivatives do not belong to its result
     max_halvings: int = 6
     max_cuts: int = 12
     #: Without derivatives a program is traced in two thirds of the time.
@@ -41,14 +41,14 @@ class Kept(NamedTuple):
 
     tangent: Any
     made: jax.Array  # False: there is none yet
-    pace: jax.Array  # linear iterations a digit, with its preconditioner when that was new
-    worn: jax.Array  # the preconditioner takes much longer by now
-    #: Root of the last step less what was predicted, and the part of it that the step before foretold: as much of it
+    pace: jax.Array  # linear iterations per digit, when its preconditioner was new
+    worn: jax.Array  # the preconditioner needs many more iterations by now
+    #: Root of the last step minus its prediction, and the part of this that the step before foretold: this part
     #: is added to the next guess.
     surprise: jax.Array
     trust: jax.Array
-    beside: jax.Array | None = None  # what is solved for beside the root, there (`Problem.beside`)
-    #: Of derivatives: their last linear solves, for the next to begin with. A run carries zeros.
+    beside: jax.Array | None = None  # the further unknowns at the root (`Problem.beside`)
+    #: The last linear solves of derivatives, from which the next solve begins. In a run they are zeros.
     adjoints: Earlier | tuple[()] = ()
 
 
@@ -60,61 +60,61 @@ class Beside(NamedTuple):
     solved: Callable[..., jax.Array]
     #: (solution nearby, tolerance over the usual one) -> guess for `residual` and `solved`.
     guess: Callable[[jax.Array, Number], tuple]
-    #: (q, solution) -> what r(q, 1) and the solution's own equation lack. Derivatives are of both together: no solve
-    #: of its own is differentiated. Where r has a symmetric derivative, that of both together is symmetric too.
+    #: (q, solution) -> residuals of r and of the solution's own equation. Both are differentiated together: no solve
+    #: is differentiated by itself. If the derivative of r is symmetric, the one of both together is symmetric too.
     lack: Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 class Problem(NamedTuple):
     """Equations of a step, and how their linear systems are solved."""
 
-    #: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that it is small against, and what
-    #: `tangent` needs beside. May close over traced parameters; derivatives are exact at the root. Where there is a
-    #: `beside`, by is its solution and a third argument a guess of it.
+    #: (q, s) -> (r, force, by): a flat vector (n,), the size of the forces that r is compared with, and data that
+    #: `tangent` needs. It may close over traced parameters; derivatives are exact at the root. If there is a
+    #: `beside`, by is its solution, and a third argument is a guess of this solution.
     residual: Callable[..., tuple[jax.Array, jax.Array, Any]]
-    #: (q, s, by, near) -> any pytree that stands for dr/dq, used again while iterations converge fast with it; near
-    #: is None, or whether an earlier one is near enough to take parts from, and that one.
+    #: (q, s, by, near) -> any pytree that represents dr/dq, used again while iterations converge fast with it; near
+    #: is None, or a pair: whether parts of an earlier tangent are near enough to be used, and this tangent.
     tangent: Callable[[jax.Array, jax.Array, Any, Any], Any]
     #: (tangent, b, tolerance, max_iterations) -> (solution of dr/dq x = b, iterations, whether dr/dq seems positive).
     solve: Callable[[Any, jax.Array, Any, int], tuple[jax.Array, jax.Array, jax.Array]]
     #: tangent -> approximate inverse of dr/dq, for derivatives.
     preconditioner: Callable[[Any], Callable[[jax.Array], jax.Array]]
     #: (tangent, b, tolerance, max_iterations, earlier solves) -> solution with dr/dq itself, its load and its residual
-    #: over |b|: for derivatives, where dr/dq is symmetric. Where there is a `beside`, b and the solution are of both
-    #: together (`Beside.lack`), and the load is what is left when what is beside is eliminated. None: they are solved
-    #: for with products of dr/dq.
+    #: over |b|: for derivatives, if dr/dq is symmetric. If there is a `beside`, b and the solution are for both
+    #: together (`Beside.lack`), and the load is the rest of b after `beside` is eliminated. None: solutions are found
+    #: with products of dr/dq.
     adjoint: Callable[[Any, jax.Array, Number, int, Earlier], tuple[jax.Array, jax.Array, jax.Array]] | None = None
-    #: Whether dr/dq is.
+    #: Whether dr/dq is symmetric.
     symmetric: bool = True
     #: Whether r depends on s.
     moved: bool = True
-    #: |r| that the digits of q leave.
+    #: |r| that is due to the rounding of q.
     roundoff: Any = 0.0
     beside: Beside | None = None
-    #: Whether r has kinks, as where a surface comes to touch.
+    #: Whether r has kinks, as at the beginning of contact.
     kinks: bool = False
-    #: What a step that cannot be followed is minimised with; None: it is not.
+    #: The energy that is minimised if the step cannot be followed; None: it is not minimised.
     potential: "Potential | None" = None
-    #: A pytree of all numbers that r depends on, beside q and s: what a root has derivatives by.
+    #: A pytree of all numbers that r depends on, except q and s: the root has derivatives by them.
     numbers: Any = None
 
 
 class Potential(NamedTuple):
     """The energy of a step, for steps that cannot be followed."""
 
-    #: (q, start) -> energy whose gradient at start is r(start, 1). Forces without an energy are held as at start.
+    #: (q, start) -> energy whose gradient at start is r(start, 1). Forces without an energy keep their values at start.
     energy: Callable[[jax.Array, jax.Array], jax.Array]
-    #: As `Problem.tangent`, of a matrix without negative eigenvalues; a fifth argument: only where it is true.
+    #: As `Problem.tangent`, but without negative eigenvalues, unless a fifth argument is false.
     definite: Callable[..., Any]
-    #: (q, s) -> the least J of an element: not above 0 where elements are inverted.
+    #: (q, s) -> the least J of an element: not above 0 if elements are inverted.
     volume: Callable[[jax.Array, Any], jax.Array]
-    #: The same of a body whose energy is finite where elements are inverted; None where it is already.
+    #: The problem of a body whose energy is finite for inverted elements; None if this body's own energy is.
     surrogate: Problem | None
-    #: Where the loads are followed from if the start is a guess, and whether it is; None where a start is a state.
+    #: The shape from which loads are followed if the start is a guess, and whether it is; None: a start is a state.
     rest: tuple[jax.Array, jax.Array] | None
-    #: q with the pressures that are best for its positions, where these are unknowns; None: there are none.
+    #: q with the pressures that are best for its positions, if pressures are unknowns; None: they are not.
     settled: Callable[[jax.Array], jax.Array] | None = None
     #: How many of the unknowns are positions; None: all.
     positions: int | None = None
-    #: Whether a solve with a definite tangent eliminates the pressures: its direction may be as loose as without any.
+    #: Whether a solve with a definite tangent eliminates the pressures: then its tolerance needs not be stricter.
     eliminates: bool = False

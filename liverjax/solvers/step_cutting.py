@@ -1,9 +1,9 @@
-"""Newton's problem along a load: the solution is followed from the last equilibrium, in parts where it fails in one go.
+"""Newton's method along a load: the solution is followed from the last equilibrium, in parts if the whole load fails.
 
 The residual r(q, s) has the loads and prescribed motion of the step's beginning at s = 0 and of its end at s = 1.
 Forces that are out of balance at the beginning (inertia, a fluid) are reduced in proportion: r - (1 - s) r(start, 0) is
-0 where a step begins. Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion is lifted
-through the tangent, never jumped to. A part that fails is halved. Only the root at s = 1 counts, and derivatives are
+0 where a step begins. Every part begins with the tangent at its beginning, -(r + dr/ds ds): prescribed motion enters
+through the tangent, never as a jump. A part that fails is halved. Only the root at s = 1 counts, and derivatives are
 those of the root.
 """
 
@@ -29,26 +29,26 @@ from liverjax.solvers.problem import (
 )
 
 #: A step that makes no more progress with a residual below so many times the precision (in float32, 5e-4 of the
-#: forces; measured: 1e-4), or so many times what rounding positions does, is at roundoff: shorter steps do not help.
+#: forces; measured: 1e-4), or so many times the effect of rounded positions, is at roundoff: shorter steps do not help.
 _PRECISIONS, _ROUNDINGS = 4096, 8
 
-#: Where the residual has kinks, a direction that is halved in vain is taken whole, so often a part: beyond a kink the
-#: tangent is another.
+#: If the residual has kinks, a direction that is halved in vain is taken whole, so often per part: beyond a kink the
+#: tangent is different.
 _LEAPS = 8
 
-#: A guess with elements of less than this part of their volume is not begun with: it may lead to a folded shape.
+#: A guess is not used if an element has less than this part of its volume there: it may lead to a folded shape.
 _FLAT = 0.1
 
-#: Tolerance of the one direction where there is but one, the loosest.
+#: The loosest tolerance of the direction of a one-step solve.
 _ONE_STEP = 1e-4
 #: Fall of |r| in an iteration; a tangent that does worse is made anew.
 _CONTRACTION = 0.15
-#: Wear of the preconditioner: linear iterations a digit over those when it was new; beyond, it is made anew.
+#: Linear iterations per digit over those when the preconditioner was new; above this it is made anew.
 _WEAR = 1.2
-#: Tolerance of the solves that carry derivatives, over that of the step.
+#: Tolerance of the solves for derivatives, over the tolerance of the step.
 _ADJOINT = 0.1
 
-#: Name of a step's root among what reverse mode may keep: with it nothing of how it was found is computed again.
+#: Name of a step's root for checkpoints: if reverse mode keeps the root, its iterations are not computed again.
 ROOT = "root"
 
 
@@ -57,10 +57,10 @@ class _Point(NamedTuple):
     size: jax.Array  # |r| there
     aim: jax.Array  # |r| that the last direction was to remove
     kept: Kept
-    beside: jax.Array | None  # what the residual solved for there; None: nothing
-    looser: jax.Array  # tolerance of the next such solve over the usual one
+    beside: jax.Array | None  # the further unknowns there (`Problem.beside`); None: there are none
+    looser: jax.Array  # tolerance of the next solve for `beside`, over the usual one
     indefinite: jax.Array  # the last tangent solved with was not positive
-    stale: jax.Array  # dq is of a tangent that was made before q
+    stale: jax.Array  # dq comes from a tangent that was made before q
     remake: jax.Array  # the next evaluation is at q again, for a new tangent
     dq: jax.Array
     t: jax.Array  # part of dq to try next
@@ -87,7 +87,7 @@ def nothing_kept(problem: Problem, start: jax.Array) -> Kept:
     zero = jnp.zeros((), start.dtype)
     made = jax.eval_shape(lambda q: problem.tangent(q, zero, problem.residual(q, zero)[2], None), start)
     no, beside = jnp.array(False), None if problem.beside is None else problem.beside.before
-    # Derivatives that begin near the last: where the matrix is symmetric, so that transposed it is the same.
+    # Solves of derivatives begin near the last ones if the matrix is symmetric, so that it is its own transpose.
     both = start if beside is None else jnp.concatenate([start, beside])
     adjoints = () if problem.adjoint is None else no_earlier(start, both)
     empty = (jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), a) for a in (made, beside))
@@ -106,8 +106,8 @@ def solve(
     """Root in q of r(q, 1), followed from `start` (n,) at s = 0, or from `guess` first; neither has a derivative.
 
     Returns the root, the statistics, and the tangent for the next step. `kept` is the tangent of the last step, `near`
-    one for derivatives. Of what is kept, the solution beside the root has the root's derivative if the problem has an
-    `adjoint`.
+    a tangent for derivatives. If the problem has an `adjoint`, the `beside` of the result is differentiated together
+    with the root.
     """
     start = jax.lax.stop_gradient(start)
     guess = predicted = None if guess is None else jax.lax.stop_gradient(guess)
@@ -138,8 +138,8 @@ def solve(
         guessing = jnp.array(guess is not None)
         return _follow(problem, start, start if guess is None else guess, guessing, kept, options)
 
-    # Two rules: how the root was found has no derivative, and the root's own is by the tangent there. For the first any
-    # function will do whose root depends on nothing.
+    # Two rules: the search has no derivative, and the root's own derivative uses the tangent there. The first
+    # rule needs any function whose root is constant.
     if options.differentiable:
         found_by = jax.lax.custom_root(lambda q: q, start, follow, lambda _, y: jnp.zeros_like(y), has_aux=True)
     else:
@@ -169,8 +169,8 @@ def _with_derivative(
     tolerance: Number,
     near: Any,
 ) -> tuple[jax.Array, jax.Array | None, Earlier | tuple[()]]:
-    """The root q and what is beside it, with the derivatives of the residual's root; and solves for the next to begin
-    with.
+    """The root q and `beside`, with the derivatives of the residual's root; and solves from which the next derivative
+    begins.
 
     These solves must be carried from step to step. So they count as further unknowns, equal to `last`. Forward mode
     hands them on, and reverse mode hands them back, from the later step to the earlier.
@@ -209,19 +209,20 @@ def _guarded(problem: Problem, q: jax.Array) -> jax.Array:
     """q, whose derivative is NaN if it is ever taken through this function, which a correct derivative never does.
 
     Up to jax 0.10 the derivative of a loop's derivative in reverse mode forgets the rule by which a root is
-    differentiated (jax 0.11.2 does not). It would take the root for a constant, and give a wrong number without a word.
+    differentiated (jax 0.11.2 does not). It would take the root for a constant, and give a wrong number without a
+    warning.
     """
     leaves = [jnp.ravel(leaf)[:1] for leaf in jax.tree.leaves(problem.numbers)]
     some = [leaf for leaf in leaves if leaf.size and jnp.issubdtype(leaf.dtype, jnp.floating)]
     if not some:
         return q
     total = jnp.sum(jnp.concatenate([leaf.astype(q.dtype) for leaf in some]))
-    # The root of 0 has no derivative.
+    # The square root has no derivative at 0: there it gives NaN.
     return q + jnp.sqrt(jnp.where(jnp.isfinite(total), 0.0 * total, 0.0))
 
 
 def _evaluated_near(problem: Problem, q: jax.Array, s: jax.Array, beside: jax.Array | None, looser: Number) -> tuple:
-    """The residual at q, with what it solves for from a solution nearby."""
+    """The residual at q; its solve for `beside` begins at a solution nearby."""
     if problem.beside is None or beside is None:
         return problem.residual(q, s)
     return problem.residual(q, s, problem.beside.guess(beside, looser))
@@ -408,7 +409,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
         load = load - jax.lax.cond(v.launch_now, lambda: ds * _along(problem, trial, s), lambda: jnp.zeros_like(r))
     slow = c.remake | (size > _CONTRACTION * c.aim)
     renew = (v.launch_now & (~c.guessing | ~c.kept.made)) | (v.go_on & ~v.launch_now & slow)
-    # No direction is solved for beyond what it can remove (Eisenstat and Walker 1996), nor beyond the goal.
+    # No direction is solved more accurately than it can be used (Eisenstat and Walker 1996), or than the goal needs.
     ratio = size / jnp.where(c.aim > 0, c.aim, 1.0)
     reach = 0.3 * jnp.where(renew, ratio**2, ratio)
     goal = 0.3 * options.tolerance / jnp.maximum(relative, 1e-300)
@@ -447,7 +448,7 @@ def _iterate(problem: Problem, options: StepOptions, start: jax.Array, c: _Point
     )
 
 
-#: What is solved for beside the root: error over the residual that a direction is to leave.
+#: Error of the solve for `beside`, over the residual that a direction is to leave.
 _BESIDE = 0.1
 
 

@@ -10,7 +10,7 @@ import jax
 from liverjax.core.struct import Number
 from liverjax.tensors.matrices import Matrix, Vector, dot, matmul, stored, transpose
 
-#: Pairs of different axes, and where the six components of a symmetric matrix stand.
+#: Pairs of different axes, and the indices of the six components of a symmetric matrix.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 SIX = ((0, 0), (1, 1), (2, 2), *PAIRS)
 
@@ -47,7 +47,7 @@ _INDEX = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 
 
 def half_contracted(moduli: Any, b: Vector) -> list:
-    """T_mpn = sum_q C_mpnq b_q of moduli over six components each; a node's part of `anisotropic`."""
+    """T_mpn = sum_q C_mpnq b_q with moduli 6 x 6 in the order of `SIX`: the part of one node for `anisotropic`."""
     return [
         [[_contract([moduli[_INDEX[m][p]][_INDEX[n][q]] for q in range(3)], b) for n in range(3)] for p in range(3)]
         for m in range(3)
@@ -55,7 +55,7 @@ def half_contracted(moduli: Any, b: Vector) -> list:
 
 
 def anisotropic(T: list, a: Vector) -> Matrix:
-    """kappa_mn = sum_p a_p T_mpn of two nodes, with `half_contracted` of the second."""
+    """kappa_mn = sum_p a_p T_mpn of two nodes: a is the first's shape vector, T the second's `half_contracted`."""
     return tuple(tuple(_contract([T[m][p][n] for p in range(3)], a) for n in range(3)) for m in range(3))
 
 

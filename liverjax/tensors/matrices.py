@@ -19,7 +19,7 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Invariants(NamedTuple):
-    """The measures of strain (E,) of which a strain energy is a function; `None` where the law does not ask for one."""
+    """The measures of strain (E,) that a strain energy depends on; `None`: the law does not use this measure."""
 
     I1: Any = None  # tr C
     I2: Any = None  # (I1^2 - tr C^2) / 2
@@ -90,7 +90,7 @@ def right_cauchy_green(F: Matrix) -> Matrix:
 
 
 def invariants(names: tuple[str, ...], F: Matrix) -> Invariants:
-    """Those of the invariants I1, I2 and J that are in `names`."""
+    """The invariants among I1, I2 and J that are in `names`."""
     values = {}
     if "I1" in names or "I2" in names:
         values["I1"] = sum(dot(row, row) for row in F)
@@ -136,11 +136,11 @@ def pack(A: Matrix) -> jax.Array:
 def stored(values: T) -> T:
     """The same pytree, written to memory: a branch keeps XLA:CPU from computing it again for every use.
 
-    Its leaves are one number, or arrays; the first array is not empty.
+    Its leaves are numbers or arrays; at least one of them is not empty.
     """
     values = jax.tree.map(jnp.asarray, values)
     number = max(jax.tree.leaves(values), key=jnp.size).ravel()[0]
-    always = (number != -jnp.inf) | (number < 0)  # of any number, NaN too; not known when compiling
+    always = (number != -jnp.inf) | (number < 0)  # true for every number and NaN; unknown to the compiler
     return jax.lax.cond(always, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
@@ -151,13 +151,13 @@ def deformation_gradient(mesh: Any, x: jax.Array) -> Matrix:
 
     Args:
         mesh: `TetMesh`.
-        x: current positions (V, 3) [m]. A difference of displacements works as well (the gradient of a field).
+        x: current positions (V, 3) [m]. Another field (V, 3) works as well: the result is its gradient.
 
     Raises:
-        InputError: x of another shape (an index beyond its end would be the last node's, silently).
+        InputError: x of another shape (an index beyond its end would silently read the last node).
     """
     if jnp.shape(x) != mesh.points.shape:
-        raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 a node, {mesh.points.shape}")
+        raise InputError(f"positions have shape {jnp.shape(x)}: give one row of 3 per node, {mesh.points.shape}")
     edges = mesh.edges([x[:, c] for c in range(3)])
     D = mesh.gradients
     return tuple(tuple(sum(edges[a][i] * D[a, j] for a in range(3)) for j in range(3)) for i in range(3))

@@ -142,9 +142,9 @@ _PAIRS_OF_NODES = ((0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1))  # i, j of g[i, i, j]
 
 
 def expanded_power_sum(alpha: Number, logs: Vector, change: tuple, log_J: Any) -> jax.Array:
-    """The expansion of this module's head for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
+    """The expansion in this module's docstring for (J^(-1/3) lambda)^alpha, differentiable in alpha, X and ln J.
 
-    Divided differences of one kind are one stacked array: a tenth of the operations to compile.
+    Divided differences of one kind are stacked in one array, so only a tenth of the operations is compiled.
     """
     q, log_J0 = alpha / 2, jax.lax.stop_gradient(log_J)
     l = 2 * (jax.lax.stop_gradient(jnp.stack(logs)) - (log_J0 / 3)[None])
@@ -199,7 +199,7 @@ def _divided_power(p: Any, y: list) -> Number:
 
 
 def sinh_ratio(p: Number, delta: Number) -> jax.Array:
-    """sinh(p delta) / sinh(delta), p where delta = 0."""
+    """sinh(p delta) / sinh(delta), which is p at delta = 0."""
     return p * _sinhc(p * delta) / _sinhc(delta)
 
 

@@ -1,16 +1,16 @@
-"""Principal fields of many: the few that hold all but a small part of them (proper orthogonal decomposition)."""
+"""Proper orthogonal decomposition: a few fields that represent many fields up to a small rest."""
 
 import numpy as np
 
-#: The most rows and columns whose products are decomposed; of more rows, as many are taken evenly.
+#: The largest size of the matrix of products; if there are more rows, so many of them are used, evenly spaced.
 MOST_PRODUCTS = 6000
 
 
 def principal_fields(rows: np.ndarray, tolerance: float) -> np.ndarray:
-    """Orthonormal fields (n, P) that leave out at most `tolerance` of rows (N, P), root of their squares.
+    """Orthonormal fields (n, P) that represent rows (N, P) up to `tolerance` times the Frobenius norm of the rows.
 
-    They come from the eigenvalues of the products of rows, or of columns where these are fewer (Sirovich 1987). These
-    have half of the digits: the least tolerance is 1e-7.
+    They come from the eigenvalues of the products of rows, or of columns if there are fewer columns (Sirovich 1987).
+    The products keep only half of the digits, so the least tolerance is 1e-7.
     """
     if min(rows.shape) > MOST_PRODUCTS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_PRODUCTS).round().astype(int)]

@@ -1,4 +1,4 @@
-"""Elements in subsets that are computed apart: numbers of one subset, and all numbers put together again."""
+"""Subsets of elements that are computed separately: read the numbers of one subset, put all numbers together again."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -12,14 +12,14 @@ T = TypeVar("T")
 
 
 class Subsets(NamedTuple):
-    """Every element in one subset."""
+    """A partition of the elements: every element is in exactly one subset."""
 
-    elements: tuple[jax.Array, ...]  # element numbers of each subset; (1, n), which no numbers by element are
-    places: jax.Array  # place of each element in all subsets, one after the other: (E,), or (1, E) of several points
+    elements: tuple[jax.Array, ...]  # element numbers (1, n) of each subset; no numbers by element have this shape
+    places: jax.Array  # place of each element when all subsets follow each other: (E,), or (1, E) with several points
 
     @property
     def number_of_elements(self) -> int:
-        """E."""
+        """Number of elements, E."""
         return self.places.shape[-1]
 
 
@@ -27,7 +27,7 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
     """Make subsets: first the elements without a group, if there are any, then each group.
 
     Args:
-        groups: element numbers (n,) of groups that share none; they may be traced.
+        groups: element numbers (n,) of groups without common elements; they may be traced.
         number_of_elements: E.
     """
     E = number_of_elements
@@ -41,7 +41,7 @@ def subsets(groups: Sequence[Any], number_of_elements: int) -> Subsets:
 
 
 def in_subset(s: Subsets, k: int, numbers: T) -> T:
-    """The numbers of a pytree that belong to subset k, of arrays (…, E) and (…, E, 3). Others stay as they are."""
+    """A pytree with the entries of subset k of its arrays (…, E) and (…, E, 3); other arrays stay as they are."""
     E, own = s.number_of_elements, s.elements[k][0]
 
     def one(a: Number) -> Number:
@@ -61,7 +61,7 @@ def put_together(s: Subsets, numbers: Sequence[T]) -> T:
     ]
     lead = jnp.broadcast_shapes(s.places.shape[:-1], *(shape[:-1] for shape in shapes))
     dtype = jnp.result_type(*(a for own in leaves for a in own))
-    # One array a subset: one copy in order, however many numbers an element has.
+    # One array per subset, so that one copy puts all numbers of every element in order.
     stacked = [
         jnp.stack([jnp.broadcast_to(jnp.asarray(a, dtype), (*lead, shape[-1])) for a in own])
         for own, shape in zip(leaves, shapes, strict=True)

@@ -28,7 +28,7 @@ from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, free_part, operator
 
 MASSES = ("consistent", "lumped")
-#: What the equations of one instant need of [solve].
+#: Values of [solve] for the equations of one instant.
 _STILL: Content = {
     "kind": "static",
     "frequencies": None,
@@ -46,11 +46,11 @@ class Harmonic:
     frequencies_Hz: jax.Array = param("Hz", "(F,)")
     displacement: jax.Array = param("m", "u, complex (F, V, 3)")
     reactions: jax.Array = param("N", "complex (F, V, 3), force of the support on the body where motion is given")
-    residual: jax.Array = param("1", "(F,) what is out of balance where the body is free, over the forces at work")
+    residual: jax.Array = param("1", "(F,) out-of-balance forces where the body is free, over the forces at work")
     pressure: jax.Array | None = param("Pa", "of the fluid, complex (F, V), of a porous scene", default=None)
 
     def check(self) -> "Harmonic":
-        """The result itself, or `RuntimeError` with advice where a frequency has no answer; host side."""
+        """The result itself, or `RuntimeError` with advice if a frequency has no answer; host side."""
         wrong = np.flatnonzero(~(np.asarray(self.residual) < 1e-6))
         if wrong.size:
             raise RuntimeError(
@@ -71,16 +71,15 @@ def harmonic(
     """Small motion of the scene at these frequencies, driven by its tractions, prescribed motions and inlets.
 
     Their numbers are amplitudes. Law, viscosity, porosity, density, supports, held nodes and regions act; gravity and
-    time steps have no part. May be differentiated in both modes and jitted; every derivative costs one more solve a
-    frequency, without a factorisation of its own.
+    time steps have no effect. It may be differentiated in both modes and jitted; every derivative costs one more solve
+    per frequency, without a new factorisation.
 
     Args:
-        scene: `Scene`. What `displaced` prescribes is the amplitude of a motion in phase.
+        scene: `Scene`. The motion of `displaced` is an amplitude with phase 0.
         frequencies_Hz: (F,), above 0; default: those of scene.solve.
         factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
             default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or of its springpots; else 1.
-            Where volumes have pressures of their own (volumetric "mixed", "nodal"), or a sponge has them, they do not
-            relax.
+            Pressures of nodes (volumetric "mixed", "nodal", or of a sponge) do not relax.
         about: positions (V, 3) [m] of an equilibrium that has rested for long, as in `simulate`; default: the
             reference shape. The law's stress there stiffens the body. A fluid has flowed until its pressure is 0.
         motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
@@ -90,8 +89,8 @@ def harmonic(
         `Harmonic`. A matrix without an inverse leaves NaN at its frequency.
 
     Raises:
-        InputError: what has no harmonic motion here (pressures that follow, friction, rigid plates), shapes and values
-            that cannot be used.
+        InputError: parts that have no harmonic motion here (pressures that follow, friction, rigid plates), shapes and
+            values that cannot be used.
     """
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
     if scene.springpots is not None:
@@ -118,7 +117,7 @@ def harmonic(
 
 
 def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "consistent") -> Operator:
-    """The dynamic stiffness of `harmonic` by element, for programs that build their own equations of it.
+    """The dynamic stiffness of `harmonic` by element, for programs that build their own equations with it.
 
     Args:
         scene, about, mass: as in `harmonic`.
@@ -133,7 +132,7 @@ def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:
     none = jnp.zeros(())
     e = equations(still, initial_state(still), 1.0, Sizes(none, none))
     if e.free.tied:
-        raise InputError("nodes that turn together (a rigid plate) have no harmonic motion here: prescribe theirs")
+        raise InputError("nodes that turn together (a rigid plate) have no harmonic motion: prescribe their motion")
     return operator(e._replace(scene=scene), scene.mesh.points if about is None else about, about is not None, mass)
 
 
@@ -148,7 +147,7 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
     out, unbalanced = jax.vmap(lambda *m: free_part(A, m))(f, balance)
     residual = _part(out, jnp.abs(f - out) + jnp.abs(load[0]))
     if unbalanced is not None and p is not None:
-        # What the motion takes from the pressures' volumes, or the fluid that enters.
+        # Volumes that the motion changes at the pressures' nodes, or the fluid that enters.
         taken: Any = sparse.at_every(A, *at, (u, jnp.zeros_like(p)))[1]
         residual = jnp.maximum(residual, _part(unbalanced, jnp.abs(taken) + jnp.abs(load[1])))
     return Harmonic(
@@ -163,7 +162,7 @@ def _answer(scene: Scene, at: tuple[jax.Array, jax.Array], motion: jax.Array, ab
 def _prescribed_and_loads(
     A: Operator, omegas: jax.Array, motion: jax.Array, traction: jax.Array
 ) -> tuple[sparse.Motions, Any]:
-    """What is prescribed, and the loads, of every frequency."""
+    """The prescribed amplitudes, and the loads, of every frequency."""
     number, own = len(omegas), A.pressures
     held = (1 - A.free.mask)[None] * motion
     force = jnp.broadcast_to(jnp.asarray(traction, complex)[None], motion.shape)
@@ -192,7 +191,7 @@ def _frequencies(frequencies_Hz: Any) -> jax.Array:
 
 
 def _factors(scene: Scene, omegas: jax.Array) -> jax.Array:
-    """m (F,) of the scene's viscosity, or (F, E)."""
+    """Factors G*/G0 (F,), or (F, E), of the scene's viscosity."""
     prony = scene.viscosity
     if prony is None:
         return jnp.ones(omegas.shape, complex)

@@ -19,15 +19,15 @@ def harmonic_mesh_error(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> jax.Array:
-    """Estimated error of amplitudes, complex (F, V, 3) [m]: what a mesh without end would add to them.
+    """Estimated error of amplitudes, complex (F, V, 3) [m]: what an infinitely fine mesh would add.
 
     A result of linear elements is solved again with quadratic ones, and one of quadratic elements with cubic ones. With
-    too few elements a wave the phase is wrong, and the error is as large as the motion. The cost is that of a mesh with
-    eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is left out.
+    too few elements per wave the phase is wrong, and the error is as large as the motion. The cost is that of a mesh
+    with eight (quadratic: three) times the unknowns. Pressures of a fluid stay linear: their own error is left out.
 
     Args:
         scene, factors, about, motion: as in `harmonic`.
-        found: its result.
+        found: result of `harmonic`.
 
     Raises:
         InputError: a scene of another mesh, and what `harmonic` refuses.

@@ -1,13 +1,13 @@
 """Dynamic stiffness of small harmonic motion: K(omega) - omega^2 M, kept by element.
 
 About a state x that has rested for long, the stress that relaxes has come down to m_inf S_h, and a small motion adds
-m(omega) times its instantaneous change, where m = G*/G0 (m_inf = 1 - sum g_k). So, with the material and the geometric
-part of the tangent apart (superposed small motion: Lockett 1972, Nonlinear Viscoelastic Solids, chapter 7),
+m(omega) times its instantaneous change, where m = G*/G0 (m_inf = 1 - sum g_k). So, with the tangent split into its
+material and geometric part (superposed small motion: Lockett 1972, Nonlinear Viscoelastic Solids, chapter 7),
 
     K(omega) = m(omega) (K_h - K_geometric) + m_inf K_geometric + K_rest,
 
-where K_rest is of what does not relax: the volumetric part of the law where only the isochoric part does, a sponge,
-supports, membranes and springs. Pressures that are unknowns beside the motion: `liverjax.waves.pressures`.
+where K_rest is the stiffness that does not relax: the volumetric part of the law if only the isochoric part relaxes, a
+sponge, supports, membranes and springs. For pressures as unknowns see `liverjax.waves.pressures`.
 """
 
 from typing import NamedTuple
@@ -40,7 +40,7 @@ _OWN = tuple((a, b) for a in range(3) for b in range(a, 3))
 class Operator(NamedTuple):
     """Matrices of every element with n nodes, and the matrices of nodes."""
 
-    points: jax.Array  # (V, 3) [m] where the nodes are
+    points: jax.Array  # (V, 3) [m] reference positions of the nodes
     nodes: jax.Array  # (n, E)
     relaxing: jax.Array  # (n, 3, n, 3, E) [N/m] is multiplied by m(omega)
     rest: jax.Array | None  # (n, 3, n, 3, E) [N/m]
@@ -55,7 +55,7 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
     """The operator about positions x (V, 3) [m].
 
     Args:
-        e: equations of the scene, of which viscosity takes no part.
+        e: equations of the scene without its viscosity.
         loaded: x is not the reference shape; there is stress.
         mass: "consistent" or "lumped", as in runs in time.
     """
@@ -80,7 +80,7 @@ def _shape_vectors(mesh: TetMesh) -> list[Vector]:
 
 
 def _blocks(scene: Scene, law: Law, F: Matrix, loaded: bool) -> tuple[list[Matrix], list[Matrix] | None]:
-    """Blocks per volume of the corners 1, 2, 3 (`_OWN`) that m(omega) multiplies, and of those that it does not."""
+    """Blocks per volume of the corners 1, 2, 3 (`_OWN`) that m(omega) multiplies, and the other blocks or None."""
     mesh, prony, D = scene.mesh, scene.viscosity, _shape_vectors(scene.mesh)
     if prony is None:
         return invariant_terms.blocks(invariant_terms.state(law, F), D, _OWN), None
@@ -114,7 +114,7 @@ def _element_matrices(mesh: TetMesh, blocks: list[Matrix]) -> jax.Array:
 
 
 def _both_ways(mesh: TetMesh, K: jax.Array) -> jax.Array:
-    """Matrices (n, …, n, …, E) of functions as the nodes have them: those of order 3 have a direction on an edge."""
+    """Matrices (n, …, n, …, E) with the nodes' signs: functions of order 3 on an edge have a direction."""
     if mesh.order < 3:
         return K
     n, E, half = len(K), K.shape[-1], K.ndim // 2
@@ -142,7 +142,7 @@ Motion = tuple[jax.Array, jax.Array | None]
 
 
 def forces_of_motion(A: Operator, factor: Number, omega: Number, motion: Motion) -> Motion:
-    """Forces (V, 3) complex [N] of a motion, and the balance (P,) [m^3] where there are pressures.
+    """Forces (V, 3) complex [N] of a motion, and the balance (P,) [m^3] if there are pressures.
 
     Args:
         A: `Operator`.
@@ -189,6 +189,6 @@ def _of_nodes_alone(A: Operator, omega: Number, u: jax.Array) -> jax.Array:
 
 
 def free_part(A: Operator, motion: Motion) -> Motion:
-    """What of a motion, or of forces, is along free directions."""
+    """The part of a motion, or of forces, along free directions."""
     u, p = motion
     return A.free.vectors(u), None if A.pressures is None or p is None else A.pressures.mask * p

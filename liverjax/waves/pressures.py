@@ -6,8 +6,9 @@ symmetric system,
     K u + B p = f,    B^T u - (store + flow / (i omega)) p = -enters / (i omega).
 
 In a sponge (`liverjax.physics.porosity`) B is minus the change of the vertices' volumes, and the second line is Darcy's
-law over i omega: (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), volumes those of the state that moves. Where a law
-keeps its volume (`liverjax.physics.volumes`) nothing flows, and store is the compliance of the pressures.
+law over i omega: (1/K_lim) i omega p = kappa lap p - i omega (dJ/J), with volumes of the state about which the body
+moves. With averaged or mixed volumes (`liverjax.physics.volumes`) nothing flows, and store is the compliance of the
+pressures.
 """
 
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ from liverjax.tensors.matrices import Matrix, determinant, dot, scale
 
 
 class Pressures(NamedTuple):
-    """Matrices of every element with n nodes, and what is known of the P pressures."""
+    """Matrices of every element with n nodes, and the given numbers of the P pressures."""
 
     nodes: jax.Array  # (4, E) vertices
     pull: jax.Array  # (n, 3, 4, E) [m^2]: B
@@ -39,7 +40,7 @@ class Pressures(NamedTuple):
     flow: jax.Array | None  # (4, 4, E) [m^3/(Pa s)]; None: nothing flows
     mask: jax.Array  # (P,) 0 where the pressure is given
     given: jax.Array  # (P,) [Pa] amplitudes where it is given, 0 elsewhere
-    enters: jax.Array | None  # (P,) [m^3/s] amplitude of what enters; None: nothing does
+    enters: jax.Array | None  # (P,) [m^3/s] amplitude of the inflow; None: no inflow
 
 
 def law_beside(scene: Scene) -> Any:
@@ -50,11 +51,11 @@ def law_beside(scene: Scene) -> Any:
 
 
 def scalars_and_pressures(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars | None, Pressures | None]:
-    """Stress and slope of volumes at given pressures about positions x (V, 3) [m], and the pressures' part; or None."""
+    """Stress and slope of volumes at given pressures about positions x (V, 3) [m], and `Pressures`; or None."""
     mesh, J = scene.mesh, determinant(F)
     if scene.porosity is not None:
         own = scene.porosity
-        # At rest for long the fluid has flowed until it pushes no more.
+        # After a long rest the fluid has flowed until its pressure is 0.
         found = Scalars({"J": volumetric_stress(own, J)}, {("J", "J"): volumetric_slope(own, J)})
         return found, _of_sponge(own, mesh, F)
     if scene.solve.volumetric == "mixed":
@@ -87,7 +88,7 @@ def _of_mixed(scene: Scene, x: jax.Array, F: Matrix) -> tuple[Scalars, Pressures
 
 
 def _compliance(mesh: TetMesh, volume: Mixed) -> jax.Array:
-    """(4, 4, E) of every element: see `Mixed.compliance`."""
+    """Compliance (4, 4, E) of every element: see `Mixed.compliance`."""
     if mesh.order > 1:
         L = jnp.asarray(basis(mesh.order).L, mesh.volumes.dtype)
         return jnp.einsum("aq,bq,qe->abe", L, L, mesh.weights / volume.rest, optimize=True)
@@ -113,7 +114,7 @@ def _sealed(mesh: TetMesh, pull: jax.Array, store: jax.Array) -> Pressures:
 
 
 def _lumped(mesh: TetMesh, density: jax.Array) -> jax.Array:
-    """(4, 4, E): each element's share of `integrals` of a density at the points, at its vertices alone."""
+    """Diagonal matrices (4, 4, E): each element's share of `integrals` of a density at the points."""
     if mesh.order == 1:
         share = jnp.broadcast_to(mesh.volumes * density / 4, (4, mesh.number_of_elements))
     else:

@@ -2,7 +2,7 @@
 
 The matrix is symmetric, not Hermitian, so one factor serves the equations, their derivatives and their adjoints: it is
 kept for them (`KEPT`). See `liverjax.solvers.factors.multifrontal`; SciPy's SuperLU, which chooses its pivots in the
-whole matrix, follows where that fails.
+whole matrix, is used if that fails.
 """
 
 import hashlib
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 #: Motions of every frequency: (F, V, 3), and (F, P) or None.
 Motions = Motion
-#: Memory [bytes] of the factors that are kept for derivatives; those of other matrices are given up first. Where those
-#: of all frequencies do not fit, they are kept as whole numbers of 16 bits, half as large.
+#: Memory [bytes] of the factors that are kept for derivatives; factors of other matrices are dropped first. If those
+#: of all frequencies do not fit, they are kept as 16-bit integers, half as large.
 KEPT = 2e9
 
 _factors: dict[bytes, multifrontal.Factor] = {}
@@ -33,7 +33,7 @@ _orders: dict[bytes, "_Order"] = {}
 
 
 def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> Motions:
-    """Free motions of every frequency with P A P x = P b, where P leaves what is free; 0 where it is not.
+    """Free motions of every frequency with P A P x = P b, where P projects onto free directions; 0 along others.
 
     Args:
         A: `Operator`.
@@ -41,7 +41,7 @@ def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> M
         omegas: angular frequencies (F,) [rad/s].
         b: forces (F, V, 3) complex [N], and the balance of pressures (F, P) [m^3] or None.
 
-    Differentiable in both modes by everything but what is free. Rows of a matrix without an inverse are NaN.
+    Differentiable in both modes by everything except the free directions. If a matrix has no inverse, its row is NaN.
     """
 
     V = b[0].shape[1]
@@ -58,7 +58,7 @@ def motions(A: Operator, factors: jax.Array, omegas: jax.Array, b: Motions) -> M
         given = (A, factors, omegas, load)
         return jax.pure_callback(_host, shape, *jax.lax.stop_gradient(given), vmap_method="sequential")
 
-    # One array: of a linear solve for several, JAX has no derivative where one is not used.
+    # One array: JAX has no derivative of a linear solve for several arrays if one of them is not used.
     x = jax.lax.custom_linear_solve(product, free(_in_one_row(b)), factorised, symmetric=True)
     u, p = _parted(x, V)
     return u, None if b[1] is None else p
@@ -82,12 +82,12 @@ def at_every(A: Operator, factors: jax.Array, omegas: jax.Array, x: Motions) -> 
 
 
 class _Order(NamedTuple):
-    """Places of the entries, and which unknowns are eliminated when: the same for all moduli and frequencies.
+    """Places of the entries, and the order of elimination: the same for all moduli and frequencies.
 
-    x, y, z of a node stand together here, and the pressures last.
+    Here x, y, z of a node follow each other, and the pressures are last.
     """
 
-    pairs: np.ndarray  # (n n E,) place of each two nodes of an element among the blocks
+    pairs: np.ndarray  # (n n E,) place among the blocks of each pair of nodes of an element
     blocks: "scipy.sparse.csr_array"  # (V, V): two nodes of an element
     free: np.ndarray  # numbers of the free unknowns
     entries: "scipy.sparse.csr_array | None"  # of free unknowns: places among the blocks; None: there are other entries
@@ -133,8 +133,8 @@ def _digest(A: Any) -> bytes:
 
 
 def _order(A: Any, free: np.ndarray) -> _Order:
-    """The order of this mesh: the last one, if it is the same."""
-    import scipy.sparse  # a fifth of the time that importing the package takes: only where it is used
+    """The order for this mesh: the stored one, if the mesh is the same."""
+    import scipy.sparse  # slow to import (a fifth of the package): only where it is used
 
     V, widths = len(A.points), [A.nodes, *(own.nodes for own in A.attached)]
     alone = _elements_alone(A)
@@ -158,7 +158,7 @@ def _order(A: Any, free: np.ndarray) -> _Order:
 
 
 def _elements_alone(A: Any) -> bool:
-    """Whether all entries are those of the elements' motion, and no node slides."""
+    """Whether all entries come from the elements' stiffness and mass, and no node slides."""
     other = (A.springs, A.pressures, A.free.normals)
     return all(own is None for own in other) and not A.attached and (A.mass is None or A.mass.ndim == 3)
 
@@ -200,7 +200,7 @@ def _matrix(A: Any, order: _Order, factor: np.ndarray, omega: float) -> Any:
 def _blocks_of_nodes(A: Any, order: _Order, factor: np.ndarray, omega: float) -> np.ndarray:
     """Sums over the elements, (blocks, 3, 3) complex.
 
-    Real sums, and as few of them as there are different ones: large new arrays cost more here than their numbers.
+    Sums are real, and none is computed twice: here large new arrays cost more than the arithmetic.
     """
     number = order.blocks.nnz
 
@@ -240,7 +240,7 @@ def _first_solution(K: Any, plan: list[multifrontal.Front], b: np.ndarray, kept:
 
 
 def _keep(key: bytes, factor: multifrontal.Factor) -> None:
-    """Keep factors up to `KEPT` bytes; of one matrix, those of the first frequencies."""
+    """Keep factors up to `KEPT` bytes; of one matrix, the factors of the first frequencies."""
     for other in [other for other in _factors if other[:16] != key[:16]]:
         del _factors[other]
     if factor.nbytes + sum(own.nbytes for own in _factors.values()) < KEPT:
@@ -257,8 +257,7 @@ def _pivoted(K: Any, b: np.ndarray) -> np.ndarray:
 
 
 def _entries_beside(A: Any, omega: float) -> list[tuple]:
-    """Values, lines and columns of all but the elements' motion: masses and springs of nodes, what is attached,
-    pressures."""
+    """Values, rows and columns of all other entries: masses and springs of nodes, elements between nodes, pressures."""
     every, found = 3 * np.arange(len(A.points)), []
     if A.mass is not None and A.mass.ndim == 1:
         found += [(-(omega**2) * A.mass + 0j, every + r, every + r) for r in range(3)]
@@ -281,7 +280,7 @@ def _entries_beside(A: Any, omega: float) -> list[tuple]:
 
 
 def _with_empty_lines(N: Any, size: int) -> Any:
-    """The matrix with lines and columns of 0 behind it."""
+    """The matrix with rows and columns of 0 appended."""
     import scipy.sparse
 
     N = N.tocoo()

@@ -1,1 +1,1 @@
-"""Families of models beside free Prony modes, and the choice between them."""
+"""Families of models other than free Prony modes, and the choice between all of them."""

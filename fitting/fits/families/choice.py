@@ -1,8 +1,8 @@
 """The choice between models of several families by their information criteria.
 
-Where one model contains another, the general one is at least as close to the data whatever they are. It is chosen only
-where the criterion is strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90): beyond the band of the
-data general models predict worse where nothing asks for them.
+If one model contains another, the general one is at least as close to any data. It is chosen only if the criterion is
+strong evidence for it (Kass and Raftery 1995, J. Am. Stat. Assoc. 90): a general model that the data do not need
+predicts worse outside their band.
 """
 
 from collections.abc import Sequence
@@ -10,15 +10,15 @@ from typing import NamedTuple, Protocol
 
 from fitting.fits.viscoelastic import FLUID, Kind
 
-#: What a model becomes for some values of its numbers. A spectrum can be any other model, `prony` with as many modes
-#: a fluid, and a Zener model with the exponent 1 a single mode.
+#: Models that a model becomes for some values of its numbers. `contains` adds three cases: a spectrum can become
+#: any model, `prony` a fluid with at most as many modes, and a Zener model with the exponent 1 a single mode.
 SPECIAL_CASES = {
     "fractional_kelvin_voigt": ("springpot",),
     "fractional_maxwell": ("springpot",),
     "fractional_parallel": ("springpot", "fractional_kelvin_voigt"),
     "fractional_zener": ("springpot", "fractional_kelvin_voigt"),
 }
-#: Difference of the criterion that is asked of a model against its special case: strong evidence.
+#: A model must be better than its special case by this difference of the criterion: strong evidence.
 GENERAL = 6.0
 
 
@@ -41,8 +41,7 @@ def contains(general: Label, special: Label) -> bool:
 
 
 def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
-    """Index of the model to choose: the lowest criterion, but no model that is not better than its special case by
-    `GENERAL`."""
+    """Index of the model with the lowest criterion among those better than their special cases by `GENERAL`."""
     beaten = {
         j
         for j, general in enumerate(labels)
@@ -54,11 +53,11 @@ def preferred(labels: Sequence[Label], criteria: Sequence[float]) -> int:
 
 
 class OfAKind(Protocol):
-    """A fit of any data."""
+    """Attributes that a fit of any data has."""
 
     @property
     def kind(self) -> Kind:
-        """What its numbers mean."""
+        """The meaning of its numbers."""
 
     @property
     def modes(self) -> int:

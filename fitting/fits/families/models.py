@@ -1,7 +1,7 @@
-"""Models beyond free Prony modes, fitted in closed form: springpots, a spectrum on a grid, fluids; and the choice.
+"""Models beyond free Prony modes, fitted in closed form: springpots, a spectrum on a grid, fluids; and how to choose.
 
-All are judged by the information criterion that chooses the number of modes. Each hands over Prony modes for the
-simulation, with the error of that conversion over the band.
+All are compared by the information criterion that also chooses the number of modes. Each is converted to Prony modes
+for the simulation; the fit states the error of this conversion over the band.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ def fractional(sweep: Sweep) -> list[Fit]:
     reference, starts = springpots.reference_frequency(sweep), springpots.starting_points(sweep)
     scaled = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
     best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
-    # As many numbers as data follow anything: that has no error, and says nothing.
+    # A model with as many numbers as data fits anything without a residual, so its fit proves nothing.
     most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
@@ -133,12 +133,12 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
 def _cut_off(fit: Fit) -> str:
     return (
         f"the model {fit.kind.name} has no finite instantaneous modulus: shear_modulus is that of the {fit.modes} "
-        "Prony modes that stand for it over the measured band, and holds for no higher frequency"
+        "Prony modes that represent it over the measured band, and is not valid at higher frequencies"
     )
 
 
 def _undetermined(fit: Fit) -> list[str]:
-    """Numbers of a fractional model that the data leave free."""
+    """A sentence on the numbers of a fractional model that the data do not determine."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, determined(fit.parameters), strict=True) if not ok]
@@ -162,7 +162,7 @@ def identifiable(fit: Fit, sweep: Sweep) -> bool:
 
 
 def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
-    """N modes without an equilibrium modulus, N by the criterion."""
+    """Fit modes without an equilibrium modulus; the criterion chooses their number."""
     largest = min(uncertainty.supported_modes(sweep), generalised_maxwell.largest_number_of_modes(sweep))
     chosen, failures = None, 0
     for modes in range(1, largest + 1):
@@ -181,7 +181,7 @@ def fluid(sweep: Sweep, dense: Spectrum) -> Fit:
 
 
 def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> list[Fit]:
-    """The fits that a choice is made from; arguments as in `choose`."""
+    """The fits from which `choose` chooses; arguments as there."""
     tried: list[Fit] = []
     if model in ("fractional", "auto"):
         tried += fractional(sweep)
@@ -195,7 +195,7 @@ def every_model(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) ->
 
 
 def best_of_models(tried: Sequence[Fit], sweep: Sweep) -> tuple[Fit, list[Fit]]:
-    """The model to choose, and those whose numbers the data determine (all, if none)."""
+    """The best model, and all models whose numbers the data determine (all of `tried`, if there is none)."""
     able = [fit for fit in tried if identifiable(fit, sweep)] or list(tried)
     return able[preferred([label_of(f) for f in able], [information_criterion(f) for f in able])], able
 
@@ -205,8 +205,8 @@ def choose(sweep: Sweep, model: str, prony: Fit | None, dense: Spectrum) -> Fit:
 
     Args:
         sweep: data.
-        model: one of `MODELS`, but "prony".
-        prony: the modes chosen, which "auto" compares with.
+        model: one of `MODELS` except "prony".
+        prony: the best fit of Prony modes, for the comparison of "auto".
         dense: as in `viscoelastic.closed_form`.
     """
     tried = every_model(sweep, model, prony, dense)
@@ -239,7 +239,7 @@ def _compared(sweep: Sweep, tried: list[Fit]) -> list[Content]:
 
 
 def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
-    """Sentences where another model explains the data about as well, or better with numbers that stay free."""
+    """Sentences if another model fits the data about as well, or better but with numbers that they do not determine."""
     best, out = min(tried, key=information_criterion), []
     if information_criterion(best) < information_criterion(chosen) - STRONG:
         apart = information_criterion(chosen) - information_criterion(best)
@@ -262,7 +262,7 @@ def _rival_models(chosen: Fit, tried: list[Fit], able: list[Fit]) -> list[str]:
 
 
 def comparison(fit: Fit) -> list[str]:
-    """Lines with the criterion of each model, best first; none where there was no choice."""
+    """Lines with the criterion of each model, best first; no lines if only one model was fitted."""
     rows = fit.details.get("models_compared", [])
     if len(rows) < 2:
         return []

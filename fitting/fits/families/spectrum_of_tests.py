@@ -24,17 +24,17 @@ from fitting.methods.relaxation_spectrum import GridOfTimes, GridSpectrum
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
-#: Weights of the second differences that are tried, heavy ones first, and iterations of one.
+#: Weights of the second differences that are tried, largest first, and most iterations for each weight.
 WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
-#: Gain of the cost, relative, below which a minimum is found; strength that stands for none, in the unit of the grid.
+#: Relative decrease of the cost at which a search ends; strength in place of 0, in the unit of the grid.
 STILL, NONE = 1e-9, 1e-12
 
 
 class SpectrumFit(NamedTuple):
-    """A spectrum with what the reports of tests ask for."""
+    """A spectrum with all numbers that the reports of tests need."""
 
     kind: Kind
-    model: Maxwell  # few Prony modes that stand for it
+    model: Maxwell  # few Prony modes that represent it
     solution: Solution
     spread: Estimate  # of these modes
     own: Estimate  # equilibrium modulus and strengths
@@ -44,7 +44,7 @@ class SpectrumFit(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _rows_and_slopes(kinds: tuple[str, ...]) -> Callable:
-    """A compiled (x, times, unit, data of every test) -> residuals (m,) and their derivative by x."""
+    """A compiled function: (x, times, unit, data of every test) -> residuals (m,) and their derivative by x."""
 
     def residuals(x, times, unit, data):
         strengths = unit * (x + NONE)
@@ -65,13 +65,13 @@ def _rows_and_slopes(kinds: tuple[str, ...]) -> Callable:
 
 class _Minimum(NamedTuple):
     x: np.ndarray
-    r: np.ndarray  # of the data
+    r: np.ndarray  # residuals of the data
     J: np.ndarray
     converged: bool
 
 
 def _minimum(function: Callable, data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
-    """Least squares with x >= 0 and the smoothness of the grid: tangents from x on, each step halved while it fails."""
+    """Least squares with x >= 0 and the grid's smoothness: Gauss-Newton from x, steps halved until the cost falls."""
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
 
     def at(x):
@@ -101,11 +101,11 @@ def _minimum(function: Callable, data: list, grid: GridOfTimes, x: np.ndarray) -
 def spectrum_of(
     tests: Sequence[Measured], near: Maxwell, noise: np.ndarray
 ) -> tuple[GridSpectrum, GridOfTimes, _Minimum]:
-    """The spectrum of the likeliest grid and weight.
+    """The spectrum for the grid and the weight of smoothness that have the best evidence.
 
     Args:
         tests: one or more.
-        near: Prony modes of about these moduli; strengths are measured in them.
+        near: Prony modes with about the same moduli; these give the unit of each strength.
         noise: relative noise of each test.
     """
     low, high = together.resolved_by(tests)
@@ -134,13 +134,13 @@ def _weighed_parts(tests: Sequence[Measured], noise: np.ndarray) -> list:
 def _as_a_fit(
     tests: Sequence[Measured], grid: GridOfTimes, found: _Minimum, told: GridSpectrum, over: Callable | None = None
 ) -> SpectrumFit:
-    """The spectrum as a fit; `over` makes of its minimum one of residuals over their noise (None: noise is found)."""
+    """The spectrum as a fit; `over` divides the residuals of its minimum by their noise (None: noise is estimated)."""
     low, high = together.resolved_by(tests)
     kept = found.x[1:] > 1e-10 * found.x.max()
     solid = told.equilibrium > 0
     free = np.concatenate([[solid], kept])
     strengths = np.concatenate([[told.equilibrium], told.strengths])[1 - int(solid) :]
-    slopes = (found.J / grid.unit)[:, free] * strengths  # by the logarithms
+    slopes = (found.J / grid.unit)[:, free] * strengths  # by the logarithms of the strengths
     prior = told.prior[:, 1 - int(solid) :] * strengths
 
     def moduli(omega, u):

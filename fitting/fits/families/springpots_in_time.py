@@ -26,9 +26,9 @@ from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
 
-#: Starts of each model, how far the random ones lie from the one that follows the Prony modes, and iterations.
+#: Starts of each model, spread of the random starts around the one from Prony modes, and most iterations.
 STARTS, AROUND, MOST_STEPS = 10, 1.0, 80
-#: An exponent is a logistic function of its number. Beyond this size a start has no slope to leave by.
+#: An exponent is a logistic function of its number. At larger numbers its slope is too small for a search to begin.
 MOST_LOGIT = 2.0
 
 
@@ -36,7 +36,7 @@ class Spans(NamedTuple):
     """Times [s] of the modes that springpots are computed with, and the frequency [rad/s] at which their numbers are
     stated."""
 
-    low: float  # shortest time [s] that is looked at
+    low: float  # shortest time [s] that the tests resolve
     high: float
     times: np.ndarray
     reference: float
@@ -50,7 +50,7 @@ def spans_of(tests: Sequence[Measured]) -> Spans:
 
 @lru_cache(maxsize=16)
 def _residuals_of_tests(kinds: tuple[str, ...]) -> Callable[..., jax.Array]:
-    """(all six numbers, switches, times, reference, data of every test) -> residuals, one test below the other."""
+    """A function: (all six numbers, switches, times, reference, data of every test) -> residuals, test after test."""
 
     def residuals(u, switches, times, reference, data):
         model, rows = springpots.as_modes(u, switches, times, reference), []
@@ -62,7 +62,7 @@ def _residuals_of_tests(kinds: tuple[str, ...]) -> Callable[..., jax.Array]:
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """The model's own numbers u -> residuals (m,) of a relaxation or creep test."""
+    """A function: the model's own numbers u -> residuals (m,) of a relaxation or creep test."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
     spans, residuals = spans_of([test]), _residuals_of_tests((test.kind,))
     data = [together.reported_numbers(test)]
@@ -75,7 +75,7 @@ def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], j
 
 @lru_cache(maxsize=16)
 def _each_model(kinds: tuple[str, ...]) -> Callable[..., Solution]:
-    """The best minimum of each model over its starts (M, S, 6)."""
+    """A function that finds the best minimum of each model from its starts (M, S, 6)."""
     residuals = _residuals_of_tests(kinds)
 
     def minima(starts, switches, *data):
@@ -116,12 +116,12 @@ class _Springpot(NamedTuple):
 
     case: Fractional
     kind: Kind
-    model: Maxwell  # few Prony modes that stand for it
+    model: Maxwell  # few Prony modes that represent it
     solution: Solution
     spread: Estimate  # of the Prony modes
     own: Estimate  # of its own numbers
     sentences: tuple[str, ...]
-    error: float  # of the few modes over the band
+    error: float  # largest relative error of these modes over the band
 
 
 def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: bool) -> _Springpot:
@@ -137,7 +137,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
 
     def moduli(omega):
         G = np.asarray(at(solution.u, jnp.asarray(omega)))
-        return G.real + 1j * np.maximum(G.imag, 1e-12 * np.abs(G))  # a model that ran away may have no loss left
+        return G.real + 1j * np.maximum(G.imag, 1e-12 * np.abs(G))  # a model whose fit diverged may have no loss left
 
     made = as_prony_modes.convert(moduli, 1 / spans.high, 1 / spans.low, case.solid)
     kind = Kind(case.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), case.names, case.units, values)
@@ -146,7 +146,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
     dense = springpots.as_modes(numbers, jnp.asarray(case.switches), times, spans.reference)
     storage, loss = generalised_maxwell.moduli(Maxwell(*(np.asarray(v) for v in dense)), made.omega)
     apart = float(np.max(np.abs((storage + 1j * loss) / moduli(made.omega) - 1)))
-    for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes that computed it")):
+    for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes used in the fit")):
         if error > as_prony_modes.ALLOWED:
             sentences.append(f"{what} follow the model {case.name} to {100 * error:.2g} % only: take another --model")
     own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
@@ -188,7 +188,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     Args:
         test: data.
         model: one of `models.MODELS`.
-        modes: of Prony modes.
+        modes: number of Prony modes, or "auto".
     """
     prony = time_tests.fit(test, modes)
     if model == "prony":
@@ -227,7 +227,7 @@ def _compared_models(tried: Sequence, criterion: Callable, data: uncertainty.Ban
     return sorted(rows, key=lambda row: row["above_the_lowest"])
 
 
-#: Fields that hold seconds.
+#: Fields that are times in seconds.
 TIMES = ("run_time", "compile_time")
 
 
@@ -242,7 +242,7 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 
 def _left_free(fit: TimeFit | Together) -> list[str]:
-    """A sentence on numbers that the data leave free. Those of a spectrum never are: its prior holds them."""
+    """A sentence on numbers that the data do not determine. A spectrum has none, because it has a prior."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, models.determined(fit.parameters), strict=True) if not ok]
@@ -308,7 +308,7 @@ def choose_together(
 
 
 def _shares_of_springpots(fit: Together) -> list[Share]:
-    """Errors of the model's own numbers without each test, and what a fit to each test alone leaves."""
+    """Errors of the model's own numbers without each test, and the misfit of a fit to each test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
     spans, parts = spans_of(fit.tests), [together.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None

@@ -1,1 +1,1 @@
-"""What a fit says of its own errors."""
+"""Errors that a fit states about itself: ends of the band, choice of the model, total error."""

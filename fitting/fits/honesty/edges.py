@@ -13,7 +13,7 @@ from fitting.readers.rheometer import Sweep, some
 from liverjax.core.struct import Content
 
 HALF_DECADE = float(np.sqrt(10))
-#: Names of the two parts that are left out, and of the moduli in words.
+#: Name of the check of the data in its sentences, and names of the two repeated fits in the report.
 KRAMERS_KRONIG = "Kramers-Kronig"
 PARTS = ("without_first_half_decade", "without_last_half_decade")
 
@@ -57,7 +57,7 @@ def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:
 def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
     """Change of each parameter, by name, without the first and without the last half decade.
 
-    None in place of a part where too few points are left. For a spectrum, only the equilibrium modulus is compared.
+    The entry is None if too few points are left. For a spectrum, only the equilibrium modulus is compared.
     """
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
@@ -79,7 +79,7 @@ def values(fit: Fit) -> dict[str, tuple[float, float]]:
 
 
 def moved(fit: Fit) -> set[str]:
-    """Names of the parameters that one half decade moves by more than their standard error."""
+    """Names of the parameters that change by more than their standard error without one of the half decades."""
     out = set()
     for part in PARTS:
         for name, change in (fit.details.get("band_sensitivity", {}).get(part) or {}).items():
@@ -107,7 +107,7 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         starts = springpots.starting_points(part)
         starts[-1, list(model.free)] = np.asarray(fit.solution.u)
         best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
-        # The program is that of all points, some without weight: it is there already.
+        # The program compiled for all points serves again: points that are left out have no weight.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
         data = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, scales)
         u = viscoelastic.timed(best, starts, np.tile(model.switches, (len(starts), 1)), *data)[0].u

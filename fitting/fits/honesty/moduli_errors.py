@@ -1,8 +1,8 @@
-"""Errors of the fitted moduli, the choice of the model among them.
+"""Errors of the fitted moduli, with the error from the choice of the model.
 
-Models that explain the data about as well have moduli of their own. Each weighs by its Akaike weight, and the
-differences between them are part of the error (Buckland, Burnham and Augustin 1997, Biometrics 53, 603; for few data
-Hurvich and Tsai 1989, Biometrika 76, 297).
+Models that explain the data about equally well differ in their moduli. Each gets its Akaike weight, and the differences
+between the models are part of the error (Buckland, Burnham and Augustin 1997, Biometrics 53, 603; for few data Hurvich
+and Tsai 1989, Biometrika 76, 297).
 """
 
 import jax.numpy as jnp
@@ -21,10 +21,10 @@ NEGLIGIBLE = 1e-4
 def fitted_moduli(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     """G' then G'' (2n,) [Pa] of a fit in closed form, by the delta method.
 
-    The errors are those of noise, of gap and instrument where the fit knows them, and of the choice of the model.
+    The errors come from noise, from gap and instrument if the fit has their errors, and from the choice of the model.
 
     Args:
-        fit: with `rivals`, where it was chosen from several models.
+        fit: the fit; `rivals` has the other models if it was chosen from several.
         omega: angular frequencies (n,) [rad/s].
         noise_given: whether the data have standard deviations.
     """
@@ -50,7 +50,7 @@ def model_weights(fit: Fit) -> dict[str, float]:
 
 
 def _weighed(fit: Fit) -> list[tuple[float, Fit]]:
-    """The rivals that weigh anything, with their weights."""
+    """The rivals whose weight is above `NEGLIGIBLE`, with their weights."""
     evidence = np.array([_akaike(own) for own in (fit, *fit.rivals)])
     shares = np.exp(-0.5 * (evidence - evidence.min()))
     shares /= shares.sum()
@@ -64,7 +64,7 @@ def _akaike(fit: Fit) -> float:
 
 
 def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
-    """What one standard deviation of each error that all points share changes (s, 2n) [Pa]: gap, instrument."""
+    """Change (s, 2n) [Pa] of the moduli by one standard deviation of each shared error (gap, instrument)."""
     shared, n = fit.uncertainty.shared, fit.modes
     if shared is None:
         return np.zeros((0, 2 * len(omega)))

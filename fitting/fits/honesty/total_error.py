@@ -10,7 +10,7 @@ from fitting.fits.honesty import edges
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.viscoelastic import Fit
 
-#: What is commonly known of plates [m]: standard deviations of the gap that an instrument states, and of the radius.
+#: Usual standard deviations [m] of the gap that an instrument states, and of the radius of the plates.
 GAP, RADIUS = 50e-6, 10e-6
 
 
@@ -26,7 +26,8 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
-    The share of the band's ends is the larger of the two changes minus the standard error, or 0.
+    The share of the band's ends is the larger of the two changes; the square of the standard error is subtracted from
+    its square.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -60,7 +61,7 @@ def _moduli(fit: Fit) -> set[str]:
 
 
 def _of_modes(fit: Fit, moved: np.ndarray) -> dict[str, float]:
-    """Size of the changes (P,) of G0, ratios and times, then that of the equilibrium modulus."""
+    """Size of the changes `moved` (P,) of G0, ratios and times, and of that of the equilibrium modulus, by name."""
     n, G0, ratios = fit.modes, fit.uncertainty.values[0], fit.uncertainty.values[1 : fit.modes + 1]
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
     out["equilibrium_modulus"] = abs(float(moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()))

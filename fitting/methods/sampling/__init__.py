@@ -1,1 +1,1 @@
-"""Samples of a posterior, and whether they are enough."""
+"""Samples of a posterior, and a check whether there are enough of them."""

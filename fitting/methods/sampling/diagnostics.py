@@ -7,7 +7,7 @@ import numpy as np
 
 
 def r_hat(draws: np.ndarray) -> float:
-    """The larger one of bulk and tail R-hat of one number, draws (chains, N); near 1 where the chains agree."""
+    """The larger one of bulk and tail R-hat of one number, draws (chains, N); near 1 if the chains agree."""
     half = draws.shape[1] // 2
     split = np.concatenate([draws[:, :half], draws[:, -half:]])
     folded = np.abs(split - np.median(split))
@@ -16,7 +16,7 @@ def r_hat(draws: np.ndarray) -> float:
 
 def _normal_scores(draws: np.ndarray) -> np.ndarray:
     import scipy.special
-    import scipy.stats  # half a second, which a fit without samples need not wait
+    import scipy.stats  # takes half a second, and only fits with samples need it
 
     ranks = scipy.stats.rankdata(draws, method="average").reshape(draws.shape)
     return scipy.special.ndtri((ranks - 0.375) / (draws.size + 0.25))

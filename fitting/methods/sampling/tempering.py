@@ -1,11 +1,11 @@
-"""Samples of a posterior by tempering: particles of the prior, led to the posterior in steps.
+"""Samples of a posterior by tempering: particles are drawn from the prior and moved to the posterior in steps.
 
-The likelihood is raised to a power that grows from 0 to 1. Each step resamples the particles by the weights that it
-gives them, and moves them by differential evolution until they are nearly independent of where they were (Del Moral,
-Doucet and Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18, 435). Runs
-begin at the prior. So they agree only if each has found the whole posterior, with its tails and all of its maxima. It
-needs only a
-density that takes many points at once: no derivative, nothing to tune or to compile.
+The likelihood is raised to a power that grows from 0 to 1. Each step gives the particles weights, resamples them by
+these weights, and moves them by differential evolution until they are nearly independent of their earlier positions
+(Del Moral, Doucet and Jasra 2006, J. R. Stat. Soc. B 68, 411; ter Braak and Vrugt 2008, Statistics and Computing 18,
+435). Runs begin at the prior. So they agree only if each has found the whole posterior, with its tails and all of its
+maxima. The method needs only a density that can be computed at many points at once: there is no derivative, and nothing
+to tune or to compile.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-#: Independent runs, and particles of each at least.
+#: Number of independent runs, and smallest number of particles in each.
 CHAINS, FEWEST = 4, 500
-#: Part of the particles that a step of the power leaves effective.
+#: Part of the particles that is effective after a step of the power.
 EFFECTIVE = 0.5
-#: Correlation with the places before a step at which these are forgotten, then that at the end; most moves of a step.
+#: Correlation with the positions before a step at which its moves end; that of the last step; most moves of a step.
 FORGOTTEN, FORGOTTEN_LAST, MOST = 0.6, 0.2, 30
-#: Part of the moves that go the whole difference of two particles, which leads from one maximum to another.
+#: Part of the moves by the whole difference of two particles, which can lead from one maximum to another.
 LONG = 0.1
 
 
@@ -37,10 +37,10 @@ class Chains(NamedTuple):
 
     draws: np.ndarray  # (CHAINS, N, P)
     log_evidence: np.ndarray  # (CHAINS,) log of the mean likelihood over the prior
-    steps: int  # of the power, of all runs
-    moves: int  # of each particle, of all runs
-    acceptance: float  # at the end
-    remembered: float  # largest correlation of the draws with the places before the last moves
+    steps: int  # number of steps of the power, in all runs together
+    moves: int  # number of moves of each particle, in all runs together
+    acceptance: float  # accepted part of the last moves
+    remembered: float  # largest correlation of the draws with the positions before the last moves
 
 
 class _Particles(NamedTuple):
@@ -58,7 +58,7 @@ def run(density: Density, count: int, seed: int = 0) -> Chains:
     Args:
         density: the posterior.
         count: draws that each run keeps.
-        seed: of the generators; the same seed gives the same draws.
+        seed: seed of the random generators; the same seed gives the same draws.
     """
     found = [
         _run_particles(density, max(FEWEST, count + count % 2), np.random.default_rng([seed, k])) for k in range(CHAINS)
@@ -92,7 +92,7 @@ def _finite_only(values: np.ndarray) -> np.ndarray:
 
 
 def _rise(likelihood: np.ndarray, left: float) -> float:
-    """How much the power may grow, by bisection on the effective number of particles."""
+    """Largest increase of the power, by bisection on the effective number of particles."""
 
     def effective(rise: float) -> float:
         w = np.exp(rise * (likelihood - likelihood.max()))
@@ -117,7 +117,7 @@ def _resampled(log_weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _moved(
     density: Density, start: _Particles, power: float, limit: float, rng: np.random.Generator
 ) -> tuple[_Particles, int, float, float]:
-    """The particles after moves that do not change the tempered density; then moves, acceptance and correlation."""
+    """The particles after moves that keep the tempered density; then number of moves, acceptance and correlation."""
     half = len(start.u) // 2
     halves = slice(0, half), slice(half, 2 * half)
     now = _Particles(*(field.copy() for field in start))
@@ -134,7 +134,7 @@ def _half_moved(
 ) -> float:
     """Move the first half in place by differences of the second; return the accepted fraction.
 
-    These differences do not depend on the particles that they move, so the density stays as it is.
+    These differences do not depend on the particles that they move, so the moves do not change the density.
     """
     own, other = now.u[halves[0]], now.u[halves[1]]
     half, size = own.shape
@@ -144,7 +144,7 @@ def _half_moved(
     reach = np.where(rng.random(half) < LONG, 1.0, usual)[:, None]
     trial = own + reach * (other[first] - other[second]) + 1e-6 * rng.standard_normal(own.shape)
     prior, likelihood = density.log_prior(trial), _finite_only(density.log_likelihood(trial))
-    with np.errstate(invalid="ignore"):  # a place without likelihood is not gone to
+    with np.errstate(invalid="ignore"):  # a point without likelihood is refused
         gain = power * (likelihood - now.likelihood[halves[0]]) + prior - now.prior[halves[0]]
     take = np.log(rng.random(half)) < np.where(np.isnan(gain), -np.inf, gain)
     for field, value in zip(now, (trial, likelihood, prior), strict=True):

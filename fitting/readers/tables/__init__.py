@@ -1,1 +1,1 @@
-"""Tables in files: lines, headings, cells, and the moduli of a sweep from whatever columns there are."""
+"""Tables in files: lines, headings, cells, and the moduli of a sweep from the columns that a file has."""

@@ -13,10 +13,10 @@ NAMES = {"storage": "G'", "loss": "G''", "complex": "|G*|", "phase": "the phase"
 
 
 def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str]) -> np.ndarray:
-    """A column (n,) in rad/s, Pa, rad or 1; moduli of tension as they are.
+    """A column (n,) converted to rad/s, Pa, rad or 1; moduli of tension are not divided by 3 here.
 
     Raises:
-        InputError: a unit that is not known, or that leaves the meaning open.
+        InputError: the unit is not known, or its meaning is ambiguous.
     """
     quantity, unit = column.quantity.removesuffix("_sd"), column.unit
     if quantity == "tangent":
@@ -53,7 +53,7 @@ def _of_frequency(path: str, column: Column, unit: str) -> float:
 
 
 def fault_of(column: Column, written: float, value: float, smallest: float, largest: float) -> tuple[str, str] | None:
-    """The fault of a value in SI, in the file's own words, and the remedy; None where there is none."""
+    """The fault of a value (in SI), quoted as the file writes it, and the remedy; None if it has no fault."""
     if not np.isfinite(value):
         if np.isnan(written):
             return f"{column.name} is empty", "fill it in or remove the line"
@@ -85,9 +85,8 @@ MODULI = ("storage", "loss", "complex")
 
 
 def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
-    """Storage and loss moduli [Pa] (n,), and their deviations where the file has them, of SI columns.
-
-    Deviations of |G*|, phase or tan(delta) are carried over to first order, taken as independent.
+    """Storage and loss moduli [Pa] (n,), and their deviations if the file has them, from SI columns. Deviations of
+    |G*|, phase or tan(delta) are converted to first order and assumed to be independent.
     """
     pair = pair_of(values)
     assert pair is not None
@@ -97,7 +96,7 @@ def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[st
     delta = np.arctan(angle) if pair[1] == "tangent" else angle
     s, c = np.sin(delta), np.cos(delta)
     notes.append(f"G' and G'' are computed from {NAMES[pair[0]]} and {NAMES[pair[1]]}")
-    # Each modulus is the measured one times a function of the angle; then its derivative by the angle.
+    # Each modulus is the measured one times a function of the angle: this function, then its derivative.
     by_angle = {
         "complex": ((c, -s), (s, c)),
         "storage": ((1 + 0 * c, 0 * c), (s / c, 1 / c**2)),

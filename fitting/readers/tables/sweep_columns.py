@@ -19,32 +19,32 @@ PAIRS = (
 NEEDED = {
     "frequency": "frequency_Hz or angular_frequency_rad_s",
     "storage": "storage_modulus_Pa",
-    "loss": "loss_modulus_Pa (or phase_angle_deg or tan_delta beside the other modulus)",
+    "loss": "loss_modulus_Pa (or phase_angle_deg or tan_delta with the other modulus)",
 }
 
 
 class Column(NamedTuple):
-    """A column that is one of a sweep's."""
+    """A column of a file that belongs to a sweep."""
 
-    place: int  # in the line, from 0
+    place: int  # index in the line, from 0
     name: str
     quantity: str  # frequency, storage, loss, complex, phase, tangent; the moduli and angles also with "_sd"
     unit: str | None
 
 
 def pair_of(quantities: Collection[str]) -> tuple[str, str] | None:
-    """The pair that tells the moduli; None where there is none."""
+    """The pair of quantities that gives both moduli; None if there is none."""
     return next((pair for pair in PAIRS if set(pair) <= set(quantities)), None)
 
 
 def is_complete(columns: list[Column]) -> bool:
-    """Whether the columns are a sweep."""
+    """Whether the columns are enough for a sweep."""
     quantities = {c.quantity for c in columns}
     return "frequency" in quantities and pair_of(quantities) is not None
 
 
 def first_missing(columns: list[Column]) -> str:
-    """The first of `NEEDED` that is not there."""
+    """The first quantity of `NEEDED` that is missing."""
     quantities = {c.quantity for c in columns}
     if "frequency" not in quantities:
         return "frequency"
@@ -57,12 +57,13 @@ def is_angular(column: Column) -> bool:
 
 
 def header_columns(cells: list[str]) -> list[Column]:
-    """Columns by quantity. The first column with a known unit comes first, rad/s before Hz; the others follow, for
-    comparison. Where they are a sweep, columns that it does not need are left out."""
+    """The columns of a sweep. For each quantity the first column with a known unit comes first, rad/s before Hz; the
+    others follow, for comparison. If they are enough for a sweep, columns that it does not need are left out.
+    """
     found = [(k, cell, quantity_of(cell)) for k, cell in enumerate(cells)]
     columns = [Column(k, cell.strip(), *q) for k, cell, q in found if q is not None]
     shear = {c.quantity for c in columns if not is_tensile(c)}
-    if "frequency" in shear and pair_of(shear):  # G before E where a file has both
+    if "frequency" in shear and pair_of(shear):  # G before E if a file has both
         columns = [c for c in columns if not is_tensile(c)]
     pair = pair_of({c.quantity for c in columns})
     if pair:
@@ -81,11 +82,11 @@ _TEMPERATURE = {"c": (1.0, 273.15), "k": (1.0, 0.0), "f": (5 / 9, 459.67 * 5 / 9
 
 
 def condition_columns(cells: list[str], units: list[str]) -> dict[str, tuple[int, float, float]]:
-    """Place, factor and offset to SI of `temperature` [K] and `shift_factor`, of the headings that name them.
+    """Place, factor and offset to SI of `temperature` [K] and `shift_factor`, from the headings that name them.
 
     Args:
         cells: headings.
-        units: of a line of their own, or nothing.
+        units: units from a line of their own; may be empty.
     """
     found: dict[str, tuple[int, float, float]] = {}
     for k, cell in enumerate(cells):

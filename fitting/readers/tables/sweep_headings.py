@@ -1,13 +1,13 @@
-"""What the heading of a column says in a frequency sweep: a quantity and its unit, in the words of instruments."""
+"""Meaning of a column's heading in a frequency sweep: a quantity and its unit, in the words that instruments use."""
 
 import re
 
 from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, TANGENT_UNITS
 
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
-#: Words that say nothing more: kinds of the same quantity, and symbols that stand beside a name.
+#: Words that add nothing: kinds of the same quantity, and symbols after a name.
 IDLE_WORDS = {"standard", "mean", "value", "g'", "g''", "g*", "e'", "e''", "e*", "delta", "omega", "f", "w"}
-#: First words of a heading, and the quantity. Those of `UNCERTAIN` count only with a unit that is known, or with none.
+#: First words of a heading, and the quantity. Words of `UNCERTAIN` count only with a known unit, or without a unit.
 WORDS = {
     "frequency": (
         *("angular frequency", "ang frequency", "angular freq", "ang freq", "angular velocity", "angular", "omega"),
@@ -41,12 +41,12 @@ _LONGEST_FIRST = sorted(
     ((words.split(), quantity) for quantity, names in WORDS.items() for words in names),
     key=lambda row: -len(row[0]),
 )
-#: Characters that stand for others.
+#: Typographic characters, and the plain ones that replace them.
 _PLAIN = {"′": "'", "’": "'", "`": "'", "´": "'", "″": "''", "”": "''", '"': "''", "δ": "delta", "ω": "omega"}
 
 
 def known_unit(quantity: str, unit: str | None) -> bool:
-    """Whether the unit can be converted; a column without one takes the default, if it has one."""
+    """Whether the unit can be converted; a column without a unit gets the default unit."""
     if unit is None:
         return True
     if quantity == "frequency":

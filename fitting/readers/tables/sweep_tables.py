@@ -19,19 +19,19 @@ from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, mea
 from fitting.readers.units import MODULUS_UNITS
 from liverjax.core.errors import InputError
 
-#: What begins a line that is no data.
+#: First characters of a comment line.
 COMMENTS = ("#", "%")
 
 
 class Table(NamedTuple):
     """A table of a file, before its units are converted."""
 
-    name: str  # what the file calls it, may be empty
+    name: str  # name in the file, may be empty
     columns: list[Column]
     rows: list[list[float]]  # in the order of the columns
-    numbers: list[int]  # of the lines in the file
-    raw: dict[str, np.ndarray]  # what the instrument measured, one value a row
-    strain_unit: str = ""  # of a column of strain, as the file states it
+    numbers: list[int]  # line numbers in the file
+    raw: dict[str, np.ndarray]  # raw measurements of the instrument, one value per row
+    strain_unit: str = ""  # unit of the strain column, as the file states it
 
     @property
     def frequencies(self) -> int:
@@ -47,8 +47,9 @@ def choose_table(
     what: str = "frequencies",
     size: Callable[[Table], int] = lambda table: table.frequencies,
 ) -> tuple[int, list[str]]:
-    """Place of the table to read, and a note where there are several: the one with most frequencies, or what `size`
-    counts."""
+    """Index of the table to read, and a note if there are several. Without `wanted` it is the table with most
+    frequencies, or with the largest `size`.
+    """
     names = [f"{k} {t.name!r}" if t.name else str(k) for k, t in enumerate(tables, 1)]
     if wanted is not None:
         k = _named(path, tables, names, wanted)
@@ -63,7 +64,7 @@ def choose_table(
 
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
-    """Place of the table with this number or name, or of the only table whose name contains the text."""
+    """Index of the table with this number or name, or of the only table whose name contains the text."""
     if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
         return int(wanted) - 1
     sought = wanted.strip().lower()
@@ -77,7 +78,7 @@ def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int
 
 
 def tables_of(path: str, lines: list[str]) -> list[Table]:
-    """Every table that holds numbers; `InputError` saying what is missing where there is none."""
+    """Every table that has numbers; if there is none, an `InputError` says what is missing."""
     for uncomment in (False, True):  # np.savetxt writes its header as a comment
         tables, headers = _search(path, [line.lstrip("#% ") for line in lines] if uncomment else lines)
         if tables:
@@ -103,7 +104,7 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
 
 def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
     """Tables with numbers, and the line numbers of all complete headers."""
-    tables, headers, k, free = [], [], 0, 0  # `free`: from where on lines belong to no table
+    tables, headers, k, free = [], [], 0, 0  # `free`: first line after the last table
     while k < len(lines):
         line = lines[k]
         k += 1
@@ -131,8 +132,8 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, strain and temperature in SI of the rows of a table; a column with a gap is left out,
-    but for the strain.
+    """Raw torque, angle, phase, strain and temperature in SI for the rows of a table; a column with a gap is left out,
+    except for the strain.
 
     `sign` is the table's decimal sign.
     """
@@ -140,7 +141,7 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
         values = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
-        # Points without a strain are left out by who needs it; of what else the instrument measured all are needed.
+        # A reader that needs the strain leaves out points without it; other columns must have all values.
         if all(v is not None and (np.isfinite(v) or quantity == "strain") for v in values):
             found[quantity] = factor * np.array(values, float) + offset
     return found
@@ -159,7 +160,7 @@ def _title(above: list[str]) -> str:
 
 
 def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: str) -> tuple[list[Column], int]:
-    """Instruments put units in a line of their own, within the next two."""
+    """The columns with the units of the unit line, if one of the next two lines is one; and the line after it."""
     for ahead in range(k, min(k + 2, len(lines))):
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
@@ -172,7 +173,7 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
 
 
 def _rows_below(path, columns, lines, k, delimiter, width):
-    """Rows of numbers below a header, their line numbers, and where to go on. An empty cell is NaN."""
+    """Rows of numbers below a header, their line numbers, and the line after them. An empty cell is NaN."""
     needed = [c for c in columns if not c.quantity.endswith("_sd")]
     kept, numbers = [], []
     while k < len(lines):
@@ -187,7 +188,7 @@ def _rows_below(path, columns, lines, k, delimiter, width):
         if words and (
             not kept or line.startswith("[") or delimiter == "\t" or not _goes_on(lines, k, delimiter, needed)
         ):
-            break  # a title taken for a header, or the end of this table
+            break  # the header was only a title, or this table ends
         k += 1
         if len([c for c in cells if c]) > width:
             raise InputError(
@@ -203,7 +204,7 @@ def _is_words(cells: list[str], needed: list[Column]) -> bool:
 
 
 def _goes_on(lines: list[str], k: int, delimiter: str, needed: list[Column]) -> bool:
-    """Whether numbers of the same table follow line k, which is words."""
+    """Whether numbers of the same table follow line k, which has words only."""
     for line in lines[k:]:
         if _complete(line):
             return False

@@ -51,7 +51,7 @@ def _decoded(path: Path, data: bytes) -> str:
 
 def find_delimiter(line: str) -> str:
     """Delimiter of the cells of a line: the most frequent of tab, semicolon, comma and bar, else spaces."""
-    plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| part no cells
+    plain = re.sub(r"\|\s*\w+\s*\*?\s*\|", "", line) if "*|" in line else line  # the bars of |G*| separate no cells
     best = max("\t;,|", key=plain.count)
     return best if best in plain else ("  " if "  " in line.strip() else " ")
 
@@ -69,15 +69,15 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-#: What stands in a cell without a measurement.
+#: Texts of a cell without a measurement.
 EMPTY = {"", "-", "--", "---", "–", "—", "*", "n/a", "#n/a", "na", "n.a.", "none", "null", "nan", "?"}
-#: Spaces and apostrophes that part the thousands of a number, and numbers by what parts their thousands.
+#: Spaces and apostrophes that separate thousands, and patterns of numbers by their separator of thousands.
 _GROUPED = re.compile(r"(?<=\d)['’ \u00a0\u2009\u202f](?=\d{3}(\D|$))")
 _THOUSANDS = {sign: re.compile(rf"[-+]?[1-9]\d{{0,2}}(\{sign}\d{{3}})+(\{other}\d*)?") for sign, other in (",.", ".,")}
 
 
 def decimal_sign(cells: Iterable[str]) -> str | None:
-    """The decimal sign of a table, "." or ",", as far as its cells tell; the other sign then parts thousands."""
+    """The decimal sign of a table, "." or ",", None if its cells do not show it; the other sign separates thousands."""
     found = set()
     for cell in cells:
         text = _GROUPED.sub("", cell.strip().strip('"').lower())
@@ -95,7 +95,7 @@ def to_number(text: str, delimiter: str, sign: str | None = None) -> float | Non
 
     Args:
         text: a cell.
-        delimiter: of the cells.
+        delimiter: delimiter of the cells.
         sign: `decimal_sign` of the table; if it is None, a single comma or point is the decimal sign.
     """
     text = text.strip().strip('"').strip()
@@ -115,5 +115,5 @@ def to_number(text: str, delimiter: str, sign: str | None = None) -> float | Non
 
 
 def means_nothing(cells: Iterable[str]) -> bool:
-    """Whether no cell is a number or empty: a line of words."""
+    """Whether no cell begins like a number: a line of words."""
     return not any(re.match(r"[-+]?[.,]?\d|nan|[-+]?inf", cell.strip('" ').lower()) for cell in cells)

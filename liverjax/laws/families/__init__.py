@@ -1,1 +1,1 @@
-"""Families of material laws, one a file."""
+"""Families of material laws, one per file."""

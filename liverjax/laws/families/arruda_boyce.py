@@ -5,7 +5,7 @@ from typing import ClassVar
 from liverjax.core.struct import Number, param, static, struct
 from liverjax.laws.base import Law
 
-#: Series coefficients of the inverse Langevin function; the chapter's print lacks the numerators (11, 19, 519).
+#: Series coefficients of the inverse Langevin function; the printed chapter lacks the numerators (11, 19, 519).
 COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 
 
@@ -13,7 +13,7 @@ COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 class ArrudaBoyce(Law):
     """W = mu sum_k c_k / N^(k-1) (Ibar1^k - 3^k) + U(J), k = 1 … 5.
 
-    Chapter, Table 1 with its numerators mended; Arruda and Boyce 1993. mu = n k_B Theta, N = `chain_length`.
+    Chapter, Table 1 with corrected numerators; Arruda and Boyce 1993. mu = n k_B Theta, N = `chain_length`.
     """
 
     mu: Number = param("Pa", "n k_B Theta", above=0.0, typical=730.0)

@@ -16,14 +16,14 @@ class Bogen(Law):
     Chapter, Table 1 (with - 3 for its - 1); Bogen 1987. One term of Ogden's law.
     """
 
-    mu: Number = param("Pa", "mu; of alpha's sign for a stable law", typical=400.0)
+    mu: Number = param("Pa", "mu; it must have alpha's sign for a stable law", typical=400.0)
     alpha: Number = param("1", "exponent", nonzero=True, typical=4.0)
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """alpha."""
+        """The exponent alpha."""
         return (self.alpha,)
 
     def stretch_energy(self, X):
@@ -31,7 +31,7 @@ class Bogen(Law):
         return self.mu / self.alpha * X
 
     def stretch_derivatives(self, X):
-        """mu/alpha, 0."""
+        """First derivative mu/alpha; the second is 0."""
         return (self.mu / self.alpha,), {}
 
     def shear_modulus(self):

@@ -55,20 +55,20 @@ class Costa(Law):
         return S, GreenModuli(normal, tuple(0.5 * s * w for w in b[3:]), 2 / s)
 
     def shear_modulus(self):
-        """Mean over all shears (Voigt's), c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
+        """Voigt's mean over all shears, c (b_ff + b_ss + b_nn)/15 + c (b_fs + b_fn + b_sn)/10 [Pa]."""
         b = self._weights()
         return self.c * (sum(b[:3]) / 15 + sum(b[3:]) / 10)
 
     def bulk_modulus(self):
-        """Voigt's: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
+        """Voigt's mean: bulk + c (b_ff + b_ss + b_nn)/9 [Pa]."""
         return (0.0 if self.bulk is None else self.bulk) + self.c * sum(self._weights()[:3]) / 9
 
     def check(self):
-        """InputError where a direction has no length or the sheet lies along the fibre."""
+        """Raise `InputError` if a direction has no length or the sheet lies along the fibre."""
         f, s = np.asarray(self.fibre, float), np.asarray(self.sheet, float)
         if f.shape[-1:] != (3,) or s.shape[-1:] != (3,):
             raise InputError(
-                f"law costa: fibre and sheet have shapes {f.shape} and {s.shape}: give (3,) or one row of 3 an element"
+                f"law costa: fibre and sheet have shapes {f.shape} and {s.shape}: give (3,) or a row of 3 per element"
             )
         size = np.linalg.norm(f, axis=-1) * np.linalg.norm(s, axis=-1)
         if np.any(np.linalg.norm(np.cross(f, s), axis=-1) <= 1e-9 * size):

@@ -23,7 +23,7 @@ class Logarithmic(Law):
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """alpha."""
+        """The exponent alpha."""
         return (self.alpha,)
 
     def stretch_energy(self, X):

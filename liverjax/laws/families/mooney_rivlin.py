@@ -15,7 +15,7 @@ _POWERS = {"c10": (1, 0), "c01": (0, 1), "c20": (2, 0), "c11": (1, 1), "c02": (0
 
 
 def _monomial(coefficient: float, *factors: tuple[Any, int]) -> Number:
-    """coefficient * prod x^n without a power of zero (whose derivative is not a number)."""
+    """coefficient * prod x^n by multiplication, since the derivative of x**0 is not a number at x = 0."""
     value = coefficient
     for x, n in factors:
         for _ in range(n):
@@ -44,7 +44,7 @@ class MooneyRivlin(Law):
     invariants: ClassVar = ("I1", "I2", "J")
 
     def terms(self):
-        """Coefficient and powers of every monomial that is there."""
+        """Coefficient and powers of every monomial whose coefficient is given."""
         return [(getattr(self, name), i, j) for name, (i, j) in _POWERS.items() if getattr(self, name) is not None]
 
     def isochoric_energy(self, I1, I2):

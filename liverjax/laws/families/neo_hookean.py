@@ -25,7 +25,7 @@ class NeoHookean(Law):
         return 0.5 * self.mu * (I1 - 3)
 
     def isochoric_derivatives(self, I1, I2):
-        """Constant slope."""
+        """A constant first derivative; the second is 0."""
         return {"I1": 0.5 * self.mu}, {}
 
     def shear_modulus(self):

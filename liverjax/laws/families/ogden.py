@@ -15,18 +15,18 @@ from liverjax.laws.base import Law
 class Ogden(Law):
     """W = sum_k mu_k/alpha_k (Xi(alpha_k) - 3) + U(J).
 
-    Chapter, Table 1; Ogden 1972. Others write mu_k/alpha_k^2: their mu_k is alpha_k times the one here. Stable for
-    every stretch where each mu_k alpha_k > 0.
+    Chapter, Table 1; Ogden 1972. Others write mu_k/alpha_k^2: their mu_k is alpha_k times the one here. The law is
+    stable for every stretch if each mu_k alpha_k > 0.
     """
 
-    mu: Sequence[float] | Array = param("Pa", "mu_k, one a term", each=True, typical=(700.0, -40.0))
-    alpha: Sequence[float] | Array = param("1", "alpha_k, one a term", nonzero=True, each=True, typical=(2.5, -4.0))
+    mu: Sequence[float] | Array = param("Pa", "mu_k, one per term", each=True, typical=(700.0, -40.0))
+    alpha: Sequence[float] | Array = param("1", "alpha_k, one per term", nonzero=True, each=True, typical=(2.5, -4.0))
     bulk: Number = param("Pa", "bulk modulus", above=0.0, typical=7700.0)
     volumetric: str = static(default="quadratic", about="quadratic, log or simo")
     invariants: ClassVar = ("stretches", "J")
 
     def exponents(self):
-        """alpha_k."""
+        """The exponents alpha_k."""
         return tuple(self.alpha)
 
     def stretch_energy(self, *X):
@@ -42,6 +42,6 @@ class Ogden(Law):
         return sum(m * a for m, a in zip(self.mu, self.alpha, strict=True)) / 2
 
     def check(self):
-        """InputError where terms do not pair."""
+        """Raise `InputError` if the numbers of mu and alpha differ."""
         if len(self.mu) != len(self.alpha):
-            raise InputError(f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one of each a term")
+            raise InputError(f"law ogden has {len(self.mu)} mu and {len(self.alpha)} alpha: give one each per term")

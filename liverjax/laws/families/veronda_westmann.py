@@ -1,4 +1,4 @@
-"""Veronda-Westmann: an exponential of the first invariant beside the second."""
+"""Veronda-Westmann: an exponential of the first invariant, and a linear term of the second."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from liverjax.laws.base import Law
 class VerondaWestmann(Law):
     """W = c1 (exp(c2 (Ibar1 - 3)) - 1) - c1 c2/2 (Ibar2 - 3) + U(J).
 
-    Veronda and Westmann 1970; the second term of the chapter's Table 1 has the units of a number.
+    Veronda and Westmann 1970; in the chapter's Table 1 the second term lacks the unit of an energy.
     """
 
     c1: Number = param("Pa", "scale of the exponential", above=0.0, typical=350.0)

@@ -1,1 +1,1 @@
-"""Stress and stiffness of one deformation gradient, by kind of law."""
+"""Stress and stiffness at one deformation gradient, one module per kind of law."""

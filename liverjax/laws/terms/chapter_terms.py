@@ -1,7 +1,8 @@
 """Stress and stiffness as the chapter writes them (section 4.1.2): six terms for every product g^k(I1, I2) h^k(J).
 
 A documented variant: `liverjax.laws.terms.invariant_terms` sums the scalars over k first and gives the same numbers to
-roundoff at a cost that does not grow with the number of products. `liverjax.laws.products` has the laws.
+roundoff at a cost that does not grow with the number of products. `liverjax.laws.products` writes the laws as such
+products.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -56,7 +57,7 @@ def _term(k: products.Product, I1: Number, I2: Number, J: jax.Array) -> _Term:
     c, i, j, p = k
 
     def g(a: int, b: int) -> Number:
-        """The a-th derivative by I1, the b-th by I2."""
+        """Derivative of g, of order a by I1 and of order b by I2."""
         factor = (1, i, i * (i - 1))[a] * (1, j, j * (j - 1))[b]
         return 0.0 if factor == 0 else c * factor * _power(I1, i - a) * _power(I2, j - b)
 
@@ -114,7 +115,7 @@ class Layout(NamedTuple):
 
     #: `constant_matrices(D, pairs)`, stored in advance as the chapter proposes; None: computed where they are used.
     constant: list | None = None
-    #: Write what blocks share to memory, as `invariant_terms` does; here the compiler does better without.
+    #: Write values that blocks share to memory, as `invariant_terms` does; here the program is faster without.
     write: bool = False
 
 
@@ -153,7 +154,7 @@ def _node(s: _At, D: Vector) -> _Node:
 
 
 def _written(values: T) -> T:
-    """The same with its arrays written to memory (`stored`). Plain numbers stay as they are, so that products with 0
+    """The pytree with its arrays written to memory (`stored`). Plain numbers stay as they are, so that products with 0
     can be left out."""
     leaves, tree = jax.tree.flatten(values)
     arrays = iter(stored([v for v in leaves if jnp.ndim(v)]))

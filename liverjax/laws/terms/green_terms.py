@@ -47,16 +47,16 @@ class GreenModuli(NamedTuple):
 
 
 def components(direction: Any, like: Any) -> Vector:
-    """A direction (3,), or one an element (E, 3), as a unit vector of components in the precision of `like`."""
+    """A direction (3,), or one per element (E, 3), as the components of a unit vector in the precision of `like`."""
     direction = jnp.asarray(direction, jnp.result_type(like))
     shape, elements = direction.shape, jnp.shape(like)
     if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[-2] != elements[-1]):
-        raise InputError(f"a direction has shape {shape}: give (3,) or one row of 3 an element, {(*elements, 3)}")
+        raise InputError(f"a direction has shape {shape}: give (3,) or one row of 3 per element, {(*elements, 3)}")
     return unit(tuple(direction[..., i] for i in range(3)))
 
 
 def material_axes(law: "Law", like: Any) -> Matrix:
-    """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes where a law has no fibre."""
+    """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes if the law has no fibre."""
     if law.fibre is None:
         return IDENTITY
     f, s = components(law.fibre, like), components(law.sheet, like)
@@ -96,7 +96,7 @@ def _stress_of_strain(law: "Law", E: Matrix) -> Matrix:
 
 
 def _slopes(function: Any, six: tuple) -> list:
-    """Derivative with respect to each entry E_ij of a symmetric E: half of that to a shear component (two entries)."""
+    """Derivative with respect to each entry E_ij of a symmetric E; a shear changes two entries, so each has half."""
     result = []
     for k, (i, j) in enumerate(SIX):
         weight = 1.0 if i == j else 0.5

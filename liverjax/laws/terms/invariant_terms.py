@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class Stress(NamedTuple):
-    """P = F S + p cof F, arrays of shape (E,): `S` a symmetric matrix or, where it is spherical, one array; p = W_J."""
+    """P = F S + p cof F, arrays of shape (E,): `S` a symmetric matrix or, if spherical, one array; p = W_J."""
 
     S: Matrix | Any
     p: jax.Array
@@ -63,11 +63,11 @@ class State(NamedTuple):
     first: dict
     second: dict
     fibres: dict  # invariant I4 of a summand -> its fibre direction
-    frame: Any  # principal stretches and axes, where a summand has an energy of stretches
+    frame: Any  # principal stretches and axes, if a summand has an energy of stretches
 
 
 class Pieces(NamedTuple):
-    """The same for laws of several kinds, each at its own elements."""
+    """The states of laws of several kinds, each at its own elements."""
 
     subsets: Subsets
     states: tuple[State, ...]
@@ -93,7 +93,7 @@ def state_of(scalars: Scalars, F: Matrix) -> State:
 
 
 def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
-    """C is computed only where I2 needs it, principal stretches only where a law needs them."""
+    """C is computed only if I2 needs it, principal stretches only if a law needs them."""
     first, second = scalars
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
@@ -104,14 +104,14 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
 
 
 def fibre_invariants(laws: tuple) -> dict[str, Any]:
-    """Names of the invariants a . The products C a for a sum of laws; each law has its own fibre a."""
+    """Name of each invariant a . C a in a sum of laws -> its law; every law has its own fibre a."""
     if len(laws) == 1:
         return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
     return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}
 
 
 def stress(s: State | Pieces) -> Stress:
-    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; absent derivatives leave no term."""
+    """S = 2 W_1 Id + 2 W_2 (I1 Id - C) + 2 W_4 a (x) a + … and p = W_J; a missing derivative adds no term."""
     if isinstance(s, Pieces):
         return _put_together(s.subsets, [stress(own) for own in s.states])
     W1, W2, p = s.first.get("I1", 0.0), s.first.get("I2"), s.first.get("J", 0.0)
@@ -134,7 +134,7 @@ def stress(s: State | Pieces) -> Stress:
 
 
 def _put_together(subsets: Subsets, found: list[Stress]) -> Stress:
-    """Stresses of all elements; a spherical one becomes a matrix where another is one."""
+    """Stresses of all elements; if one of them is a matrix, the spherical ones become matrices too."""
     if any(isinstance(S, tuple) for S, _ in found):
         found = [Stress(S if isinstance(S, tuple) else _spherical(S), p) for S, p in found]
     return put_together(subsets, found)
@@ -152,7 +152,7 @@ def piola(F: Matrix, cof: Matrix, resultant: Stress) -> Matrix:
     return tuple(tuple(FS[i][j] + p * cof[i][j] for j in range(3)) for i in range(3))
 
 
-#: |J| of the flattest element that a second Piola-Kirchhoff stress is computed of.
+#: Smallest |J| for which a second Piola-Kirchhoff stress is computed.
 _FLAT = 1e-3
 
 
@@ -197,16 +197,16 @@ def _weight(invariant: str) -> float:
 
 
 class _Parts(NamedTuple):
-    """The parts of the blocks."""
+    """Values from which the blocks are computed."""
 
     J: jax.Array
     first: dict
     second: dict
-    slopes: list[dict]  # of every node
+    slopes: list[dict]  # `slopes` of every node
     diagonal: dict  # (i, j) -> D_i . S D_j
     turning: dict  # (i, j) -> W_J F (D_i x D_j), where it is not 0
-    metric: dict  # (i, j) -> D_i . D_j, where I2 needs it
-    left: Matrix | None  # F F^T, there
+    metric: dict  # (i, j) -> D_i . D_j, if I2 needs it
+    left: Matrix | None  # F F^T, if I2 needs it
 
 
 def _parts(s: State, D: list[Vector], pairs: tuple[tuple[int, int], ...]) -> _Parts:
@@ -226,7 +226,7 @@ def _block(s: _Parts, pair: tuple[int, int], regularised: bool) -> Matrix:
     vi, vj = s.slopes[pair[0]], s.slopes[pair[1]]
     second = dict(s.second)
     W_JJ = second.pop(("J", "J"), None) if regularised else None
-    # v_a,i (x) sum_b W_ab v_b,j: one outer product an invariant.
+    # v_a,i (x) sum_b W_ab v_b,j: one outer product per invariant.
     partner: dict[str, Vector] = {}
     for (a, b), W in second.items():
         for row, column in dict.fromkeys(((a, b), (b, a))):

@@ -7,7 +7,7 @@ In the principal axes S is diagonal, S_m = tau_m / lambda_m^2 with tau_m = dw/d 
 
 The chapter's A H A form (section 4.1.2) has a geometric mean there: wrong except for alpha = 2 and 4.
 
-Values are these formulas. Their derivatives come from the energy expanded in frozen principal axes
+Values come from these formulas. Their derivatives come from the energy expanded in frozen principal axes
 (`liverjax.tensors.principal`). This expansion is smooth where stretches are equal; the axes themselves are not.
 """
 
@@ -110,7 +110,7 @@ def stress(law: "Law", F: Matrix, frame: Frame) -> Matrix:
 
 
 def moduli(law: "Law", F: Matrix, frame: Frame) -> list[list]:
-    """dS/dE [Pa] of w alone over six components each, in the coordinate axes, with `frame` = `principal(F)`."""
+    """dS/dE [Pa] of w alone, 6 x 6 components in the coordinate axes, with `frame` = `principal(F)`."""
     return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
@@ -134,8 +134,8 @@ def _square(upper: tuple) -> list[list]:
     return [[entries[min(a, b), max(a, b)] for b in range(6)] for a in range(6)]
 
 
-# The arguments of a function with a rule of its own are those that it is not linear in: JAX forgets the rule of a
-# function of which only a linear argument is unknown (forward over reverse mode).
+# Functions with a derivative rule of their own are not linear in any argument: JAX would drop the rule of a
+# function if only a linear argument were unknown (forward over reverse mode).
 
 
 def stress_at_constant(law: "Law", F: Matrix) -> Matrix:
@@ -217,14 +217,14 @@ def _expanded_energy(law: "Law", logs: Vector, axes: Matrix, log_J0: Number, Y: 
 
 
 def _energy_of_change(law: "Law", F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
-    """The energy as a function of a change Y of C, and Y: zero, `orders` times differentiable with respect to F."""
+    """The energy as a function of a change Y of C, and Y itself: zero, but differentiable `orders` times by F."""
     logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))
     return partial(_expanded_energy, law, logs, axes, log_J0), change(F, orders)
 
 
 def _strain_derivatives(function: Any, Y: tuple) -> jax.Array:
-    """Derivatives of `function` with respect to the six entries of E, first axis; dY = 2 dE, a shear is two entries."""
+    """Derivatives of `function` with respect to the six entries of E, first axis; dY = 2 dE, a shear fills two."""
 
     def along(direction):
         tangents = tuple(d * jnp.ones_like(y) for d, y in zip(direction, Y, strict=True))

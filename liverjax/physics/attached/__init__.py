@@ -1,1 +1,1 @@
-"""Elements of their own between the nodes of a body: membranes, ligaments, vessels."""
+"""Additional elements between the nodes of a body: membranes, ligaments, vessels."""

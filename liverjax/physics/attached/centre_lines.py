@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Distance between rings over the mean radius of the tubes.
 _BAND = 2.0
-#: Rings of fewer points go about no tube.
+#: Rings of fewer points do not go around a tube.
 _LEAST = 5
 
 
@@ -32,12 +32,12 @@ class CentreLines(NamedTuple):
 
 
 def read_surface(path: Path, scale: float, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (n, 3) [m] and triangles (t, 3) of a surface file, corners of one place joined.
+    """Corners (n, 3) [m] and triangles (t, 3) of a surface file, with corners at the same place joined.
 
     Args:
         path: any format of meshio with triangles (STL, PLY, OBJ, VTK, …).
         scale: unit of the file [m].
-        name: of what asks, for messages.
+        name: name of the vessel, for messages.
 
     Raises:
         InputError: a file that cannot be read, or without triangles.
@@ -75,7 +75,7 @@ def centre_lines(points: np.ndarray, triangles: np.ndarray, name: str = "vessel"
     Args:
         points: corners (n, 3) [m].
         triangles: (t, 3) corners of each; tubes may be open or closed at their ends.
-        name: of what asks, for messages.
+        name: name of the vessel, for messages.
 
     Raises:
         InputError: a surface too short or too coarse to have a line.
@@ -126,7 +126,7 @@ def _spacing(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> flo
 
 
 def _rings_of(points: np.ndarray, triangles: np.ndarray, away: np.ndarray) -> _Rings:
-    """The points where edges cross the levels in the middle of each spacing."""
+    """Rings of the points where edges cross levels of the distance; the levels lie midway in each spacing."""
     import scipy.sparse
     from scipy.sparse.csgraph import connected_components
 
@@ -184,7 +184,7 @@ def _pieces(points: np.ndarray, r: _Rings) -> CentreLines:
 
 
 def _without_tips(r: _Rings, real: np.ndarray) -> tuple[_Rings, np.ndarray]:
-    """Drop the last ring of each branch, which may go about a corner of the end, and join its bands."""
+    """Drop the last ring of each branch, which may go around a corner of the end, and join its bands."""
     keep, band, below, above = set(real.tolist()), r.band.copy(), r.below.copy(), r.above.copy()
     sides = np.concatenate([below[real], above[real]])
     for a in real:

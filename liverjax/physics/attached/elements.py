@@ -16,7 +16,7 @@ from liverjax.solvers.attached import Attached
 
 
 class Elements(NodalForce):
-    """Acts between nodes, element by element."""
+    """A force that acts between nodes, element by element."""
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
         """Node numbers (n, m) of m elements."""
@@ -27,11 +27,11 @@ class Elements(NodalForce):
         raise TypeError(f"{type(self).__name__} lacks tangents(mesh)")
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Energy (Q, m) [J] of every point, at C_11 (Q, m); or C_11, C_12, C_22."""
+        """Energy (Q, m) [J] of every point as a function of C_11 (Q, m), or of C_11, C_12 and C_22."""
         raise TypeError(f"{type(self).__name__} lacks energies(mesh, C)")
 
     def away(self) -> jax.Array | None:
-        """Part (d, 3, Q, m) to subtract from the tangent vectors, for ends that are no nodes; None: nothing."""
+        """Part (d, 3, Q, m) to subtract from the tangent vectors, for ends that are not nodes; None: nothing."""
         return None
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
@@ -44,7 +44,7 @@ class Elements(NodalForce):
         return jnp.zeros_like(x).at[nodes].add(own)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
-        """Sum over the elements."""
+        """Energy [J] of all elements."""
         f = self._vectors(self.tangents(mesh), x[self.nodes(mesh)])
         return jnp.sum(self.energies(mesh, _metric(f)))
 

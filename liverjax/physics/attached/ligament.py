@@ -1,8 +1,8 @@
 """A ligament: a cable with tension at rest, between two points of the body, or from a place of it to a point outside.
 
-Its tension is k (l - l0) of its length l, and 0 where it is slack: a ligament pulls and does not push. It is given a
-rest length l0, or the tension T0 in the reference shape, l0 = L - T0/k. From a place of n nodes it has n fibres, which
-share stiffness and tension.
+Its tension is k (l - l0) of its length l, and 0 if it is slack: a ligament pulls and does not push. The user gives its
+rest length l0, or its tension T0 at its length L in the reference shape: then l0 = L - T0/k. From a place of n nodes it
+has n fibres, which share stiffness and tension.
 """
 
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.elements import Elements
 from liverjax.physics.base import Physics, Step
 
-#: A fibre this little shorter than its rest length, relative to it, is not slack but rounded.
+#: A fibre that is shorter by less than this part of its rest length is not slack: the difference is roundoff.
 _ROUNDED = 1e-9
 
 
@@ -28,8 +28,8 @@ class Ligament(Physics):
     """Fibres (m) that each pull at nodes of the body, and may end outside it."""
 
     nodes: Indices = param("1", "node numbers (n, m)", lower=0)
-    weights: Array = param("1", "of these nodes in the fibre's vector (n, m): they add up to 0, or to 1 with a wall")
-    to: Numbers | None = param("m", "where fibres end outside the body (3,); None: in it", default=None)
+    weights: Array = param("1", "weights of these nodes in the fibre's vector (n, m): the sum is 0, or 1 with a wall")
+    to: Numbers | None = param("m", "where fibres end outside the body (3,); None: both ends are in it", default=None)
     stiffness: Number = param("N/m", "of all fibres together", above=0.0)
     pre_tension: Number | None = param("N", "of all fibres together, in the reference shape", lower=0.0, default=None)
     rest_length: Any = param("m", "of each fibre", above=0.0, default=None)
@@ -39,7 +39,7 @@ class Ligament(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "Ligament":
-        """From [[ligament]]: a place and a point of the wall, or two points of the body."""
+        """Read [[ligament]]: a place and a point of the wall, or two points of the body."""
         if ("points" in table) == ("to" in table):
             raise InputError(f"{name} needs either to = [x, y, z], with a place, or points = [[x, y, z], [x, y, z]]")
         if "stiffness" not in table:
@@ -73,7 +73,7 @@ class Ligament(Physics):
             raise InputError(f"{name} has a fibre without length: move its end")
         if self.pre_tension is not None and np.any(rest <= 0):
             most = float(np.asarray(self.stiffness) * lengths.min())
-            raise InputError(f"{name}.pre_tension = {self.pre_tension} N is more than it could have, {most:.3g} N")
+            raise InputError(f"{name}.pre_tension = {self.pre_tension} N must be below its limit, {most:.3g} N")
 
     def _vectors(self, mesh: TetMesh) -> jax.Array:
         """Vectors (m, 3) along the fibres in the reference shape."""
@@ -104,7 +104,7 @@ class Ligament(Physics):
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
 
 
-@jax.jit  # checks of a sweep ask for them row by row
+@jax.jit  # compiled, since checks of a sweep compute them for each row
 def _lengths_and_rest(ligament: Ligament, mesh: TetMesh) -> tuple[jax.Array, jax.Array]:
     """Lengths (m,) of the fibres in the reference shape, and at rest [m]."""
     return ligament._lengths(mesh), ligament._rest(mesh)
@@ -114,7 +114,7 @@ def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: 
     """A ligament between two points (2, 3) [m] of the body.
 
     Raises:
-        InputError: a point outside it.
+        InputError: a point outside the body.
     """
     nodes, values = locate.weights(mesh, *locate.elements_at(mesh, points, f"{name} points"))
     signed = values * np.array([[-1.0, 1.0]])
@@ -129,7 +129,7 @@ def _vector(value: object, name: str) -> np.ndarray:
     except (TypeError, ValueError):
         vector = np.empty(0)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise InputError(f"{name} = {value!r} is no point: give three numbers in m")
+        raise InputError(f"{name} = {value!r} is not a point: give three numbers in m")
     return vector
 
 
@@ -138,13 +138,13 @@ class Fibres(Elements):
     """A ligament during a step."""
 
     at: Any = param("1", "node numbers (n, m)")
-    weights: Array = param("1", "in the fibre's vector (n, m)")
+    weights: Array = param("1", "weights of the nodes in the fibre's vector (n, m)")
     to: Any = param("m", "end outside the body (3,), or None")
     rest: Any = param("m", "rest lengths (m,)")
     spring: Any = param("N/m", "stiffness of one fibre")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
-        """Where the fibres pull."""
+        """Nodes at which the fibres pull."""
         return self.at
 
     def tangents(self, mesh: TetMesh) -> jax.Array:
@@ -152,12 +152,12 @@ class Fibres(Elements):
         return jnp.asarray(self.weights)[None, :, None, :]
 
     def away(self) -> jax.Array | None:
-        """The end outside."""
+        """The end outside the body."""
         if self.to is None:
             return None
         return jnp.broadcast_to(jnp.asarray(self.to)[None, :, None, None], (1, 3, 1, len(self.rest)))
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Half of stiffness times the square of the stretch, where that is above 0."""
+        """Half the stiffness times the square of the elongation; 0 if the fibre is slack."""
         longer = jnp.maximum(jnp.sqrt(C[0]) - self.rest[None], 0.0)
         return 0.5 * self.spring * longer * longer

@@ -30,15 +30,15 @@ class Membrane(Physics):
     """A thin layer on triangles of the surface, without tension in the reference shape."""
 
     triangles: Indices = param("1", "node numbers (m, 3)", lower=0)
-    thickness: Number = param("m", "of the layer: one number, or one a triangle (m,)", above=0.0)
-    law: Law = param("1", "of the layer; a number of it may be one a triangle (m,)")
+    thickness: Number = param("m", "of the layer: one number, or one per triangle (m,)", above=0.0)
+    law: Law = param("1", "law of the layer; its numbers may have one value per triangle (m,)")
 
     section: ClassVar[str] = "membrane"
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "thickness", "law")
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> "Membrane":
-        """From [[membrane]]: a place (the whole surface where there is none), a thickness and a law."""
+        """Read [[membrane]]: a place (by default the whole surface), a thickness and a law."""
         for key, example in (("thickness", "thickness = 5e-5, in m"), ("law", "[membrane.law] with name and numbers")):
             if key not in table:
                 raise InputError(f"{name} needs {key}: write {example}")
@@ -56,15 +56,15 @@ class Membrane(Physics):
         selection.check_triangles(mesh, self.triangles, f"{name}.triangles")
         if np.shape(self.thickness) not in ((), (len(self.triangles),)):
             shape, count = np.shape(self.thickness), len(self.triangles)
-            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one a triangle {count}")
+            raise InputError(f"{name}.thickness has shape {shape}: give one number, or one per triangle: {count}")
         layers.check(self.law, name)
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Membrane":
-        """On the same triangles."""
+        """The membrane on the same triangles of the richer mesh."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def freeze(self, memory: None, step: Step) -> "Stretched":
-        """The incompressible part of the law, where it has one."""
+        """The membrane with the isochoric part of its law if there is one, else with the whole law."""
         isochoric = self.law.isochoric_part()
         law, solved = (self.law, jnp.ones(0)) if isochoric is None else (isochoric, None)
         return Stretched(triangles=self.triangles, thickness=self.thickness, law=law, solved=solved)
@@ -76,7 +76,7 @@ class Stretched(Elements):
 
     triangles: Indices = param("1", "node numbers (m, 3)")
     thickness: Any = param("m", "of the layer")
-    law: Law = param("1", "isochoric, or whole where the stretch of the thickness is solved for")
+    law: Law = param("1", "isochoric, or whole if the stretch of the thickness is solved for")
     solved: object = param("1", "not None: the stretch of the thickness is solved for", default=None)
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
@@ -99,7 +99,7 @@ class Stretched(Elements):
         return (0.5 * self.thickness * r11 * r22)[None] * jnp.asarray(weights, W.dtype)[:, None] * W
 
     def _edges(self, mesh: TetMesh) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Triangular root (m,) [m] of the metric of the reference triangles' edges."""
+        """Cholesky factor, r11, r12 and r22 (m,) [m], of the metric of the reference triangles' edges."""
         corners = jnp.moveaxis(mesh.points[self.triangles[:, :3]], 0, -1)
         first, second = corners[1] - corners[0], corners[2] - corners[0]
         r11 = jnp.sqrt(jnp.sum(first * first, axis=0))

@@ -2,7 +2,7 @@
 
 The line is cut at the faces of the tetrahedra. A piece has no unknowns of its own: its points move with the functions
 of its element. Its section is a ring, or a disc without `wall`; its law acts in tension along it, at constant volume.
-The tissue in the place of the wall is not removed.
+The tissue in the place law of the wall is not removed.
 """
 
 from collections.abc import Mapping
@@ -36,17 +36,17 @@ class Vessel(Physics):
 
     element: Indices = param("1", "element numbers (m,)", lower=0)
     enters: jax.Array = param("1", "barycentric coordinates where a piece begins (4, m)")
-    leaves: jax.Array = param("1", "and where it ends (4, m)")
-    radius: Number = param("m", "outer radius, one number or one a piece (m,)", above=0.0)
-    wall: Number | None = param("m", "thickness of the wall; None: the section is a disc", above=0.0, default=None)
-    law: Law = param("1", "of the wall")
+    leaves: jax.Array = param("1", "barycentric coordinates where a piece ends (4, m)")
+    radius: Number = param("m", "outer radius, one number or one per piece (m,)", above=0.0)
+    wall: Number | None = param("m", "thickness law of the wall; None: the section is a disc", above=0.0, default=None)
+    law: Law = param("1", "law of the wall")
 
     section: ClassVar[str] = "vessel"
     keys: ClassVar[tuple[str, ...]] = ("where", "set", "line", "surface", "unit", "radius", "wall", "law")
 
     @classmethod
     def read(cls, mesh: TetMesh, table: dict[str, object], name: str) -> "Vessel":
-        """From [[vessel]]: points of a centre line and a radius (or one a point), or the file of a surface; a law."""
+        """Read [[vessel]]: points of a centre line and a radius (or one per point), or the file of a surface; a law."""
         if ("line" in table) == ("surface" in table) or "law" not in table:
             raise InputError(
                 f"{name} needs line = [[x, y, z], …] with radius in m, or surface = 'tube.stl', and [vessel.law]"
@@ -88,7 +88,7 @@ class Vessel(Physics):
         layers.check(self.law, name)
 
     def freeze(self, memory: None, step: Step) -> "Bars":
-        """The isochoric part of the law, where it has one."""
+        """The bars of the vessel, with the isochoric part of the law if it has one."""
         law = self.law.isochoric_part() or self.law
         return Bars(element=self.element, enters=self.enters, leaves=self.leaves, section_area=self.area(), law=law)
 
@@ -114,7 +114,7 @@ def _lines_of_surface(table: Mapping[str, object], name: str) -> CentreLines:
 
 
 def along(mesh: TetMesh, line: np.ndarray, radius: Any, law: Law, name: str = "vessel", **given: object) -> Vessel:
-    """A vessel along a line (n, 3) [m] with one radius or one a point (n,) [m]; what lies outside is left out.
+    """A vessel along a line (n, 3) [m] with one radius or one per point (n,) [m], without parts outside the body.
 
     Raises:
         InputError: a line outside the body.
@@ -164,8 +164,8 @@ class Bars(Elements):
     element: Indices = param("1", "element numbers (m,)")
     enters: jax.Array = param("1", "barycentric (4, m)")
     leaves: jax.Array = param("1", "barycentric (4, m)")
-    section_area: jax.Array = param("m^2", "one number, or one a piece (m,)")
-    law: Law = param("1", "of the wall")
+    section_area: jax.Array = param("m^2", "one number, or one per piece (m,)")
+    law: Law = param("1", "law of the wall")
 
     def nodes(self, mesh: TetMesh) -> jax.Array:
         """Nodes of the elements that the vessel crosses."""
@@ -189,7 +189,7 @@ class Bars(Elements):
         return jnp.stack(rows, axis=1)[None]
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
-        """Volume of the wall times the energy density of an incompressible sample in tension."""
+        """Volume law of the wall times the energy density of an incompressible sample in tension."""
         law = jax.tree.map(lambda v: v if jnp.ndim(v) == 0 else v[None], self.law)
         volume = self.section_area * self._lengths(mesh) / len(C[0])
         return volume[None] * layers.axial_energy(law, jnp.sqrt(C[0]))

@@ -3,9 +3,9 @@
 Every point of contact has an elastic slip e along the obstacle's surface [m], which the next steps remember. Within a
 step it grows with the motion of the point past the obstacle; beyond mu times the point's depth it is cut to that, and
 the point slides. The shear is `stiffness` times e, and the pressure is `stiffness` times the depth. So a point that
-sticks slips by at most mu times its depth, and it does not creep. An open contact forgets.
+sticks slips by at most mu times its depth, and it does not creep. A contact that opens loses its slip.
 
-The force has no energy: sliding takes it away. Its tangent is exact, and not symmetric where points slide.
+The force has no energy: sliding dissipates it. Its tangent is exact, and not symmetric where points slide.
 
 Source: Wriggers 2006, Computational Contact Mechanics, sections 5.2 and 6.4 (penalty, return mapping).
 """
@@ -45,7 +45,7 @@ class RoughObstacle(Obstacle):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
-        """From [[obstacle]] with a friction."""
+        """Read [[obstacle]] with a friction."""
         plain = super().read(mesh, table, name)
         return replace(plain, friction=table["friction"])
 
@@ -63,7 +63,7 @@ class RoughObstacle(Obstacle):
     def freeze(self, memory: Any, step: Step) -> "Rubbing":
         """Keep the slip at the beginning of the step, and the places of the points relative to the obstacle."""
         moved = super().freeze(memory, step).moved
-        # At rest the positions that a run begins with are but a guess: the surface comes from the reference.
+        # In a static run the first positions are only a guess: the surface comes from the reference shape.
         x = step.x if step.inertia else jnp.where(step.k == 1, step.mesh.points, step.x)
         past = contact_points(self, step.mesh, x) - moved[0][:, None, None]
         slip = jnp.zeros_like(past) if memory is None else memory
@@ -88,9 +88,9 @@ class Rubbing(Touching):
 
     friction: Number = param("1", "mu", default=0.0)
     slip: Any = param("m", "elastic slip at the beginning (3, Q, m)", default=None)
-    past: jax.Array | None = param("m", "points of contact then, as seen from the obstacle (3, Q, m)", default=None)
-    nodes: Array | None = param("1", "of the triangles (n, m)", default=None)
-    functions: Array | None = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
+    past: jax.Array | None = param("m", "points of contact then, relative to the obstacle (3, Q, m)", default=None)
+    nodes: Array | None = param("1", "nodes of the triangles (n, m)", default=None)
+    functions: Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
 
     conservative: ClassVar[bool] = False  # type: ignore[misc]
 
@@ -121,7 +121,7 @@ class Rubbing(Touching):
         return (just_touching(self.obstacle, mesh, d) & (d.value >= 0) & (self.friction > 0))[None, None]
 
     def force(self, mesh: TetMesh, x: jax.Array, s: Number) -> jax.Array:
-        """Pressures, and the shear that holds back."""
+        """Forces of the pressures and of the frictional shear."""
         shear = weighted_stiffness(self.obstacle, mesh)[None] * self.slip_at(self.points(x), s)
         return super().force(mesh, x, s) + shared_out(self.obstacle, mesh, x, shear)
 
@@ -133,8 +133,9 @@ class Rubbing(Touching):
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(self._law(at, s)[0]), H))
 
     def energy_from(self, mesh: TetMesh, x: jax.Array, start: jax.Array) -> jax.Array:
-        """Half of stiffness times slip squared, up to the largest slip that the pressure at `start` allows; linear
-        beyond."""
+        """The energy of the contact, plus half of stiffness times slip squared up to the largest slip that the pressure
+        at `start` allows; linear beyond.
+        """
         one = jnp.ones((), x.dtype)
         n, most = self._law(self.points(start), one)
         size = _of_slip(self._trial(self.points(x), one, n))
@@ -142,7 +143,7 @@ class Rubbing(Touching):
         return self.energy(mesh, x) + jnp.sum(weighted_stiffness(self.obstacle, mesh) * stored)
 
     def definite(self, mesh: TetMesh, x: jax.Array, s: Number) -> Attached:
-        """Second derivative of that energy. A point that slides is held only across its direction of sliding."""
+        """Second derivative of `energy_from`. A sliding point has stiffness only across its direction of sliding."""
         at, plain = self.points(x), super().definite(mesh, x, s)
         n, most = self._law(at, s)
         trial = self._trial(at, s, n)
@@ -153,7 +154,7 @@ class Rubbing(Touching):
         return self._with_shear(mesh, plain, jnp.where(self._guessed(mesh, at, s), _planes(n), H))
 
     def _with_shear(self, mesh: TetMesh, plain: Attached, H: jax.Array) -> Attached:
-        """The stiffness of the pressures with that of the shear, H (3, 3, Q, m) over the contact's."""
+        """The stiffness of the pressures plus that of the shear: H (3, 3, Q, m) times the contact's stiffness."""
         shear = weighted_stiffness(self.obstacle, mesh)[None, None] * H
         return Attached(plain.nodes, plain.blocks + between_nodes(mesh, shear))
 

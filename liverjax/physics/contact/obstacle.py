@@ -3,9 +3,10 @@
 At three points of every triangle a pressure `stiffness` times the depth acts along the obstacle's normal, per reference
 area; where the surface is outside, nothing acts, so nothing sticks. It has no friction
 (`liverjax.physics.contact.friction` has). The energy is half of pressure times depth. Its gradient and second
-derivative are exact. The surface stays in the obstacle by the pressure over the stiffness. By default the stiffness is
-`HARDNESS` times the body's own over the size of a triangle. At a pressure as large as the body's stiffness the depth is
-then below a hundredth of the triangle's size. `lj.obstacle_forces` tells force and largest depth.
+derivative are exact. The surface stays inside the obstacle, at a depth of pressure over stiffness. By default the
+stiffness is `HARDNESS` times the body's own over the size of a triangle. At a pressure as large as the body's stiffness
+the depth is then below a hundredth of the triangle's size. `lj.obstacle_forces` returns the force and the largest
+depth.
 
 Source: Wriggers 2006, Computational Contact Mechanics, chapters 5 and 6 (penalty, exact tangent).
 """
@@ -45,10 +46,10 @@ class Obstacle(Physics):
     triangles: Indices = param("1", "node numbers (m, 3) of the surface that may touch it", lower=0)
     shape: str = static(default="plane", about="plane, sphere, cylinder or cone", words=tuple(SHAPES))
     position: Numbers = param(
-        "m", "point of the plane or of the cylinder's axis, centre, tip (3,)", default=(0.0, 0.0, 0.0)
+        "m", "point of the plane or of the cylinder's axis, sphere's centre, cone's tip (3,)", default=(0.0, 0.0, 0.0)
     )
     axis: Numbers = param(
-        "1", "normal to the free side; axis; from the cone's tip inwards (3,)", default=(0.0, 0.0, 1.0)
+        "1", "plane's normal to the free side; cylinder's axis; cone's, inwards (3,)", default=(0.0, 0.0, 1.0)
     )
     radius: Number = param("m", "of sphere and cylinder; of a cone's rounded tip", lower=0.0, default=0.0)
     half_angle: Number = param("deg", "of the cone, between axis and side", above=0.0, default=45.0)
@@ -56,11 +57,11 @@ class Obstacle(Physics):
     times: Numbers | None = param("s", "times of a history (T,)", default=None)
     history: Numbers | None = param("m", "displacements at these times (T, 3), or factors of by (T,)", default=None)
     stiffness: Any = param(
-        "Pa/m", "pressure over depth, one or one a triangle (m,); None: by the body's own", above=0.0, default=None
+        "Pa/m", "pressure over depth, one number or one per triangle (m,); None: from the law", above=0.0, default=None
     )
 
     section: ClassVar[str] = "obstacle"
-    #: What the factors of a history belong to.
+    #: The field that the factors of a history multiply.
     driven: ClassVar[str] = "by"
     keys: ClassVar[tuple[str, ...]] = (
         *("shape", "where", "set", "position", "axis", "radius", "half_angle", "by", "history", "stiffness"),
@@ -68,7 +69,7 @@ class Obstacle(Physics):
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Content, name: str) -> Self:
-        """From [[obstacle]]: a shape, its place and numbers; the whole surface may touch it where no part is named."""
+        """Read [[obstacle]]: a shape, its place and numbers; by default the whole surface may touch it."""
         if "shape" not in table:
             raise InputError(f"{name} is without shape: give {', '.join(SHAPES)}")
         shape = as_word(table["shape"], f"{name} shape")
@@ -117,7 +118,7 @@ class Obstacle(Physics):
             raise InputError(f"{name} history has factors, but there is no by that they belong to: give by")
 
     def check_place(self, mesh: TetMesh, name: str) -> None:
-        """Refuse a body that begins inside. A loaded body may lie in the obstacle as deep as the contact leaves it."""
+        """Refuse a body that begins inside. A loaded body may lie inside, at the depth of its contact."""
         size, deepest = float(np.ptp(np.asarray(mesh.points), axis=0).max()), float(_depth_at_beginning(self, mesh))
         if deepest > 1e-9 * size:
             raise InputError(
@@ -138,7 +139,7 @@ class Obstacle(Physics):
         """Take the default stiffness from the law: that of a layer with modulus K + 4/3 mu, K at most 3 mu."""
         if self.stiffness is not None:
             return self
-        # A surface gives way to the side: a bulk modulus far above shear would make the contact needlessly hard.
+        # Material under a contact can move sideways: a bulk modulus far above shear would make it needlessly hard.
         shear = law.shear_modulus()
         modulus = jnp.max(jnp.asarray(jnp.minimum(law.bulk_modulus(), 3 * shear) + 4 / 3 * shear))
         return replace(self, stiffness=HARDNESS * modulus / jnp.sqrt(_triangle_areas(self, mesh)))
@@ -148,7 +149,7 @@ class Obstacle(Physics):
         return replace(self, by=None) if self.history is None else self
 
     def enriched(self, mesh: TetMesh, more: Callable[[Indices], Indices]) -> "Obstacle":
-        """On the same triangles."""
+        """The obstacle for the same triangles of the richer mesh."""
         return replace(self, triangles=promotion.with_faces(mesh, self.triangles))
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
@@ -159,7 +160,7 @@ class Obstacle(Physics):
         return zero if self.by is None else jnp.asarray(self.by) * (k / steps)
 
     def freeze(self, memory: None, step: Step) -> "Touching":
-        """Its places at the beginning and at the end of the step."""
+        """The obstacle, with its displacements at the beginning and at the end of the step."""
         dt = 0.0 if step.dt is None else step.dt
         moved = jnp.stack([self.displacement(n, step.steps, dt) for n in (step.k - 1, step.k)])
         return Touching(obstacle=self, moved=moved.astype(step.x.dtype))
@@ -187,7 +188,7 @@ class Touching(NodalForce):
         return self.force_at(mesh, x, self.place(x, s))
 
     def force_at(self, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
-        """The same with the obstacle displaced by `moved` (3,)."""
+        """`force` with the obstacle displaced by `moved` (3,)."""
         return contact_force(self.obstacle, mesh, x, moved)
 
     def energy(self, mesh: TetMesh, x: jax.Array) -> jax.Array:
@@ -199,7 +200,7 @@ class Touching(NodalForce):
         """Second derivative of the energy: the part along the normal, and the part by the change of the normal."""
         d, k = _distances(self.obstacle, mesh, x, self.place(x, s)), weighted_stiffness(self.obstacle, mesh)
         depth = jnp.minimum(d.value, 0.0)
-        # A surface that just touches counts as pressed: else a body that lies on a plane begins with nothing below it.
+        # A surface that just touches counts as pressed: else a body that lies on a plane would begin without support.
         inside = just_touching(self.obstacle, mesh, d).astype(x.dtype)
         H = jnp.stack(
             [
@@ -242,7 +243,7 @@ def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Ar
     return jnp.maximum(-jnp.min(_distances(obstacle, mesh, x, moved).value), 0.0)
 
 
-@jax.jit  # checks of a sweep ask for it row by row
+@jax.jit  # compiled, since checks of a sweep compute it for each row
 def _depth_at_beginning(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """How deep () [m] a run would begin inside the body; negative: the distance between them."""
     return -jnp.min(_distances(obstacle, mesh, mesh.points, obstacle.displacement(0, 1, 0.0)).value)
@@ -254,7 +255,7 @@ def touching_nodes(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
 
 
 def point_functions(mesh: TetMesh, dtype: DTypeLike) -> jax.Array:
-    """Of a triangle's nodes at its points (n, Q)."""
+    """Functions of a triangle's nodes at its points of contact (n, Q)."""
     return jnp.asarray(surface.triangle_functions(mesh, _rule(mesh)[1]), dtype)
 
 
@@ -282,7 +283,7 @@ def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array
 
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
-    """Whether points (Q, m) are inside, or so near that the obstacle carries a body that lies there."""
+    """Whether points (Q, m) are inside, or so near that they count as touching."""
     return d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
 
 
@@ -302,7 +303,7 @@ def three_numbers(value: object, name: str) -> jax.Array:
     """A vector (3,) of a scene file.
 
     Raises:
-        InputError: anything else.
+        InputError: the value is not three finite numbers.
     """
     given = np.asarray(value, object)
     try:

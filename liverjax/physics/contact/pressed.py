@@ -1,11 +1,12 @@
-"""A rigid obstacle that a given force presses into the body, as a weight on an indenter: it finds its own place.
+"""A rigid obstacle that a given force presses into the body, as a weight on an indenter: equilibrium gives its place.
 
 The obstacle moves along its force alone. Its travel t follows from the balance of forces along that line,
 
     dE/dt(x, t) = F,
 
-E the energy of the contact at positions x. Eliminated, t(x) adds -h h^T / E_tt to the stiffness of the contact, with h
-= d2E/dx dt. This dense matrix of rank one is not stored: products apply it, and a factorisation is corrected for it.
+where E is the energy of the contact at positions x. When t is eliminated, t(x) adds -h h^T / E_tt to the stiffness of
+the contact, with h = d2E/dx dt. This dense matrix of rank one is not stored: products apply it, and a factorisation is
+corrected for it.
 """
 
 from collections.abc import Mapping
@@ -41,20 +42,19 @@ _MOST_STEPS = 200
 class PressedObstacle(Obstacle):
     """An obstacle under a force."""
 
-    force: Numbers = param("N", "that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
+    force: Numbers = param("N", "force that presses it (3,), reached at the last step", default=(0.0, 0.0, 0.0))
 
     keys: ClassVar[tuple[str, ...]] = (*(key for key in Obstacle.keys if key != "by"), "force")
     driven: ClassVar[str] = "force"
 
     @classmethod
     def read(cls, mesh: TetMesh, table: Mapping[str, object], name: str) -> Self:
-        """From [[obstacle]] with a force."""
+        """Read [[obstacle]] with a force."""
         plain = super().read(mesh, {key: value for key, value in table.items() if key != "force"}, name)
         return replace(plain, force=three_numbers(table["force"], f"{name} force"))
 
     def check(self, mesh: TetMesh, name: str) -> None:
-        """Refuse, beside what `Obstacle` refuses, a missing force, a given motion, and a history that is not of
-        factors."""
+        """Refuse what `Obstacle` refuses, a missing force, a prescribed motion, and a history of displacements."""
         super().check(mesh, name)
         history.check(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
@@ -88,7 +88,7 @@ class PressedObstacle(Obstacle):
         return False
 
     def holds(self, mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Nothing: it gives way."""
+        """No nodes: the obstacle yields to the body."""
         return np.zeros(0, int), np.zeros((0, 3))
 
     def at_beginning(self) -> "PressedObstacle":
@@ -111,11 +111,11 @@ class PressedObstacle(Obstacle):
         return jnp.zeros(3)
 
     def begin(self, start: Start) -> jax.Array:
-        """No travel () yet."""
+        """The travel () [m] at the beginning of a run: 0."""
         return jnp.zeros((), start.x.dtype)
 
     def freeze(self, memory: Any, step: Step) -> "Pressing":
-        """The force at the beginning and at the end of the step, and where the obstacle was."""
+        """The force at the beginning and at the end of the step, and the travel of the obstacle before."""
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
         load = jnp.stack([jnp.asarray(self.load(n, step.steps, dt), dtype) for n in (step.k - 1, step.k)])
         return Pressing(
@@ -146,10 +146,10 @@ class Pressing(Touching):
     """The obstacle during a step."""
 
     load: Any = param("N", "size of the force at the beginning and at the end (2,)", default=None)
-    direction: Any = param("1", "of the force (3,)", default=None)
+    direction: Any = param("1", "direction of the force (3,)", default=None)
     before: Any = param("m", "travel at the beginning ()", default=None)
-    nodes: jax.Array | None = param("1", "of the triangles (n, m)", default=None)
-    functions: jax.Array | None = param("1", "of a triangle's nodes at its points (n, Q)", default=None)
+    nodes: jax.Array | None = param("1", "nodes of the triangles (n, m)", default=None)
+    functions: jax.Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
 
     def points(self, x: jax.Array) -> jax.Array:
@@ -161,7 +161,7 @@ class Pressing(Touching):
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Travel () [m] at which the contact carries the force; NaN where no place does. Has first derivatives."""
+        """Travel () [m] at which the contact balances the force; NaN if there is none. It has first derivatives."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
         held, slope, _ = self._resistance(at, found)
@@ -182,7 +182,7 @@ class Pressing(Touching):
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]
         enough = 16 * float(jnp.finfo(at.dtype).eps) * jnp.maximum(load, first)
-        # No depth below this carries the force, even if all points touched.
+        # No smaller depth can balance the force, even if all points touched.
         least = load / jnp.sum(own.hardness)
 
         def unfinished(c: tuple) -> jax.Array:

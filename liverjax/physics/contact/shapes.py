@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from liverjax.core.struct import Array, Number
 
-#: What a scene may name, and the numbers that each needs.
+#: Shapes that a scene may name, and the numbers that each needs.
 SHAPES: dict[str, tuple[str, ...]] = {
     "plane": ("axis",),
     "sphere": ("radius",),
@@ -34,7 +34,7 @@ def distance(shape: str, y: list[jax.Array], axis: Any, radius: Number, half_ang
     Args:
         shape: one of `SHAPES`.
         y: columns, from the place of the shape.
-        axis: unit vector (3,): the plane's normal to the free side, the cylinder's axis, the cone's from its tip in.
+        axis: unit vector (3,): the plane's normal to the free side, the cylinder's axis, the cone's axis inwards.
         radius: [m] of sphere and cylinder; of the cone's rounded tip, whose lowest point is at its place.
         half_angle: [rad] of the cone, between axis and side.
     """

@@ -1,1 +1,1 @@
-"""Volume changes held on average over neighbouring elements, against locking."""
+"""Volume changes that are averaged at nodes or have pressures as unknowns, against locking."""

@@ -3,10 +3,10 @@
 The volumetric energy is sum_a V_a U(J_a) over nodes, J_a the mean J of the elements around node a weighted by their
 volumes, V_a a quarter of these. There are about five times fewer nodes than elements, so five times fewer constraints
 where the bulk modulus is large. The pressure of a node is p_a = U'(J_a); that of an element is the mean over its nodes.
-The stiffness is that at given pressures plus G^T D^-1 G with D = V_a/U''. This is the system of a porous step in which
-nothing flows.
+The stiffness is that at given pressures plus G^T D^-1 G, with G the derivative of the nodal volumes and D = V_a/U''.
+This is the system of a porous step in which nothing flows.
 
-Where elements have different volumetric energies, that of a node is their mean, weighted by volume.
+If elements have different volumetric energies, a node has their mean, weighted by volume.
 """
 
 from typing import Any
@@ -36,7 +36,7 @@ def _invariants(law: Law, J: jax.Array) -> Any:
 
 
 def nodal_energy(mesh: TetMesh, law: Law) -> Law:
-    """The volumetric energy of the nodes, with one bulk modulus a node (V,) where elements have different ones."""
+    """The volumetric energy of the nodes, with one bulk modulus per node (V,) if elements have different ones."""
     U = volumetric_part(law)
     if len(U.pieces()) == 1 and all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(U)):
         return U
@@ -80,10 +80,10 @@ def compliance(mesh: TetMesh, law: Law, J: jax.Array, positive: bool) -> BlockMa
 class AveragedVolume(Physics):
     """The volumetric energy of a law, averaged at the nodes."""
 
-    law: Law = param("1", "of which the volumetric part counts")
+    law: Law = param("1", "law whose volumetric part is used")
 
     def freeze(self, memory: None, step: Step) -> "Averaged":
-        """The energy of the nodes."""
+        """The volumetric energy of the nodes, ready to act during a step."""
         return Averaged(law=nodal_energy(step.mesh, self.law))
 
 

@@ -1,18 +1,19 @@
-"""Pressures of their own against volumetric locking: Taylor-Hood, P2/P1, of quadratic elements, P1/P1 of linear ones.
+"""Pressures as unknowns, against volumetric locking: Taylor-Hood (P2/P1) for quadratic elements, P1/P1 for linear ones.
 
 With U(J) = K g(J)^2 / 2 the energy per volume is
 
     W_isochoric + gamma g^2 / 2 + p g - p^2 / (2 (K - gamma)),
 
-p linear in every element and continuous. Where p has its best value, this is U with g averaged by p's functions: so
-volume changes are held on average, not at every point. The part gamma = min(mu, K/2) of the bulk modulus, a quarter of
-that in linear elements, stays with the displacements, which keeps their matrix positive; the solution does not depend
-on it as the mesh is refined. Pressures are unknowns beside the positions: eliminated, Newton's method would not
-converge where K is large.
+p linear in every element and continuous. For the best p this is U with g averaged by p's functions: so volume changes
+are limited on average, not at every point. The part gamma = min(mu, K/2) of the bulk modulus, a quarter of that in
+linear elements, stays with the displacements, which keeps their matrix positive; the solution does not depend on it as
+the mesh is refined. Pressures are unknowns together with the positions: if they were eliminated, Newton's method would
+not converge for large K.
 
-Linear positions cannot hold linear pressures: some pressures that change from node to node would move nothing, and they
-grow without bound where K is large. So linear elements have - (p - mean of p)^2 / (2 mu) as well, with the mean of the
-element (Bochev, Dohrmann and Gunzburger 2006): it goes with the square of the element's size.
+Linear positions do not determine linear pressures: some pressures that alternate from node to node would have no
+effect, and they grow without bound for large K. So linear elements have a further term, - (p - mean of p)^2 / (2 mu),
+with the mean over the element (Bochev, Dohrmann and Gunzburger 2006): it decreases with the square of the element's
+size.
 """
 
 from collections.abc import Callable
@@ -51,7 +52,7 @@ def check_mixed_law(law: Law, name: str = "[solve] volumetric = 'mixed'") -> Non
 
 
 def strain(kind: str, J: jax.Array) -> jax.Array:
-    """g(J) of U = K g^2 / 2, about J - 1: J - 1 ("quadratic"), ln J ("log"), or what "simo" has for it."""
+    """g(J) of U = K g^2 / 2, about J - 1: J - 1 ("quadratic"), ln J ("log"), or the analogue for "simo"."""
     if kind == "log":
         return jnp.log(J)
     d = J - 1
@@ -65,7 +66,7 @@ def strain(kind: str, J: jax.Array) -> jax.Array:
     return d * jnp.sqrt(jnp.where(jnp.abs(d) < 0.1, series, whole))
 
 
-#: gamma over min(mu, K/2), by order. What stays with linear elements locks in them: less of it is more exact.
+#: gamma over min(mu, K/2), by order. In linear elements this part causes locking, so less of it is more accurate.
 _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 
 
@@ -73,10 +74,10 @@ _PART = {1: 0.25, 2: 1.0, 3: 1.0}
 class MixedVolume(Physics):
     """The volumetric energy of a law, with pressures as unknowns."""
 
-    law: Law = param("1", "of which the volumetric part counts")
+    law: Law = param("1", "law whose volumetric part is used")
 
     def begin(self, start: Start) -> jax.Array:
-        """No pressure."""
+        """Zero pressures (V,)."""
         return jnp.zeros(start.mesh.number_of_vertices, start.x.dtype)
 
     def freeze(self, memory: jax.Array, step: Step) -> "Mixed":
@@ -110,7 +111,7 @@ class Mixed(VolumeStress):
     unknown: ClassVar[bool] = True
 
     def _slopes(self, J: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """g, g' and g''."""
+        """g and its first two derivatives at volume ratios J."""
 
         def first(J: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jax.jvp(lambda J: strain(self.kind, J), (J,), (jnp.ones_like(J),))

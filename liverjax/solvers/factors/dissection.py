@@ -1,29 +1,29 @@
 """Nested dissection of a mesh (George 1973, SIAM J. Numer. Anal. 10, 345): the order of eliminating groups of nodes.
 
-The elements are parted in two again and again, and the nodes between two parts come after both. Work grows with the
-cube of the nodes between: of all planes across nine directions the one is taken that leaves least work by an estimate.
-In a mesh without layers the elements beside a plane have many nodes in common. There the fewest nodes that part both
-sides are better: the smallest cut of a graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
+The elements are divided in two again and again, and the nodes between two parts are eliminated after both. Work grows
+with the cube of the number of nodes between. Of all planes normal to nine directions, the one with the least estimated
+work is taken. In a mesh without layers the elements beside a plane have many nodes in common. There the smallest set of
+nodes that separates both sides is better: the smallest cut of a graph (Ford and Fulkerson 1956, Can. J. Math. 8, 399).
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-#: Nodes of a group that is not parted any more; elements from which on diagonal planes and smallest cuts are tried.
+#: A group of so few nodes is not divided; from so many elements on, diagonal planes and smallest cuts are tried.
 LEAF, MANY = 40, 200
-#: Least part of the elements on one side of a plane, and of those on each side of it among which the cut may pass.
+#: Least part of the elements on one side of a plane; part on each side of the plane that a smallest cut may reach.
 LEAST, BESIDE = 0.25, 0.07
-#: The cut's estimated work, over that of the plane, from which on it is taken: planes leave straighter rests.
+#: A smallest cut is taken if its estimated work is below this part of the plane's: planes leave straighter parts.
 BETTER = 0.9
-#: Across which planes stand.
+#: Normals of the planes.
 DIRECTIONS = np.array(
     [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]
 )
 
 
 class _Part(NamedTuple):
-    """Elements that hang together, the nodes that are eliminated within them, and those that come later."""
+    """A part of the elements, the nodes that are eliminated inside it, and its nodes that are eliminated later."""
 
     elements: np.ndarray  # (n,)
     nodes: np.ndarray  # (k,), rising
@@ -42,15 +42,15 @@ class _Cut(NamedTuple):
 
 
 def work(own: Any, border: Any) -> Any:
-    """What eliminating unknowns costs that are coupled with a border of others, in multiplications."""
+    """Multiplications that eliminate `own` unknowns, which are coupled with `border` others."""
     return own**3 / 3 + own**2 * border + own * border**2
 
 
 def dissected(elements: np.ndarray, points: np.ndarray) -> list[tuple[np.ndarray, list[int]]]:
-    """Groups of nodes with the numbers of their children; a group stands after its children.
+    """Groups of nodes with the numbers of their children; a group comes after its children.
 
     Args:
-        elements: nodes (n, E) of every element; one that has fewer repeats one of them.
+        elements: nodes (n, E) of every element; an element with fewer nodes repeats one of them.
         points: positions (V, 3).
     """
     centres, taken = points[elements].mean(axis=0), np.zeros(len(points), bool)
@@ -112,8 +112,9 @@ def _first_and_last(nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray]) -> N
 
 
 def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Work (n,) of a cut after each element of an order with these nodes (E, n): that of the nodes between, and twice
-    that of the next cut of each side, as if it were a cube."""
+    """Work (n,) of a cut after each element of an order with these nodes (E, n): the work of the nodes between, and
+    twice the work of the next cut on each side, as if the side were a cube.
+    """
     n, m = nodes.shape[1], len(part.border)
     _first_and_last(nodes, span)
     begun, over = (np.cumsum(np.bincount(own[part.nodes], minlength=n)).astype(float) for own in span)
@@ -127,13 +128,13 @@ def _work_of_cuts(nodes: np.ndarray, part: _Part, span: tuple[np.ndarray, np.nda
 def _smallest_cuts(
     near: np.ndarray, nodes: np.ndarray, span: tuple[np.ndarray, np.ndarray], ends: tuple[int, int]
 ) -> list[np.ndarray]:
-    """Which elements are on the first side of the cuts with the fewest nodes: of all these, the first and the last.
+    """Which elements (h,) are on the first side, for the first and the last of all cuts with the fewest nodes.
 
     Args:
         near: nodes (E, h) of elements low to high of an order.
-        nodes: (k,) those that a cut may pass through, rising; others do not hold parts together.
+        nodes: (k,) rising, nodes that a cut may pass through; other nodes do not connect parts.
         span: first and last element of each node in this order.
-        ends: low, high: elements before and after are on the one and on the other side.
+        ends: low and high; elements before low are on the first side, elements from high on are on the second side.
     """
     import scipy.sparse
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -148,7 +149,7 @@ def _smallest_cuts(
     into, element = at[known], 2 * k + np.broadcast_to(np.arange(h), near.shape)[known]
     first, last = np.flatnonzero(span[0][own] < low), np.flatnonzero(span[1][own] >= high)
     source, sink, inside = 2 * k + h, 2 * k + h + 1, np.arange(k)
-    # A way enters a node at its number and leaves it at k more. Only through a node itself is it narrow.
+    # A path enters node i at number i of the graph and leaves it at i + k. Only the edge between them has capacity 1.
     lines = np.concatenate([inside, k + into, element, np.full(len(first), source), k + last])
     columns = np.concatenate([k + inside, element, into, first, np.full(len(last), sink)])
     wide = np.where(np.arange(len(lines)) < k, 1, k + 1).astype(np.int32)
@@ -161,7 +162,7 @@ def _smallest_cuts(
 
 
 def _neighbours_together(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """The nodes in an order in which those of a part of space follow each other."""
+    """The nodes in an order in which near nodes follow each other."""
     if len(nodes) <= 8:
         return nodes
     side = points[nodes, np.argmax(np.ptp(points[nodes], axis=0))]

@@ -1,13 +1,13 @@
 """Factorisation of sparse symmetric matrices of a mesh, on the host, by dense matrices: real or complex symmetric.
 
-`liverjax.solvers.factors.dissection` has the order. Each group of nodes is eliminated in a dense matrix of itself and
+`liverjax.solvers.factors.dissection` gives the order. Each group of nodes is eliminated in a dense matrix of itself and
 its border (Duff and Reid 1983, ACM TOMS 9, 302), `PIVOTS` unknowns at a time, so that nearly all work is products of
-matrices. Groups whose children are done are eliminated side by side, one a core. By symmetry the lower triangles are
-enough. A piece that nothing else runs beside has its tiles side by side instead. Pivots are chosen within the unknowns
-that are eliminated together. Large matrices are factorised in single precision and solved with refinement: half the
-time and memory, and the same digits. Where that does not converge, double precision follows. Factors that are too many
-for the memory are kept as whole numbers of 16 bits, each row with a size of its own: half the memory again, with about
-two more steps of refinement.
+matrices. Groups whose children are done are eliminated in parallel, one per core. By symmetry the lower triangles are
+enough. If only one piece can run, its tiles run in parallel instead. Pivots are chosen within the unknowns that are
+eliminated together. Large matrices are factorised in single precision and solved with refinement: half the time and
+memory, and the same digits. If the refinement does not converge, double precision follows. Factors that would not fit
+in memory are kept as 16-bit integers, with a scale for each row: half the memory again, with about two more steps of
+refinement.
 """
 
 import itertools
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 #: Unknowns from which on single precision pays.
 SINGLE_FROM = 20_000
-#: Unknowns of a group that are eliminated together, and the side of the tiles of what they change.
+#: Unknowns of a group that are eliminated together, and the side of the tiles in which they change the rest.
 PIVOTS, TILE = 256, 256
 #: Part of all work below which groups are eliminated with their descendants, in one piece.
 PIECE = 1 / 32
-#: Steps of refinement, and the part of the terms of an equation that may be out of balance.
+#: Most steps of refinement; backward error that ends it, and backward error above which a solution is wrong.
 STEPS, ENOUGH, WRONG = 12, 4e-16, 1e-11
 
 
@@ -37,17 +37,17 @@ class Front(NamedTuple):
 
     own: np.ndarray  # (n,)
     border: np.ndarray  # (m,)
-    children: list[int]  # groups before it whose rest it takes in
+    children: list[int]  # earlier groups whose remaining matrices are added to this one
 
 
 class Eliminated(NamedTuple):
-    """Unknowns that were eliminated together: A^-1 of their own matrix, and X = A^-1 B of those that come after."""
+    """Unknowns that were eliminated together: A^-1 of their own matrix, and X = A^-1 B for the unknowns after them."""
 
     own: np.ndarray  # (n,)
     after: np.ndarray  # (m,)
     inverse: np.ndarray  # (n, n)
     X: np.ndarray  # (n, m), or whole numbers (n, m or 2 m)
-    sizes: np.ndarray | None = None  # (n,) what 1 of these numbers is in each row
+    sizes: np.ndarray | None = None  # (n,) value of the whole number 1 in each row
 
     def times(self, y: np.ndarray) -> np.ndarray:
         """X y, (n,)."""
@@ -71,18 +71,18 @@ class Factor(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Memory."""
+        """Memory [bytes]."""
         return self.matrix.data.nbytes + sum(step.inverse.nbytes + step.X.nbytes for step in self.steps)
 
 
 def fronts(
     neighbours: "scipy.sparse.csr_array", groups: list[tuple[np.ndarray, list[int]]], node: np.ndarray
 ) -> list[Front]:
-    """The groups as unknowns.
+    """The groups of nodes as groups of unknowns, with their borders.
 
     Args:
         neighbours: (V, V), an entry for each two nodes whose unknowns are coupled.
-        groups: of `liverjax.solvers.factors.dissection.dissected`.
+        groups: result of `liverjax.solvers.factors.dissection.dissected`.
         node: (N,) the node of each unknown.
     """
     order = np.argsort(node, kind="stable")
@@ -108,20 +108,20 @@ def _unknowns(nodes: np.ndarray, order: np.ndarray, ends: np.ndarray) -> np.ndar
 
 
 def single_bytes(plan: list[Front], kind: np.dtype) -> float:
-    """Memory of a factor in single precision of a matrix of this kind, real or complex."""
+    """Memory [bytes] of a factor in single precision; `kind` says whether the matrix is real or complex."""
     own, border = (np.array([len(part) for part in parts], float) for parts in zip(*(f[:2] for f in plan), strict=True))
     together = np.minimum(own, PIVOTS)
     return float(np.sum(own * (0.5 * (own + together) + border))) * (8 if kind.kind == "c" else 4)
 
 
 def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool, small: bool = False) -> Factor:
-    """Eliminate group after group.
+    """The factor of A, from the elimination of one group after the other.
 
     Args:
         A: (N, N).
         plan: `fronts`.
         single: in single precision.
-        small: keep whole numbers of 16 bits, in single precision only.
+        small: keep the factor as 16-bit integers; in single precision only.
 
     Raises:
         numpy.linalg.LinAlgError: values that are not finite, or a group whose own matrix has no inverse.
@@ -137,17 +137,17 @@ def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool, sma
 
 
 class _Elimination(NamedTuple):
-    """What the threads share."""
+    """Data that the threads share."""
 
     A: Any
     plan: list[Front]
     kind: np.dtype
     small: bool
-    rests: list[np.ndarray | None]  # what each group leaves to the next
-    steps: list[list[Eliminated]]  # of each group
+    rests: list[np.ndarray | None]  # the remaining matrix that each group leaves to its parent
+    steps: list[list[Eliminated]]  # results of each group
 
     def piece(self, groups: list[int], cores: int) -> None:
-        """Eliminate some groups, one after the other, the tiles of each on this number of cores."""
+        """Eliminate `groups` one after the other, with the tiles of each group on `cores` cores."""
         place = np.full(self.A.shape[0], -1)
         size = max(len(front.own) + len(front.border) for front in (self.plan[k] for k in groups))
         memory, scratch = np.empty(size**2, self.kind), np.empty((cores, min(size, TILE) ** 2), self.kind)
@@ -156,7 +156,7 @@ class _Elimination(NamedTuple):
             F, n = _matrix_of_group(self.A, front, place, memory), len(front.own)
             for c in front.children:
                 rest = self.rests[c]
-                if rest is not None:  # a part of the body that nothing couples with the others has left nothing
+                if rest is not None:  # None: a part of the body that is not coupled with the others
                     _add(F, place[self.plan[c].border], rest)
                     self.rests[c] = None
             place[front.own] = place[front.border] = -1
@@ -167,7 +167,7 @@ class _Elimination(NamedTuple):
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
-    """All groups in pieces, as many at a time as there are cores. The sums do not depend on who is first."""
+    """Eliminate all pieces, as many at a time as there are cores. The sums do not depend on which ends first."""
     pieces, waits_for = _work_in_pieces(own.plan)
     running: dict[Future, int] = {}
     with ThreadPoolExecutor(_cores()) as pool:
@@ -213,8 +213,9 @@ def _work_in_pieces(plan: list[Front]) -> tuple[list[list[int]], list[set[int]]]
 
 
 def _scaled(A: Any) -> tuple[Any, np.ndarray]:
-    """The matrix with scales (N,) on both sides that make the largest entry of every line nearly 1, and these (Ruiz
-    2001)."""
+    """The matrix with scales (N,) on both sides that make the largest entry of every row nearly 1, and these scales
+    (Ruiz 2001).
+    """
     import scipy.sparse
 
     A = A.tocsr()
@@ -230,8 +231,7 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
 
 
 def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """The columns of A of the group itself, on and below the diagonal; `place` says where its unknowns and border
-    are."""
+    """The group's own columns of A, on and below the diagonal; `place` gets its unknowns' and border's places."""
     n, size = len(front.own), len(front.own) + len(front.border)
     place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
     F = memory[: size * size].reshape((size, size), order="F")
@@ -244,7 +244,7 @@ def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray
 
 
 def _lower_triangle(F: np.ndarray) -> np.ndarray:
-    """A copy of it, with what stands above it in the tiles of the diagonal: half of the memory is never touched."""
+    """A copy of the lower triangle with whole tiles on the diagonal: half of the memory is never touched."""
     out = np.zeros(F.shape, F.dtype, order="F")
     for a in range(0, len(F), TILE):
         out[a:, a : a + TILE] = F[a:, a : a + TILE]
@@ -252,7 +252,7 @@ def _lower_triangle(F: np.ndarray) -> np.ndarray:
 
 
 def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
-    """Add a lower triangle to F at rising places `at`, of which many follow each other."""
+    """Add a lower triangle to F at rising places `at`, one run of consecutive places after the other."""
     ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1), len(at)]
     runs = [(a, b, at[a]) for a, b in itertools.pairwise(ends) if a < b]
     for k, (a, b, column) in enumerate(runs):
@@ -261,7 +261,7 @@ def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
 
 
 def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
-    """Eliminate a group in its matrix F (n + m, n + m), whose lower triangle becomes that of what is left."""
+    """Eliminate a group in its matrix F (n + m, n + m); the last m rows become the remaining lower triangle."""
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
     for a in range(0, n, PIVOTS):
         b = min(a + PIVOTS, n)
@@ -274,7 +274,7 @@ def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Elimin
 
 
 def _in_whole_numbers(step: Eliminated) -> Eliminated:
-    """The step with an X of 16 bits."""
+    """The step with X as 16-bit integers."""
     parts = np.ascontiguousarray(step.X).view(step.X.real.dtype)
     sizes = np.abs(parts).max(axis=1, initial=0.0) / np.iinfo(np.int16).max
     sizes = np.where(sizes > 0, sizes, 1.0).astype(parts.dtype)
@@ -294,9 +294,9 @@ def _inverted(A: np.ndarray) -> np.ndarray:
 
 
 def _taken_off(rest: np.ndarray, B: np.ndarray, inverse: np.ndarray, scratch: np.ndarray) -> np.ndarray:
-    """Take B^T A^-1 B, which is symmetric, off the lower triangle of `rest` (m, m), tile by tile; return A^-1 B.
+    """Subtract the symmetric B^T A^-1 B from the lower triangle of `rest` (m, m), tile by tile; return A^-1 B.
 
-    On as many cores as there are rows of `scratch`, each of which is a tile.
+    It runs on as many cores as `scratch` has rows; each row is memory for one tile.
     """
     X, starts = np.empty(B.shape, B.dtype), range(0, len(rest), TILE)
 
@@ -312,15 +312,14 @@ def _taken_off(rest: np.ndarray, B: np.ndarray, inverse: np.ndarray, scratch: np
     if len(scratch) == 1 or len(starts) < 4:
         columns(starts, scratch[0])
     else:
-        # Columns of tiles grow shorter: dealt out in turn, each core has about the same.
+        # Later columns have fewer tiles: dealt out in turn, each core gets about the same work.
         with ThreadPoolExecutor(len(scratch)) as pool:
             list(pool.map(columns, [starts[k :: len(scratch)] for k in range(len(scratch))], scratch))
     return X
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
-    """The refined solution x (N,) of A x = b, and its backward error: the residual of a line over the size of its
-    terms."""
+    """The refined solution x (N,) of A x = b, and its backward error: the residual over the size of its terms."""
     A, scale = factor.matrix, factor.scale
     b, x = scale * b, np.zeros(len(b), A.dtype)
     size, left, last = abs(A), b, np.inf
