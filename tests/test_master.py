@@ -54,13 +54,17 @@ def test_sweeps_with_a_gap_between_them_are_refused():
 
 
 def test_standard_errors_of_factors_are_right():
-    z = []
-    for seed in range(12):
+    z, of_law = [], []
+    for seed in range(24):
         found = shifts.found(sweeps(0.02, seed), TEMPERATURES, REFERENCE)
         free = np.arange(11) != REFERENCE
         z.append((found.log_a - TRUE)[free] / found.log_a_errors[free])
         assert 0.015 < found.apart < 0.025
-    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4  # neighbours share errors: 12 sets of about 3 independent ones
+        wlf = temperature_laws.temperature_laws_of(found)[0].numbers
+        of_law.append([(wlf[name][0] - true) / wlf[name][1] for name, true in (("C1", C1), ("C2_K", C2))])
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4  # neighbours share errors: 24 sets of about 3 independent ones
+    # C1 and C2 go together, so 24 values: 1 +- 0.3. As if the factors were independent, their errors were half as large.
+    assert 0.6 < np.sqrt(np.mean(np.square(of_law))) < 1.4
 
 
 def test_vertical_factors_are_found_where_the_curve_has_a_shape():
@@ -79,7 +83,8 @@ def test_laws_have_their_numbers_and_errors():
         value, error = wlf.numbers[name]
         assert abs(value - true) < 4 * error < 0.2 * true
     energy = 8e4 / (8.314462618 * np.log(10))
-    exact = found._replace(log_a=energy * (1 / TEMPERATURES - 1 / TEMPERATURES[REFERENCE]))
+    given = {"covariance": np.zeros((11, 11)), "given": True}
+    exact = found._replace(log_a=energy * (1 / TEMPERATURES - 1 / TEMPERATURES[REFERENCE]), **given)
     (law,) = (law for law in temperature_laws.temperature_laws_of(exact) if law.name == "Arrhenius")
     value, error = law.numbers["activation_energy_J_per_mol"]
     assert value == pytest.approx(8e4, rel=1e-9) and error < 1 and law.apart < 1e-12

@@ -47,7 +47,15 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
             place = int(np.argmin(np.abs(log_a)))
         log_a = log_a - log_a[place]
         found = Shifts(
-            T, place, log_a, none, none, none, shifts.distances_from_curve(data.sweeps, log_a, none), given=True
+            T,
+            place,
+            log_a,
+            none,
+            none,
+            none,
+            shifts.distances_from_curve(data.sweeps, log_a, none),
+            np.zeros((len(T), len(T))),
+            given=True,
         )
     else:
         found = shifts.found(data.sweeps, T, place, vertical)

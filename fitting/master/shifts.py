@@ -34,6 +34,7 @@ class Shifts(NamedTuple):
     log_b: np.ndarray  # (K,) log10 of b_T; 0 without vertical shifts
     log_b_errors: np.ndarray
     misfit: np.ndarray  # (K,) root mean square distance from the curve, relative
+    covariance: np.ndarray  # (K, K) of `log_a`: neighbours are matched to each other, so their errors are correlated
     given: bool = False
 
     @property
@@ -69,10 +70,14 @@ def found(sweeps: Sequence[Sweep], temperatures: np.ndarray, reference: int, ver
         if np.abs(moved).max() < CONVERGED:
             break
     _check_overlap(columns, log_a, temperatures)
-    spread = np.zeros((2, len(sweeps)))
-    spread[free] = _errors_of_shifts(A[:, kept], b, 2 * sum(len(c[0]) for c in columns))[: free.sum()]
+    covariance = np.zeros((2 * len(sweeps),) * 2)
+    own = _covariance(A[:, kept], b, 2 * sum(len(c[0]) for c in columns))[: free.sum(), : free.sum()]
+    covariance[np.ix_(free.ravel(), free.ravel())] = own
+    spread = np.sqrt(np.diag(covariance)).reshape(2, -1)
     misfit = distances_from_curve(sweeps, log_a, log_b)
-    return Shifts(temperatures, reference, log_a, spread[0], log_b, spread[1], misfit)
+    return Shifts(
+        temperatures, reference, log_a, spread[0], log_b, spread[1], misfit, covariance[: len(sweeps), : len(sweeps)]
+    )
 
 
 def _check_overlap(columns: list, log_a: np.ndarray, temperatures: np.ndarray) -> None:
@@ -144,11 +149,10 @@ def _linear_problem(columns: list, log_a: np.ndarray, log_b: np.ndarray) -> tupl
     return A, np.concatenate([*right, np.zeros(len(smooth))])  # the coefficients are at their minimum already
 
 
-def _errors_of_shifts(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
-    """Standard errors of all unknowns; the first `data` rows are of the data, the others keep the curve smooth."""
-    inverse = np.linalg.pinv(A)
-    noise = np.sqrt(np.sum(b[:data] ** 2) / max(1, data - A.shape[1]))
-    return noise * np.sqrt(np.sum(inverse[:, :data] ** 2, axis=1))
+def _covariance(A: np.ndarray, b: np.ndarray, data: int) -> np.ndarray:
+    """Covariance of all unknowns; the first `data` rows are of the data, the others keep the curve smooth."""
+    inverse = np.linalg.pinv(A)[:, :data]
+    return inverse @ inverse.T * np.sum(b[:data] ** 2) / max(1, data - A.shape[1])
 
 
 def _first_shifts(columns: list, temperatures: np.ndarray, reference: int) -> np.ndarray:

@@ -38,16 +38,25 @@ def temperature_laws_of(shifts: Shifts) -> list[TemperatureLaw]:
     return sorted(found, key=lambda law: law.apart)
 
 
-def _weights_of_factors(shifts: Shifts) -> np.ndarray:
-    return 1 / np.hypot(shifts.log_a_errors, LEAST)
+def _whitening(shifts: Shifts) -> np.ndarray:
+    """Rows W with W^T W = C^-1, where C is the covariance of the factors beside the reference, with `LEAST` added."""
+    free = np.arange(len(shifts.log_a)) != shifts.reference
+    least = LEAST if shifts.given else 0.1 * LEAST
+    C = shifts.covariance[np.ix_(free, free)] + least**2 * np.eye(free.sum())
+    return np.linalg.inv(np.linalg.cholesky(C)) @ np.eye(len(free))[free]
+
+
+def _noise(off: np.ndarray, numbers: int, given: bool) -> float:
+    """Variance by which the covariance is multiplied, from whitened residuals; factors with errors keep at least 1."""
+    found = float(off @ off) / max(1, len(off) - numbers)
+    return found if given else max(1.0, found)
 
 
 def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
-    x, w = (1 / T - 1 / T0) / (GAS * np.log(10)), _weights_of_factors(shifts)
-    energy = float(np.sum(w**2 * x * shifts.log_a) / np.sum(w**2 * x**2))
+    x, W = (1 / T - 1 / T0) / (GAS * np.log(10)), _whitening(shifts)
+    energy = float((W @ x) @ (W @ shifts.log_a) / np.sum((W @ x) ** 2))
     off = energy * x - shifts.log_a
-    freedom = max(1, len(T) - 2)
-    error = float(np.sqrt(np.sum((w * off) ** 2) / freedom / np.sum(w**2 * x**2)))
+    error = float(np.sqrt(_noise(W @ off, 1, shifts.given) / np.sum((W @ x) ** 2)))
 
     def at(T: np.ndarray) -> np.ndarray:
         return energy * (1 / T - 1 / T0) / (GAS * np.log(10))
@@ -58,7 +67,7 @@ def _arrhenius(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw:
 
 def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
     """The WLF law; None if the factors curve the other way, because then the law has no finite numbers."""
-    w = _weights_of_factors(shifts)
+    W = _whitening(shifts)
 
     # C2 stays above T0 minus the lowest temperature: the law has its pole at T0 - C2.
     lowest = T0 - T.min()
@@ -68,13 +77,13 @@ def _wlf(T: np.ndarray, T0: float, shifts: Shifts) -> TemperatureLaw | None:
 
     best = None
     for first in (np.log(5.0), np.log(50.0), np.log(300.0)):
-        got = scipy.optimize.least_squares(lambda u: w * (curve(u, T) - shifts.log_a), [10.0, first], method="lm")
+        got = scipy.optimize.least_squares(lambda u: W @ (curve(u, T) - shifts.log_a), [10.0, first], method="lm")
         best = got if best is None or got.cost < best.cost else best
     assert best is not None
     c1, c2 = float(best.x[0]), float(np.exp(best.x[1]) + lowest)
     if not (0 < c1 < 1e3 and c2 < 1e4):
         return None
-    noise = 2 * best.cost / max(1, len(T) - 3)
+    noise = _noise(best.fun, 2, shifts.given)
     covariance = np.linalg.pinv(best.jac.T @ best.jac) * noise
     errors = np.sqrt(np.diag(covariance)) * np.array([1.0, np.exp(best.x[1])])
     off = curve(best.x, T) - shifts.log_a

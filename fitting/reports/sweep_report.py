@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitting.fits.families import models
+from fitting.fits.families import limits, models
 from fitting.fits.honesty import edges, moduli_errors, total_error
 from fitting.fits.posterior import Posterior
 from fitting.fits.simulated_rheometer import largest_shift
@@ -50,6 +50,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
     u, n = fit.uncertainty, fit.modes
     errors = fit.relative_errors(sweep)
     e = u.standard_errors
+    limiting = limits.errors(u, fit.model, fit.parameters)
     return {
         "method": fit.method,
         "model": fit.kind.name,
@@ -60,8 +61,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "ratios": fit.model.ratios.tolist(),
         "relaxation_times": fit.model.relaxation_times.tolist(),
         "standard_errors": {
-            "shear_modulus": e[0],
-            "equilibrium_modulus": equilibrium_error(u),
+            **limiting,
             "ratios": e[1 : n + 1].tolist(),
             "relaxation_times": e[n + 1 :].tolist(),
         },

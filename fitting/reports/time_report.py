@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fitting.fits.families import limits
 from fitting.fits.posterior import Posterior
 from fitting.fits.time_tests import TimeFit
 from fitting.methods import time_response
@@ -41,8 +42,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             "ratios": fit.model.ratios.tolist(),
             "relaxation_times": fit.model.relaxation_times.tolist(),
             "standard_errors": {
-                "shear_modulus": e[0],
-                "equilibrium_modulus": equilibrium_error(u),
+                **limits.errors(u, fit.model, fit.parameters),
                 "ratios": e[1 : n + 1].tolist(),
                 "relaxation_times": e[n + 1 :].tolist(),
             },

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fitting.fits.families import limits
 from fitting.fits.time_tests import thinned
 from fitting.fits.together import Share, Together
 from fitting.methods.generalised_maxwell import moduli
@@ -48,7 +49,7 @@ def write(out: Path, found: Together) -> Content:
             "equilibrium_modulus": _equilibrium(found),
             "ratios": found.model.ratios.tolist(),
             "relaxation_times": found.model.relaxation_times.tolist(),
-            "standard_errors": _by_name(u.standard_errors, n) | {"equilibrium_modulus": equilibrium_error(u)},
+            "standard_errors": _by_name(u.standard_errors, n) | limits.errors(u, found.model, found.parameters),
             "interval_quantile_95": u.quantile,
             "correlation": u.correlation.tolist(),
             "correlation_names": list(u.names),

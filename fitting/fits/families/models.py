@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import viscoelastic
+from fitting.fits.families import limits
 from fitting.fits.families.choice import contains, label_of, preferred
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion, number_of_parameters
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
@@ -125,6 +126,7 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
             f"{fit.modes} Prony modes follow the model {fit.kind.name} to {100 * made.error:.2g} % only; simulate a "
             "narrower band with --max-frequency"
         )
+    sentences += limits.sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
     warnings = (*fit.warnings, *sentences, *_undetermined(fit))
     details = fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}}
     return fit._replace(details=details, warnings=warnings)

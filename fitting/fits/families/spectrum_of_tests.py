@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import time_tests, together
+from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Together
 from fitting.fits.viscoelastic import Kind
@@ -180,6 +181,7 @@ def _as_a_fit(
         },
     }
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(u)))
+    sentences += limits.sentences("spectrum", spread, model, own)
     return SpectrumFit(kind, model, solution, spread, own, details, tuple(sentences))
 
 

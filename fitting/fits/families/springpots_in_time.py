@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import time_tests, together, viscoelastic
-from fitting.fits.families import choice, models, spectrum_of_tests
+from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
@@ -152,6 +152,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
     own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
     spread = uncertainty.estimate(solution, over_noise, kind.maxwell)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(solution.u)))
+    sentences += limits.sentences(case.name, spread, model, own)
     return _Springpot(case, kind, model, solution, spread, own, tuple(sentences), made.error)
 
 
