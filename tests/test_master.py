@@ -63,7 +63,7 @@ def test_standard_errors_of_factors_are_right():
         wlf = temperature_laws.temperature_laws_of(found)[0].numbers
         of_law.append([(wlf[name][0] - true) / wlf[name][1] for name, true in (("C1", C1), ("C2_K", C2))])
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4  # neighbours share errors: 24 sets of about 3 independent ones
-    # C1 and C2 go together, so 24 values: 1 +- 0.3. As if the factors were independent, their errors were half as large.
+    # C1 and C2 go together, so 24 values: 1 +- 0.3. With independent factors their errors were half as large.
     assert 0.6 < np.sqrt(np.mean(np.square(of_law))) < 1.4
 
 

@@ -124,7 +124,11 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
     names = sorted({n for row in known for n in row if "[" in n}, key=lambda n: (n.split("[")[0], _place(n)))
     for name in (*(n for n in known[0] if "[" not in n), *names):
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
-        out[name] = population(pairs[:, 0], pairs[:, 1])
+        found = population(pairs[:, 0], pairs[:, 1])
+        if found is not None and name.startswith("ratios["):  # a part of the modulus
+            ends = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
+            found = found._replace(**dict(zip(("mean_interval", "new_interval"), ends, strict=True)))
+        out[name] = found
     return out
 
 

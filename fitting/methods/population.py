@@ -3,6 +3,11 @@
 The logarithm y_i of sample i has the mean mu, a spread s between samples and an error e_i: y_i ~ N(mu, s^2 + e_i^2).
 s is estimated by restricted maximum likelihood, the interval of mu after Hartung and Knapp (2001), Statistics in
 Medicine 20, the one of a new sample after Higgins, Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172.
+
+Few samples say little about s. The values of the samples moved towards the mean are therefore means over all s, weighed
+by the restricted likelihood and by a half-Cauchy prior of scale 1 (Gelman 2006, Bayesian Analysis 1, 515), and their
+errors contain those of s and mu. Hartung and Knapp's interval is too narrow if few samples carry most of the weight;
+then the interval of the mean over all s is used, if it is wider.
 """
 
 from typing import NamedTuple
@@ -10,6 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 import scipy.stats
+
+#: Effective over real number of samples below which Hartung and Knapp's interval is too narrow.
+EVEN = 0.8
+#: A number below this part of the mean, with a larger error, is not that of a sample of the population.
+BELOW = 1e-3
 
 
 class Population(NamedTuple):
@@ -19,7 +29,7 @@ class Population(NamedTuple):
     spread: float  # standard deviation of the logarithms between samples
     mean_interval: tuple[float, float]
     new_interval: tuple[float, float]  # of a further sample
-    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean according to their errors
+    pooled: np.ndarray  # (n,) values of the samples, moved towards the mean according to their errors; NaN: below reach
     pooled_errors: np.ndarray  # (n,) standard deviations of their logarithms
 
 
@@ -35,17 +45,67 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     n = len(y)
     half = float(scipy.stats.t.ppf(0.975, n - 1)) * sd
     half_new = float(scipy.stats.t.ppf(0.975, max(1, n - 2))) * float(np.hypot(np.sqrt(variance), sd))
-    pooled, pooled_errors = np.full(len(values), mean), np.full(len(values), np.sqrt(variance))
-    trust = variance / (variance + v)
-    pooled[known], pooled_errors[known] = mean + trust * (y - mean), np.sqrt(trust * v)
+    intervals = (mean - half, mean + half), (mean - half_new, mean + half_new)
+    over = _over_spreads(y, v)
+    w = 1 / (v + variance)
+    if np.sum(w) ** 2 / np.sum(w**2) < EVEN * n:
+        whole = over.interval(0.0), over.interval(1.0)
+        intervals = tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(intervals, whole, strict=True))
+    pooled, pooled_errors = np.full((2, len(values)), np.nan)
+    # Samples that determine nothing are like a new one; a value far below the others is another material.
+    silent = ~known & (values > BELOW * np.exp(mean))
+    pooled[silent], pooled_errors[silent] = over.moved(np.zeros(silent.sum()), np.full(silent.sum(), 1e12))
+    pooled[known], pooled_errors[known] = over.moved(y, v)
+    mean_interval, new_interval = ((float(np.exp(a)), float(np.exp(b))) for a, b in intervals)
     return Population(
         mean=float(np.exp(mean)),
         spread=float(np.sqrt(variance)),
-        mean_interval=(float(np.exp(mean - half)), float(np.exp(mean + half))),
-        new_interval=(float(np.exp(mean - half_new)), float(np.exp(mean + half_new))),
+        mean_interval=mean_interval,
+        new_interval=new_interval,
         pooled=np.exp(pooled),
         pooled_errors=pooled_errors,
     )
+
+
+class _Spreads(NamedTuple):
+    """Spreads s (K,) with their weights, and the mean at each of them with its variance."""
+
+    s: np.ndarray
+    weight: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+
+    def moved(self, y: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values (n,) of samples with the variances v of their errors, moved towards the mean; standard deviations."""
+        trust = self.s[:, None] ** 2 / (self.s[:, None] ** 2 + v)
+        at = self.mean[:, None] + trust * (y - self.mean[:, None])
+        variances = trust * v + (1 - trust) ** 2 * self.variance[:, None]
+        middle = self.weight @ at
+        return middle, np.sqrt(self.weight @ (variances + (at - middle) ** 2))
+
+    def interval(self, share: float) -> tuple[float, float]:
+        """The 95 % interval of the mean, with this share of the variance between samples: 1 for a new sample."""
+        sd = np.sqrt(self.variance + share * self.s**2)
+        ends = float(np.min(self.mean - 40 * sd)), float(np.max(self.mean + 40 * sd))
+
+        def quantile(q: float) -> float:
+            return float(
+                scipy.optimize.brentq(lambda x: self.weight @ scipy.stats.norm.cdf((x - self.mean) / sd) - q, *ends)
+            )
+
+        return quantile(0.025), quantile(0.975)
+
+
+def _over_spreads(y: np.ndarray, v: np.ndarray) -> _Spreads:
+    """Weights of spreads by the restricted likelihood and the prior."""
+    size = float(np.sqrt(np.var(y) + np.mean(v)))
+    s = np.concatenate([[0.0], np.geomspace(1e-4 * size, max(100 * size, 30.0), 400)])
+    w = 1 / (v + s[:, None] ** 2)
+    total = np.sum(w, axis=1)
+    mean = np.sum(w * y, axis=1) / total
+    log = -0.5 * (np.sum(w * (y - mean[:, None]) ** 2 - np.log(w), axis=1) + np.log(total))
+    weight = np.exp(log - log.max()) / (1 + s**2) * np.gradient(s)
+    return _Spreads(s, weight / weight.sum(), mean, 1 / total)
 
 
 def _variance_between(y: np.ndarray, v: np.ndarray) -> float:

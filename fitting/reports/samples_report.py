@@ -115,8 +115,12 @@ def warnings(found: Samples) -> list[str]:
             out.append(f"{name}: it is {np.round(own[0]):g} in all samples, the springpot is a pure spring or dashpot")
         elif p is None:
             out.append(f"{name}: fewer than two samples determine it; it has no population")
-        elif p.spread == 0:
-            out.append(f"{name}: the errors of the samples explain their spread; no spread between samples is seen")
+        else:
+            if p.spread == 0:
+                out.append(f"{name}: the errors of the samples explain their spread; no spread between samples is seen")
+            without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
+            if without:
+                out.append(f"{name}: {', '.join(without)} has none (a fluid?), so the population is that of the others")
     failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
     if failed:
         out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
@@ -125,6 +129,10 @@ def warnings(found: Samples) -> list[str]:
         ("Kramers-Kronig", "the data do not agree with themselves"),
         ("structured misfit", "the misfit has structure"),
         ("half decade", "the ends of the band decide some numbers"),
+        ("(a fluid)", "the equilibrium modulus cannot be distinguished from zero"),
+        ("have merged", "two relaxation times have merged"),
+        ("extrapolated", "a relaxation time lies outside of what the frequencies resolve"),
+        ("use fewer modes", "a mode is not needed or not determined"),
     ):
         count = sum(any(words in w for w in f.warnings) for f in found.fits)
         if count:
