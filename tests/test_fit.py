@@ -392,3 +392,35 @@ def test_a_point_without_derivatives_is_not_gone_to():
     assert not bool(lost.converged)
     half, _ = spread(np.full((3, 1), np.nan), 1.0, np.ones((1, 1)))
     assert np.all(np.isinf(half))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"storage": [1.0, 2.0]}, "storage is of type list: give an array"),
+        ({"loss": np.ones(3)}, r"loss has shape \(3,\): give one number per frequency"),
+        ({"loss": np.append(np.ones(15), -1.0)}, r"loss\[15\] = -1 must be above 0"),
+        ({"storage": np.append(np.ones(15), np.nan)}, r"storage\[15\] = nan must be above 0"),
+        ({"storage_sd": np.ones(16)}, "only one of storage_sd and loss_sd is given"),
+        ({"storage_sd": np.zeros(16), "loss_sd": np.ones(16)}, r"storage_sd\[0\] = 0 must be above 0"),
+        ({"angular_frequency": OMEGA[::-1]}, "angular_frequency must be in ascending order"),
+        ({"angular_frequency": OMEGA * 1j}, "angular_frequency is of type ndarray: give an array of real"),
+    ],
+)
+def test_sweeps_made_in_python_are_refused_in_one_sentence(change, words):
+    for fit in (lambda s: viscoelastic.closed_form(s, 1), generalised_maxwell.refuse_impossible):
+        with pytest.raises(InputError, match=words):
+            fit(sweep()._replace(**change))
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"modes": 2.0}, "modes = 2.0 must be a whole number"),
+        ({"modes": "auto"}, "modes = 'auto' must be a whole number: give e.g. 2, or call choose_modes"),
+        ({"modes": 2, "optimizer": "foo"}, "optimizer = 'foo' is not known"),
+    ],
+)
+def test_unknown_choices_of_a_fit_are_refused(more, words):
+    with pytest.raises(InputError, match=words):
+        viscoelastic.closed_form(sweep(), **more)

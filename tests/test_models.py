@@ -11,10 +11,12 @@ from conftest import ROOT, SHARED
 
 from fitting.__main__ import main
 from fitting.fits import simulated_rheometer, viscoelastic
+from fitting.fits.families import limits as family_limits
 from fitting.fits.families import models
 from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep, read_sweep
+from fitting.reports import sweep_report
 from liverjax import InputError
 
 pytestmark = pytest.mark.quick_to_compile
@@ -388,3 +390,26 @@ def test_a_master_curve_of_26_decades_is_followed_by_the_spectrum():
     # The noise of 2 % is averaged over about seven moduli a parameter.
     assert np.mean(np.abs(np.concatenate([f.storage, f.loss]) / exact - 1)) < 0.012
     assert f.details["spectrum"]["decades_carried"] > 20
+
+
+@pytest.mark.parametrize(
+    ("name", "limits"), [("fractional_zener", (1200.0, 300.0)), ("fractional_kelvin_voigt", (None, 300.0))]
+)
+def test_limits_of_prony_modes_have_the_error_of_their_band(name, limits):
+    """The modes follow the model within the band only: their limits were 13 and 22 of their standard errors off."""
+    s = fractional_sweep(name, 0.01, omega=np.geomspace(0.1, 100, 30))
+    (fit,) = (f for f in models.fractional(s) if f.kind.name == name)
+    content = sweep_report.summary(fit, s)
+    for key, true in zip(("shear_modulus", "equilibrium_modulus"), limits, strict=True):
+        if true is not None:
+            assert abs(content[key] - true) < 3 * content["standard_errors"][key]
+            assert abs(content[key] - true) > 3 * family_limits.limit_errors(fit.uncertainty, fit.model, None)[key]
+            assert any(f"{family_limits.NAMES[key]} of the" in w and "measured band only" in w for w in fit.warnings)
+    prony = viscoelastic.closed_form(s, 2)
+    assert sweep_report.summary(prony, s)["standard_errors"]["shear_modulus"] == prony.uncertainty.standard_errors[0]
+
+
+def test_an_exponent_at_its_bound_is_told():
+    s = Sweep(OMEGA, 1e-3 * OMEGA, 10.0 * OMEGA)
+    (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")
+    assert any("exponent is at its bound 1: the springpot is a dashpot" in w for w in fit.warnings)

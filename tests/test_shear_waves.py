@@ -92,3 +92,12 @@ def test_bad_files_are_refused(tmp_path, text, words):
     (tmp_path / "w.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         dispersion.read_dispersion(tmp_path / "w.csv")
+
+
+def test_waves_are_cut_to_the_band_as_sweeps_are():
+    w = waves(0.0)
+    cut = dispersion.in_band(w, None, HIGH[5] / (2 * np.pi))
+    assert np.array_equal(cut.angular_frequency, HIGH[:6]) and np.array_equal(cut.velocity, w.velocity[:6])
+    assert "6 waves outside" in cut.notes[-1] and dispersion.in_band(w, 0.0, None) is w
+    with pytest.raises(InputError, match="2 waves lie in the band"):
+        dispersion.in_band(w, None, HIGH[1] / (2 * np.pi))

@@ -239,3 +239,12 @@ def test_polystyrene_in_three_tests(tmp_path, capsys):
     content = json.loads((tmp_path / "fit.json").read_text())
     assert any("do not agree" in w for w in content["warnings"])
     assert max(t["misfit"] for t in content["tests"]) < 0.4
+
+
+def test_one_measurement_does_not_count_twice(tmp_path, capsys):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n1,100,10\n2,110,11\n")
+    for arguments in (["a.csv", "--with", "b.csv"], ["a.csv", "b.csv"]):
+        paths = [str(tmp_path / a) if a.endswith("csv") else a for a in arguments]
+        assert main([*paths, "--out", str(tmp_path / "o")]) == 2
+        assert "it is the same measurement as" in capsys.readouterr().err

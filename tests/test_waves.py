@@ -381,3 +381,12 @@ def test_one_component_is_not_enough_for_forces(tmp_path, capsys):
     np.savez(tmp_path / "one.npz", displacement=field.displacement[..., :1], spacing=H, frequencies=HERTZ)
     assert command.main(["waves", str(tmp_path / "one.npz"), "--out", str(tmp_path)]) == 2
     assert "three components" in capsys.readouterr().err
+
+
+def test_waves_of_the_other_sign_are_told(small):
+    """Conjugate waves, of exp(-i omega t), have the modulus of a solid that gains energy."""
+    field = small.field._replace(displacement=np.conj(small.field.displacement))
+    other = elastography.organ_of(field, elastography.body_of(field), DENSITY)
+    assert not waves_report._sign(small, elastography.regions_of(small))
+    (told,) = waves_report._sign(other, elastography.regions_of(other))
+    assert "loss modulus is negative at 60 Hz, 100 Hz" in told and "complex conjugate" in told

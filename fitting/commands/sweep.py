@@ -261,10 +261,32 @@ def _check(options: argparse.Namespace) -> None:
         )
     if options.profile and options.model != "prony":
         raise InputError(f"--profile works with --model prony only; leave it out for --model {options.model}")
+    _note_idle(options)
+    _refuse_copies([*options.sweep, *options.others])
     shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
         raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
     laws.find(options.law)
+
+
+def _note_idle(options: argparse.Namespace) -> None:
+    """Print a note on options of the simulation that the closed form does not use."""
+    several = len(options.sweep) > 1 or bool(options.others) or options.master is not None
+    if options.method == "torsion" or (options.method is None and not several):
+        return
+    idle = {"--steps": options.steps != 50, "--scheme": options.scheme != "exponential"}
+    idle["--law"] = options.law != "neo_hookean" and not options.precompression
+    for name in (name for name, changed in idle.items() if changed):
+        print(f"note: {name} is for the simulation: it changes nothing in the closed form", file=sys.stderr)
+
+
+def _refuse_copies(files: list[Path]) -> None:
+    """Refuse files with the same content: they are one measurement, which would count twice."""
+    seen: dict[bytes, Path] = {}
+    for file in (file for file in files if file.is_file()):
+        first = seen.setdefault(file.read_bytes(), file)
+        if first is not file:
+            raise InputError(f"{file}: it is the same measurement as {first}: give each once")
 
 
 def _check_friction(options: argparse.Namespace) -> None:
@@ -396,6 +418,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
         print(f"note: {note}", file=sys.stderr)
     if options.gap_error:  # before the sentences that compare with the errors
         closed = instrument.with_gap_error(closed, options.gap_error / simulation.height)
+    if corrected is not sweep:
+        dense = generalised_maxwell.spectrum(corrected)
     fits = [edges.honest(closed, corrected, dense)]
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation))

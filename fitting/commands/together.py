@@ -55,7 +55,8 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
         return read_described(path)
 
     if dispersion.names_velocities(path):
-        return dispersion.read_dispersion(path, options.density)
+        waves = dispersion.read_dispersion(path, options.density)
+        return waves if whole else dispersion.in_band(waves, options.min_frequency, options.max_frequency)
     try:
         sweep = rheometer.read_sweep(path)
     except InputError as no_sweep:

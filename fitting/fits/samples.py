@@ -126,8 +126,8 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
         pairs = np.array([row.get(name, (0.0, np.inf)) for row in known])
         found = population(pairs[:, 0], pairs[:, 1])
         if found is not None and name.startswith("ratios["):  # a part of the modulus
-            ends = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
-            found = found._replace(**dict(zip(("mean_interval", "new_interval"), ends, strict=True)))
+            of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
+            found = found._replace(mean_interval=of_mean, new_interval=of_new)
         out[name] = found
     return out
 

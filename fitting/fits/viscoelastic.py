@@ -14,6 +14,7 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import Solution, bfgs, from_starts
+from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
@@ -95,7 +96,12 @@ def best_of(minimise: Callable, residuals: Callable, each: int = 0) -> Callable[
 
 def check_modes(sweep: Sweep, modes: int) -> None:
     """Raise `InputError`, with the largest number of modes, if the sweep has too few points for the parameters."""
+    check_sweep(sweep)
     largest = generalised_maxwell.largest_number_of_modes(sweep)
+    if isinstance(modes, bool) or not isinstance(modes, (int, np.integer)):
+        raise InputError(f"modes = {modes!r} must be a whole number: give e.g. 2, or call choose_modes")
+    if largest < 1:
+        raise InputError(f"{sweep.source or 'sweep'}: one frequency determines no mode: measure at more frequencies")
     if modes < 1:
         raise InputError(f"--modes {modes} must be at least 1, or auto")
     if modes > largest:
@@ -115,6 +121,8 @@ def closed_form(sweep: Sweep, modes: int, dense: Spectrum | None = None, optimiz
         optimizer: one of `OPTIMIZERS`.
     """
     check_modes(sweep, modes)
+    if optimizer not in OPTIMIZERS:
+        raise InputError(f"optimizer = {optimizer!r} is not known: use {' or '.join(OPTIMIZERS)}")
     dense = dense or generalised_maxwell.refuse_impossible(sweep)
     return modes_from(sweep, generalised_maxwell.starts(sweep, modes, dense), Kind(), optimizer)
 

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.optimize
 
 from fitting.methods.host import Array, arrays_of
+from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
 
@@ -163,6 +164,7 @@ HOPELESS = 0.3
 
 def refuse_impossible(sweep: Sweep) -> Spectrum:
     """The dense spectrum; raises `InputError` if no generalised Maxwell solid is near the data."""
+    check_sweep(sweep)
     dense = spectrum(sweep)
     if dense.misfit > HOPELESS:
         above = np.median(sweep.loss / sweep.storage)

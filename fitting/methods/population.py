@@ -16,6 +16,8 @@ import numpy as np
 import scipy.optimize
 import scipy.stats
 
+from liverjax.core.errors import InputError
+
 #: Effective over real number of samples below which Hartung and Knapp's interval is too narrow.
 EVEN = 0.8
 #: A number below this part of the mean, with a larger error, is not that of a sample of the population.
@@ -36,6 +38,8 @@ class Population(NamedTuple):
 def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     """Mean and spread of positive values (n,) with standard errors (n,); None if the data determine fewer than two."""
     values, errors = np.asarray(values, float), np.asarray(errors, float)
+    if values.ndim != 1 or values.shape != errors.shape or np.any(errors < 0):
+        raise InputError(f"values {values.shape}, errors {errors.shape}: give one error of at least 0 per value (n,)")
     known = (values > 0) & np.isfinite(values) & np.isfinite(errors) & (errors < 10 * values)
     if known.sum() < 2:
         return None
@@ -50,7 +54,8 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     w = 1 / (v + variance)
     if np.sum(w) ** 2 / np.sum(w**2) < EVEN * n:
         whole = over.interval(0.0), over.interval(1.0)
-        intervals = tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(intervals, whole, strict=True))
+        first, second = ((min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(intervals, whole, strict=True))
+        intervals = first, second
     pooled, pooled_errors = np.full((2, len(values)), np.nan)
     # Samples that determine nothing are like a new one; a value far below the others is another material.
     silent = ~known & (values > BELOW * np.exp(mean))

@@ -68,6 +68,31 @@ class Sweep(NamedTuple):
         return float(1 / self.angular_frequency[-1]), float(1 / self.angular_frequency[0])
 
 
+def check_sweep(sweep: Sweep) -> None:
+    """Refuse numbers that make no sweep, for sweeps made in Python; readers refuse them with line and column.
+
+    Raises:
+        InputError: one sentence naming the field, its value and the remedy.
+    """
+    name, first = sweep.source or "sweep", np.shape(sweep.angular_frequency)
+    fields = {key: getattr(sweep, key) for key in ("angular_frequency", "storage", "loss", "storage_sd", "loss_sd")}
+    for key, values in fields.items():
+        if values is None and key.endswith("_sd"):
+            continue
+        kind = getattr(getattr(values, "dtype", None), "kind", "")
+        if kind not in ("f", "i", "u"):
+            raise InputError(f"{name}: {key} is of type {type(values).__name__}: give an array of real numbers (n,)")
+        if values.ndim != 1 or values.shape != first or not len(values):
+            raise InputError(f"{name}: {key} has shape {values.shape}: give one number per frequency, here {first}")
+        wrong = np.flatnonzero(~(np.isfinite(values) & (values > 0)))
+        if wrong.size:
+            raise InputError(f"{name}: {key}[{wrong[0]}] = {values[wrong[0]]:g} must be above 0: correct or remove it")
+    if (sweep.storage_sd is None) != (sweep.loss_sd is None):
+        raise InputError(f"{name}: only one of storage_sd and loss_sd is given: give both, or neither")
+    if np.any(np.diff(sweep.angular_frequency) < 0):
+        raise InputError(f"{name}: angular_frequency must be in ascending order: sort the points")
+
+
 def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
     """Relative standard deviation of points about a smooth curve, from four neighbours at a time (robust).
 

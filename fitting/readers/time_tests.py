@@ -201,7 +201,8 @@ def from_rest(
     if not at_once and abs(driven[0]) > AT_REST * np.max(np.abs(driven)):
         notes.append(
             f"the rows begin at {time[0]:.3g} s under load: a linear ramp from 0 s on is assumed. If it was a step at "
-            "0 s, say --ramp 0 (in a description: ramp = 0), or put a row with this load at 0 s"
+            "0 s, put a row with this load at 0 s, or (relaxation and creep alone) say --ramp 0 (in a description: "
+            "ramp = 0)"
         )
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
 

@@ -50,7 +50,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
     u, n = fit.uncertainty, fit.modes
     errors = fit.relative_errors(sweep)
     e = u.standard_errors
-    limiting = limits.errors(u, fit.model, fit.parameters)
+    limiting = limits.limit_errors(u, fit.model, fit.parameters)
     return {
         "method": fit.method,
         "model": fit.kind.name,

@@ -42,7 +42,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             "ratios": fit.model.ratios.tolist(),
             "relaxation_times": fit.model.relaxation_times.tolist(),
             "standard_errors": {
-                **limits.errors(u, fit.model, fit.parameters),
+                **limits.limit_errors(u, fit.model, fit.parameters),
                 "ratios": e[1 : n + 1].tolist(),
                 "relaxation_times": e[n + 1 :].tolist(),
             },

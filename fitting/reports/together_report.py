@@ -49,7 +49,7 @@ def write(out: Path, found: Together) -> Content:
             "equilibrium_modulus": _equilibrium(found),
             "ratios": found.model.ratios.tolist(),
             "relaxation_times": found.model.relaxation_times.tolist(),
-            "standard_errors": _by_name(u.standard_errors, n) | limits.errors(u, found.model, found.parameters),
+            "standard_errors": _by_name(u.standard_errors, n) | limits.limit_errors(u, found.model, found.parameters),
             "interval_quantile_95": u.quantile,
             "correlation": u.correlation.tolist(),
             "correlation_names": list(u.names),

@@ -177,7 +177,7 @@ def _of_map(drawn: WaveMap) -> Content:
 
 
 def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
-    told, each = [], found.whole if found.parts is None else found.parts
+    told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
             continue
@@ -210,6 +210,18 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
             "a body that does not move like a viscous solid"
         )
     return told
+
+
+def _sign(organ: Organ, found: Found) -> list[str]:
+    """A sentence if the loss modulus of the whole organ is negative, which no passive material has."""
+    rows = zip(organ.field.frequencies, found.whole.modulus, found.whole.standard_errors, strict=True)
+    wrong = [f"{f:g} Hz" for f, G, error in rows if G.imag.min() < -3 * error.imag.max()]
+    if not wrong:
+        return []
+    return [
+        f"the loss modulus is negative at {', '.join(wrong)}, which no tissue has: here the motion is the real part of "
+        "U exp(+i omega t), so take the complex conjugate of waves of the other sign"
+    ]
 
 
 def _short(chi2: float) -> str:

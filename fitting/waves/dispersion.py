@@ -88,6 +88,30 @@ def read_dispersion(path: str | os.PathLike, density: float | None = None) -> Di
     )
 
 
+def in_band(waves: Dispersion, low: float | None, high: float | None) -> Dispersion:
+    """The waves at frequencies from `low` to `high` [Hz]; a note says how many are left out.
+
+    Raises:
+        InputError: fewer than `FEWEST` frequencies are left.
+    """
+    hertz = waves.angular_frequency / (2 * np.pi)
+    kept = (hertz >= (0.0 if low is None else low) * (1 - 1e-9)) & (
+        hertz <= (np.inf if high is None else high) * (1 + 1e-9)
+    )
+    if kept.all():
+        return waves
+    if len(np.unique(hertz[kept])) < FEWEST:
+        raise InputError(f"{waves.source}: {kept.sum()} waves lie in the band that the command names; widen the band")
+    attenuation = None if waves.attenuation is None else waves.attenuation[kept]
+    note = f"{np.sum(~kept)} waves outside of the band asked for are left out"
+    return waves._replace(
+        angular_frequency=waves.angular_frequency[kept],
+        velocity=waves.velocity[kept],
+        attenuation=attenuation,
+        notes=(*waves.notes, note),
+    )
+
+
 def _header(lines: list[str]) -> tuple[int, str, dict[str, tuple[int, str]]] | None:
     """Number and delimiter of the first line that names all needed quantities, with their places and units."""
     for k, line in enumerate(lines):

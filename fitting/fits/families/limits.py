@@ -32,16 +32,16 @@ def of_the_modes(model: Maxwell) -> dict[str, float]:
     return {"shear_modulus": G, "equilibrium_modulus": max(0.0, G * (1 - float(np.sum(np.asarray(model.ratios)))))}
 
 
-def errors(modes: Estimate, model: Maxwell, own: Estimate | None) -> dict[str, float]:
+def limit_errors(modes: Estimate, model: Maxwell, own: Estimate | None) -> dict[str, float]:
     """Standard errors [Pa] of the limits of Prony modes, with the difference from the model's own limits."""
     found = {"shear_modulus": float(modes.standard_errors[0]), "equilibrium_modulus": equilibrium_error(modes)}
     here = of_the_modes(model)
     return found | {name: float(np.hypot(found[name], there - here[name])) for name, there in of_the_model(own).items()}
 
 
-def sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | None) -> list[str]:
+def limit_sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | None) -> list[str]:
     """A sentence for every limit in which the modes differ from the model by more than the errors of the fit."""
-    here, alone = of_the_modes(model), errors(modes, model, None)
+    here, alone = of_the_modes(model), limit_errors(modes, model, None)
     out = []
     for limit, there in of_the_model(own).items():
         if abs(here[limit] - there) > TOLD * alone[limit]:

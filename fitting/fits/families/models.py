@@ -26,6 +26,10 @@ MODELS = ("prony", "fractional", "spectrum", "auto")
 STRONG = 10.0
 
 
+#: Distance from 0 and 1 below which an exponent is at its bound.
+BOUND = 1e-3
+
+
 def fractional(sweep: Sweep) -> list[Fit]:
     """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts; one program fits them all."""
     reference, starts = springpots.reference_frequency(sweep), springpots.starting_points(sweep)
@@ -126,8 +130,8 @@ def _finished(fit: Fit, made: as_prony_modes.Conversion) -> Fit:
             f"{fit.modes} Prony modes follow the model {fit.kind.name} to {100 * made.error:.2g} % only; simulate a "
             "narrower band with --max-frequency"
         )
-    sentences += limits.sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
-    warnings = (*fit.warnings, *sentences, *_undetermined(fit))
+    sentences += limits.limit_sentences(fit.kind.name, fit.uncertainty, fit.model, fit.parameters)
+    warnings = (*fit.warnings, *sentences, *undetermined(fit))
     details = fit.details | {"conversion": {"modes": fit.modes, "largest_relative_error": made.error}}
     return fit._replace(details=details, warnings=warnings)
 
@@ -139,20 +143,34 @@ def _cut_off(fit: Fit) -> str:
     )
 
 
-def _undetermined(fit: Fit) -> list[str]:
-    """A sentence on the numbers of a fractional model that the data do not determine."""
+def undetermined(fit: Any) -> list[str]:
+    """Sentences on the numbers of a fractional model (of any fit) that the data do not determine."""
     if fit.parameters is None or fit.kind.effective is not None:
         return []
     free = [n for n, ok in zip(fit.kind.names, determined(fit.parameters), strict=True) if not ok]
-    return (
-        [f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model"] if free else []
-    )
+    told = at_bounds(fit.parameters)
+    if free:
+        told.append(f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model")
+    return told
+
+
+def at_bounds(own: Estimate) -> list[str]:
+    """A sentence for each exponent at its bound, where a standard error says nothing."""
+    out = []
+    for name, value in zip(own.names, own.values, strict=True):
+        if "exponent" in name and not BOUND < value < 1 - BOUND:
+            what = "dashpot" if value > 0.5 else "spring"
+            out.append(
+                f"{name} is at its bound {round(float(value))}: the springpot is a {what}, and the standard error of "
+                "the exponent has no meaning"
+            )
+    return out
 
 
 def determined(own: Estimate) -> np.ndarray:
     """Which numbers of a model have an error below half their value; exponents may also be 0 or 1 (spring, dashpot)."""
     values, errors = own.values, own.standard_errors
-    bound = np.array(["exponent" in name for name in own.names]) & ((values < 1e-3) | (values > 1 - 1e-3))
+    bound = np.array(["exponent" in name for name in own.names]) & ((values < BOUND) | (values > 1 - BOUND))
     return (errors < 0.5 * np.abs(values)) | bound
 
 

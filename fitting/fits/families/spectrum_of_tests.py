@@ -181,7 +181,7 @@ def _as_a_fit(
         },
     }
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(u)))
-    sentences += limits.sentences("spectrum", spread, model, own)
+    sentences += limits.limit_sentences("spectrum", spread, model, own)
     return SpectrumFit(kind, model, solution, spread, own, details, tuple(sentences))
 
 

@@ -152,7 +152,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
     own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
     spread = uncertainty.estimate(solution, over_noise, kind.maxwell)
     model = Maxwell(*(np.asarray(v) for v in kind.maxwell(solution.u)))
-    sentences += limits.sentences(case.name, spread, model, own)
+    sentences += limits.limit_sentences(case.name, spread, model, own)
     return _Springpot(case, kind, model, solution, spread, own, tuple(sentences), made.error)
 
 
@@ -238,18 +238,8 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
     mean = float(fit.relative_errors.mean())
     if mean > 0.05:
         out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try another --model")
-    out += _left_free(fit)
+    out += models.undetermined(fit)
     return out + time_tests.structured_misfit(fit)
-
-
-def _left_free(fit: TimeFit | Together) -> list[str]:
-    """A sentence on numbers that the data do not determine. A spectrum has none, because it has a prior."""
-    if fit.parameters is None or fit.kind.effective is not None:
-        return []
-    free = [n for n, ok in zip(fit.kind.names, models.determined(fit.parameters), strict=True) if not ok]
-    if not free:
-        return []
-    return [f"the data leave {' and '.join(free)} of the model {fit.kind.name} free: take a simpler model"]
 
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
@@ -304,7 +294,7 @@ def choose_together(
         best = best._replace(shares=_shares_of_springpots(best))
     out = [*best.warnings] if best.converged else ["the fit did not converge: take another --model", *best.warnings]
     out += together.disagreements(best.shares)
-    out += _left_free(best)
+    out += models.undetermined(best)
     return best._replace(tried=rows, warnings=tuple(out), **seconds)
 
 
