@@ -186,7 +186,7 @@ def test_gradients_through_closing_contact():
         assert min(errors) < 1e-6
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_forces_on_obstacles_know_regions_and_precision(precision):
     """The contact's own stiffness follows from the stiffest law of the body, as in the run: forces balance."""
     scene = lying(steps=1, precision=precision, tolerance=1e-8 if precision == "float64" else 1e-4)

@@ -214,6 +214,7 @@ def check_derivatives(scene: lj.Scene, at: dict, hertz: np.ndarray, about: jax.A
     assert errors[0] / errors[1] > 50 and min(errors) < 1e-7, errors
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_sponge():
     at = {"law.mu": 300.0, "porosity.bulk": 400.0, "porosity.limit_bulk": 2200.0, "porosity.permeability": 2e-5}
     at = {name: jnp.asarray(value) for name, value in at.items()}

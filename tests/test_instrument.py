@@ -141,6 +141,7 @@ def test_the_error_of_the_gap_is_that_of_the_moduli_alone():
     assert np.allclose(np.diag(wide.uncertainty.correlation), 1)
 
 
+@pytest.mark.slow
 def test_the_simulation_has_the_errors_of_gap_and_instrument_too():
     """Its mesh and its steps move nothing by a tenth of an error, so its errors are those of the closed form."""
     s = sweep(5e-4, 3, noise=0.03)._replace(friction=FRICTION, friction_error=2e-7)

@@ -65,7 +65,8 @@ def test_numbers_by_node_are_means_by_element():
     assert np.isclose(total, jnp.sum(mesh.volumes * density[mesh.tetrahedra].mean(axis=1)), rtol=1e-13)
 
 
-@pytest.mark.parametrize("integrator", ["euler", pytest.param("newmark", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["euler", "newmark"])
 def test_a_free_quadratic_body_falls_as_one(integrator):
     """Lumped masses of quadratic elements are not as their weight: the body bends itself."""
     found = []

@@ -40,6 +40,7 @@ def _relative_error(scene: lj.Scene) -> float:
     return float(np.abs(np.asarray(result.mesh_error.positions)).max()) / moved
 
 
+@pytest.mark.slow
 def test_a_following_pressure_on_a_cube():
     """The functions of a face have 9/20 of a uniform load; without them the error was 0.56."""
     assert _relative_error(_cube(traction=(lj.Traction(triangles=_face("z_max"), pressure=100.0),))) < ROUNDOFF

@@ -31,6 +31,7 @@ def one_mode(seed: int) -> Sweep:
     return measured(storage + 1j * loss, seed)
 
 
+@pytest.mark.slow
 def test_of_one_model_they_are_those_of_repeated_measurements():
     at, repeats = np.array([0.1, 3.0, 300.0]), 80  # the last is beyond the band
     found = [moduli_errors.fitted_moduli(viscoelastic.closed_form(one_mode(k), 1), at, False) for k in range(repeats)]

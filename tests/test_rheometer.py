@@ -425,3 +425,21 @@ def test_any_encoding_is_read(tmp_path, encoding):
     s = read_sweep(tmp_path / "a.csv")
     assert s.storage.tolist() == [1250, 1500, 1750] and s.loss.tolist() == [500, 600, 700]
     assert s.raw is not None and np.allclose(s.raw["temperature"], 293.15)
+
+
+def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
+    head = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,"
+    rows = [(f, 100.0 + f, 10.0) for f in (0.1, 1.0, 10.0)]
+
+    def notes(column, values):
+        lines = [f"{f},{a},{b},{v}" for v in values for f, a, b in rows]
+        (tmp_path / "s.csv").write_text("\n".join([head + column, *lines]) + "\n")
+        return read_sweep(tmp_path / "s.csv").notes[-1]
+
+    assert "the temperatures are 20 to 37 °C" in notes("temperature_C", (20, 37)) and "--master" in notes(
+        "temperature_C", (20, 37)
+    )
+    assert "the strains are 0.01 to 0.5" in notes("strain_%", (1, 50))
+    assert notes("temperature_C", (20, 21)).endswith("a measurement of its own") == notes(
+        "strain_%", (1, 1.2)
+    ).endswith("own")

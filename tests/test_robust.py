@@ -291,7 +291,8 @@ def test_a_following_pressure_is_held_in_each_iteration():
         assert np.abs(run(start).check().positions - rest).max() < 1e-6 * 0.1
 
 
-@pytest.mark.parametrize("taken", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("taken", [True, False])
 def test_the_kind_of_a_tangent_may_be_chosen_when_the_program_runs(taken):
     mesh, law = shapes.box((1.0, 1.0, 1.0), (1, 1, 1)), laws.typical("saint_venant_kirchhoff")
     scene = lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))

@@ -172,6 +172,7 @@ def test_every_model_reaches_the_best_of_a_hundred_starts_of_scipy(kind, file):
         assert float(fit.solution.cost) <= best * (1 + 1e-4), fit.kind.name
 
 
+@pytest.mark.slow
 def test_the_posterior_of_springpots_in_time_has_the_errors_of_the_fit():
     """A model that the test determines well: deviations of the draws are the standard errors, and means the numbers."""
     answer = inverse_laplace("fractional_kelvin_voigt", False)

@@ -22,6 +22,7 @@ from fitting.readers.tables.sweep_tables import Table, choose_table, tables_of
 from fitting.readers.tables.text_tables import split_line as split_line
 from fitting.readers.tables.text_tables import text_of
 from fitting.readers.tables.text_tables import to_number as to_number
+from fitting.readers.units import celsius
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
@@ -111,9 +112,32 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
         notes.append(f"{repeated} frequencies are repeated; each line counts as a measurement of its own")
+        notes += _what_differs({name: v[good] for name, v in table.raw.items()})
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
+
+
+#: Differences within one sweep, of the temperature [K] and of the strain (largest over smallest), that get a note.
+WARMER, STRAINED = 2.0, 1.5
+
+
+def _what_differs(raw: dict[str, np.ndarray]) -> list[str]:
+    """Notes if lines at the same frequency were measured at other temperatures or strains."""
+    out = []
+    heat, strain = (raw[q][np.isfinite(raw[q])] if q in raw else np.empty(0) for q in ("temperature", "strain"))
+    if heat.size and np.ptp(heat) > WARMER:
+        low, high = celsius(np.array([heat.min(), heat.max()]))
+        out.append(
+            f"the temperatures are {low:.4g} to {high:.4g} °C, and one material at one temperature is fitted: give "
+            "--master, or a file for each temperature"
+        )
+    if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
+        out.append(
+            f"the strains are {strain.min():.3g} to {strain.max():.3g}, and one linear material is fitted: give a file "
+            "for each strain"
+        )
+    return out
 
 
 def _check_agreement(path: str, first: dict, column: Column, written: np.ndarray, good: np.ndarray) -> None:

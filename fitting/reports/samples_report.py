@@ -8,6 +8,8 @@ import numpy as np
 
 from fitting.fits.honesty import edges
 from fitting.fits.samples import Samples
+from fitting.readers.rheometer import WARMER
+from fitting.readers.units import celsius
 from fitting.reports.sweep_report import band_sensitivity, numbers, summary
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
@@ -121,6 +123,12 @@ def warnings(found: Samples) -> list[str]:
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(f"{name}: {', '.join(without)} has none (a fluid?), so the population is that of the others")
+    heat = np.array([np.mean(s.raw["temperature"]) for s in found.sweeps if s.raw and "temperature" in s.raw])
+    if heat.size and np.ptp(heat) > WARMER:
+        low, high = celsius(np.array([heat.min(), heat.max()]))
+        out.append(
+            f"the samples were measured at {low:.4g} to {high:.4g} °C: their spread contains the temperature's part"
+        )
     failed = [Path(s.source).name for f, s in _pairs(found) if not f.converged]
     if failed:
         out.append(f"the fit of {', '.join(failed)} did not converge; its best point is given: try fewer modes")
