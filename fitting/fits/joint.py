@@ -80,9 +80,11 @@ def through(name: str, rig: glued.Rig, measured: Numbers, sd: Numbers) -> Test:
         InputError: the readings are not as many as the rig's steps, or the noise is not positive.
     """
     measured = np.asarray(measured, float)
-    sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
     if measured.shape != (rig.scene.solve.steps,):
         raise InputError(f"{name}: {measured.size} readings for {rig.scene.solve.steps} steps: give one per step")
+    if np.shape(sd) not in ((), measured.shape):
+        raise InputError(f"{name}: sd has shape {np.shape(sd)}: give one number, or one per reading {measured.shape}")
+    sd = np.broadcast_to(np.asarray(sd, float), measured.shape)
     if not (np.all(np.isfinite(measured)) and np.all(np.isfinite(sd)) and np.all(sd > 0)):
         raise InputError(f"{name}: readings and their positive noise must be finite numbers: correct them")
 
