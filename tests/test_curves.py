@@ -334,6 +334,7 @@ def test_components_and_named_tests_are_the_same_data(tmp_path):
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,nan\nuniaxial,2,3\nuniaxial,3,3\n", "not finite"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,-1,1\nuniaxial,2,3\nuniaxial,3,3\n", "not possible"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,1\nuniaxial,2,3\n", "at least 3"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,2,1\nuniaxial,6,3\nuniaxial,9,4\n", "do not begin near 1"),
         ("test,stretch,force_N\nuniaxial,1,1\n", "no column nominal_stress_Pa"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,0.9,1\nuniaxial,1.1,-1\nuniaxial,1.2,-2\n", "point against"),
     ],

@@ -75,6 +75,11 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
         ("depth_m,force_N\n0,0\n1e-4,x\n", [], "line 3: 'x' is not a finite number"),
         ("depth_m,force_N\n0,0\n1e-4,1\n", [], "2 loading points"),
         ("depth_m,force_N\n" + "".join(f"-{k}e-5,-{k}e-3\n" for k in range(8)), [], "so change its sign"),
+        (
+            "depth_m,force_N\n" + "".join(f"{k}e-5,-{k**2}e-3\n" for k in range(30)),
+            [],
+            "the force falls while the depth grows: change its sign",
+        ),
         ("depth_m,force_N\n0,0\n", ["--thickness", "-1"], "must be above 0"),
         ("depth_m,force_N\n0,0\n", ["--poisson", "0.7"], "must be from 0 to 0.5"),
         ("depth_m,force_N\n0,0\n", ["--radius", "0"], "must be above 0"),
@@ -135,3 +140,20 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
         tmp_path / "c.csv", np.column_stack([DEPTH, force])[40:], "%.9g", ",", header="depth_m,force_N", comments=""
     )
     assert np.allclose(read_indentation(tmp_path / "c.csv").force, force[40:], rtol=1e-7)
+
+
+def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):
+    """The noise of the approach hid the misfit: a punch on data of a sphere had a third of the modulus, unsaid."""
+    depth = np.linspace(-1e-3, 1e-3, 101)
+    force = hertz(np.maximum(depth, 0.0))
+    force = force + 0.003 * force.max() * np.random.default_rng(3).normal(size=len(force))
+    np.savetxt(
+        tmp_path / "c.csv", np.column_stack([depth, force]), delimiter=",", header="depth_m,force_N", comments=""
+    )
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "10", "--out", str(tmp_path)]
+    assert main(command) == 0 and "misfit" not in capsys.readouterr().err
+    assert main([*command, "--shape", "punch"]) == 0
+    assert "structured misfit: residuals in contact change sign" in capsys.readouterr().err
+    assert main([*command, "--shape", "cone"]) == 0
+    told = capsys.readouterr().err
+    assert "a half-angle of 45 degrees is assumed" in told and "--radius is for a sphere or a punch" in told

@@ -298,6 +298,10 @@ IDLE = {
         },
         r"\[output\] fields is for runs in time",
     ),
+    "masses of waves": (
+        {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0, "mass": "lumped"}},
+        r"\[body\] mass = 'lumped' is for runs in time, harmonic motion has consistent masses",
+    ),
     "forces of waves": (
         {"solve": {"kind": "harmonic", "frequencies": [1.0]}, "body": {"density": 1.0}, "output": {"reactions": True}},
         r"\[output\] reactions is for runs in time",

@@ -351,7 +351,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu\nnan\n", "row 1, law.mu = 'nan' is not a finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
         ("law.nu\n700\n", "did you mean mu"),
-        ("mesh.points.0\n700\n", "'mesh.points.0' is not a number of the scene file"),
+        ("mesh.points.0\n700\n", "'mesh.points.0' is a list in the scene file"),
         ("mesh.points.0.1\n700\n", "only all points can change"),
         ("fixed.0.nodes.0\n3\n", "is not a number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
@@ -404,7 +404,11 @@ def test_designs(files, kind, rows):
 
 
 def test_unusable_designs_are_refused(files, capsys):
-    for given, sentence in ((["law.mu=5"], "no range"), (["law.mu=5:1"], "does not rise"), (["a=1:2", "a=1:2"], "two")):
+    for given, sentence in (
+        (["law.mu=5"], "is not a range"),
+        (["law.mu=5:1"], "does not rise"),
+        (["a=1:2", "a=1:2"], "two"),
+    ):
         assert main(["design", str(files / "d.csv"), *given]) == 2
         assert sentence in capsys.readouterr().err
 

@@ -21,13 +21,29 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("file", type=Path, metavar="CURVE.csv", help="depth and force")
     command.add_argument("--shape", choices=("sphere", "cone", "punch"), default="sphere", help="default sphere")
     command.add_argument("--radius", type=float, default=0.0, metavar="M", help="radius of sphere or punch [m]")
-    command.add_argument("--half-angle", type=float, default=45.0, metavar="DEG", help="cone: from axis to side")
+    command.add_argument("--half-angle", type=float, metavar="DEG", help="cone: from axis to side (default 45)")
     command.add_argument("--thickness", type=float, required=True, metavar="M", help="thickness of the layer [m]")
     command.add_argument("--poisson", type=float, default=0.5, metavar="NU", help="Poisson's ratio (default 0.5)")
     command.add_argument(
         "--out", type=Path, default=Path("indentation"), metavar="DIR", help="folder of the results (indentation)"
     )
     return command
+
+
+#: Angle [degrees] of a cone whose angle is not given.
+HALF_ANGLE = 45.0
+
+
+def _notes_on_shape(options: argparse.Namespace) -> list[str]:
+    """Notes on an angle that is assumed, and on numbers that the shape does not have."""
+    cone, told = options.shape == "cone", []
+    if cone and options.half_angle is None:
+        told.append(f"a half-angle of {HALF_ANGLE:g} degrees is assumed: --half-angle gives another, E goes with 1/tan")
+    if not cone and options.half_angle is not None:
+        told.append(f"--half-angle is for a cone: it changes nothing for a {options.shape}")
+    if cone and options.radius:
+        told.append("--radius is for a sphere or a punch: it changes nothing for a cone")
+    return told
 
 
 def run(options: argparse.Namespace) -> int:
@@ -38,9 +54,10 @@ def run(options: argparse.Namespace) -> int:
     from fitting.rigs.thin_layer import Indenter, Layer
     from liverjax.core.files import writable
 
-    rig = Indenter(options.shape, options.thickness, options.poisson, options.radius, options.half_angle)
+    angle = HALF_ANGLE if options.half_angle is None else options.half_angle
+    rig = Indenter(options.shape, options.thickness, options.poisson, options.radius, angle)
     layer, curve = Layer(rig), read_indentation(options.file)
-    for note in curve.notes:
+    for note in (*_notes_on_shape(options), *curve.notes):
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
     found = fit_contact(curve.depth, curve.force, layer.force)

@@ -176,6 +176,10 @@ def _kind(F: np.ndarray) -> str:
     return "general"
 
 
+#: A test whose smallest stretch is this large began far from rest: strains in % are more likely.
+STRAINED = 1.9
+
+
 def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
     column = _stress_column(file, rows[0], "nominal_stress", unit)
     if column is None:
@@ -193,6 +197,11 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         driven = _column(file, group, "shear") if shear else stretch
         if np.any(stretch <= 0):
             raise InputError(f"{file}: a stretch of {stretch.min():g} is not possible: give length over rest length")
+        if not shear and stretch.min() >= STRAINED:
+            raise InputError(
+                f"{file}: stretches of {stretch.min():g} to {stretch.max():g} do not begin near 1: a stretch is the "
+                "length over the length at rest; write a strain of 2 % as 1.02"
+            )
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
         label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
         component = (0, 1) if shear else (0, 0)

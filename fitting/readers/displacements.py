@@ -17,6 +17,10 @@ from liverjax.scenes.scene import Scene
 
 #: A point farther from the mesh than this, in sizes of the nearest element, does not belong to the body.
 _FAR = 2.0
+#: Of points farther outside than this [elements], the surface of a coarse mesh explains at most this part.
+_OUTSIDE, _MOST_OUTSIDE = 0.25, 0.2
+#: Displacements above so many sizes of the body are no displacements.
+_LONGEST = 2.0
 _COLUMNS = ("node", "x", "y", "z", "ux", "uy", "uz", "time", "sd")
 
 
@@ -64,6 +68,14 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     seen = np.isfinite(measured)
     if not seen.any():
         raise InputError(f"{path}: no displacement is measured: fill ux, uy, uz")
+    size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
+    wild = np.argwhere(np.abs(np.where(seen, measured, 0.0)) > _LONGEST * size)
+    if len(wild):
+        row, axis = wild[0]
+        raise InputError(
+            f"{path}: row {row + 1}: u{'xyz'[axis]} = {measured[row, axis]:g} m in a body of {size:.3g} m: give "
+            "--unit, or leave empty what was not measured"
+        )
     if "sd" in table:
         sd = scale * table["sd"]
     elif noise is not None:
@@ -75,7 +87,8 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     if "node" in table:
         nodes, weights = _at_nodes(path, mesh, table["node"])
     else:
-        nodes, weights = _measured_at_points(path, mesh, scale * np.stack([table[c] for c in "xyz"], axis=1))
+        places = scale * np.stack([table[c] for c in "xyz"], axis=1)
+        nodes, weights = _measured_at_points(path, mesh, places)
     return Displacements(
         step=_steps(path, scene, table.get("time"), n),
         nodes=nodes,
@@ -89,7 +102,9 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of an empty file
-            data = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, comments="#", dtype=float))
+            # Spreadsheets write a mark before the first name.
+            data = np.genfromtxt(path, delimiter=",", names=True, comments="#", dtype=float, encoding="utf-8-sig")
+            data = np.atleast_1d(data)
     except (OSError, ValueError, IndexError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path} cannot be read ({reason}): give a CSV with columns x,y,z,ux,uy,uz") from None
@@ -110,7 +125,7 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
 
 def _refuse_words(path: Path, table: dict[str, np.ndarray]) -> None:
     """Raise `InputError` if a cell is neither empty nor a number: it would count as not measured."""
-    cells = np.atleast_2d(np.genfromtxt(path, delimiter=",", comments="#", dtype=str, encoding="utf-8"))
+    cells = np.atleast_2d(np.genfromtxt(path, delimiter=",", comments="#", dtype=str, encoding="utf-8-sig"))
     for j, (name, column) in enumerate(table.items()):
         for k in np.flatnonzero(np.isnan(column)):
             cell = cells[k - len(column), j].strip().strip('"')  # the header, if it is there, is above
@@ -136,6 +151,12 @@ def _measured_at_points(path: Path, mesh: TetMesh, points: np.ndarray) -> tuple[
         bad = int(np.argmax(outside))
         raise InputError(
             f"{path}: the point {points[bad].tolist()} m is {outside[bad]:.3g} elements off the mesh: is --unit right?"
+        )
+    off = int(np.sum(outside > _OUTSIDE))
+    if off > _MOST_OUTSIDE * len(points):
+        raise InputError(
+            f"{path}: {off} of {len(points)} points lie outside of the mesh, up to {outside.max():.2g} elements: look "
+            "at the axes, the origin and --unit"
         )
     return nodes, weights
 

@@ -54,7 +54,9 @@ def read_indentation(path: str | Path) -> IndentationCurve:
     last, notes = _end_of_loading(depth, force)
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
+        pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
         remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
+        remedy = "the force falls while the depth grows: change its sign" if pulls and not falls else remedy
         raise InputError(f"{path}: {last} loading points; a fit needs {_FEWEST} or more, at different depths: {remedy}")
     depth, force = depth[:last], force[:last]
     offset = _offset(force)

@@ -75,11 +75,13 @@ def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit
         told.append(f"{far}: the theory is for small strains; fit a part of the curve as well and compare")
     if fit.modulus <= 0:
         told.append("the modulus is not positive: the force does not rise with the depth; check the signs")
-    runs, chance = runs_probability(np.sign(fit.residuals))
+    # The points before contact have noise alone: with them a misfit of the indentation would look like noise.
+    touching = fit.residuals[curve.depth > fit.contact_point]
+    runs, chance = runs_probability(np.sign(touching))
     if chance < 1e-3:
         told.append(
-            f"structured misfit: residuals change sign {runs - 1} times over {len(fit.residuals)} points (by chance: "
-            f"{chance:.1g}); standard errors are too small then"
+            f"structured misfit: residuals in contact change sign {runs - 1} times over {len(touching)} points (by "
+            f"chance: {chance:.1g}): another shape, layer or material; standard errors are too small then"
         )
     if curve.force.min() < -5 * fit.noise:
         told.append("forces are negative: this is adhesion, which the model does not have")
