@@ -16,6 +16,7 @@ from fitting.fits.families import models
 from fitting.fits.honesty import edges, total_error
 from fitting.methods import generalised_maxwell, kramers_kronig
 from fitting.methods.kramers_kronig import runs_probability
+from fitting.readers.frequency_sweep import scatter
 from fitting.readers.rheometer import Sweep, read_sweep, some, within, without_inertia
 from liverjax import InputError
 
@@ -272,3 +273,25 @@ def test_total_errors_hold_what_a_shorter_band_says():
 def _honest_fit(s: Sweep) -> viscoelastic.Fit:
     dense = generalised_maxwell.spectrum(s)
     return edges.honest(viscoelastic.choose_modes(s, dense)[0], s, dense)
+
+
+@pytest.mark.parametrize(("noise", "found"), [(0.001, 0.0012), (0.005, 0.0058), (0.02, 0.0205)])
+def test_the_scatter_of_few_points_is_their_noise(noise, found):
+    """Six points a decade: about a parabola through four neighbours the curve itself scatters by 1 %."""
+    w = 2 * np.pi * np.logspace(-1, 1.5, 16)
+    G = 1000 * (0.5 + 0.3j * w * 0.5 / (1 + 0.5j * w) + 0.2j * w * 0.03 / (1 + 0.03j * w))
+    rng = np.random.default_rng(0)
+    each = [scatter(w, G.real * (1 + noise * rng.standard_normal(16))) for _ in range(200)]
+    assert np.median(each) == pytest.approx(found, rel=0.25)
+
+
+def test_data_that_contradict_themselves_are_told_and_sound_ones_are_not():
+    """A loss modulus 30 % too large, and a drift of 15 %, were inside of five times the curvature."""
+    w = 2 * np.pi * np.logspace(-1, 1.5, 16)
+    G = 1000 * (0.5 + 0.3j * w * 0.5 / (1 + 0.5j * w) + 0.2j * w * 0.03 / (1 + 0.03j * w))
+    rng, told = np.random.default_rng(1), []
+    for data in (G, G.real + 1.3j * G.imag, G * np.linspace(1, 0.85, 16)):
+        noisy = (data.real * (1 + 0.002 * rng.standard_normal(16)), data.imag * (1 + 0.002 * rng.standard_normal(16)))
+        s = Sweep(w, *noisy)
+        told.append(kramers_kronig.of_data(s, generalised_maxwell.spectrum(s)).far)
+    assert [bool(far) for far in told] == [False, True, True]

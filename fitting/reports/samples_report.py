@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fitting.fits.families import limits
 from fitting.fits.honesty import edges
 from fitting.fits.samples import Samples
 from fitting.readers.rheometer import WARMER
@@ -123,6 +124,7 @@ def warnings(found: Samples) -> list[str]:
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
                 out.append(f"{name}: {', '.join(without)} has none (a fluid?), so the population is that of the others")
+    out += _limits_of_typical(found)
     heat = np.array([np.mean(s.raw["temperature"]) for s in found.sweeps if s.raw and "temperature" in s.raw])
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
@@ -146,6 +148,24 @@ def warnings(found: Samples) -> list[str]:
         if count:
             out.append(f"in {count} of {len(found.fits)} samples {told}; fit.json has the sentences of each")
     return out
+
+
+#: Relative difference of a limit of the typical sample's Prony modes from that of its model that gets a sentence.
+APART = 0.01
+
+
+def _limits_of_typical(found: Samples) -> list[str]:
+    """A sentence if the Prony modes at the top of fit.json have another equilibrium modulus than the population."""
+    p = found.populations.get("equilibrium_modulus")
+    if found.kind.values is None or p is None:
+        return []
+    rest = limits.of_the_modes(found.typical)["equilibrium_modulus"]
+    if abs(rest / p.mean - 1) < APART:
+        return []
+    return [
+        f"the equilibrium modulus of the typical sample's Prony modes is {rest:.4g} Pa, the population's mean "
+        f"{p.mean:.4g} Pa: the modes follow the model {found.kind.name} over the measured band only"
+    ]
 
 
 def table(found: Samples) -> str:
