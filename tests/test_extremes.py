@@ -202,7 +202,7 @@ def test_averaged_volumes_have_a_gradient():
 @pytest.mark.parametrize(
     "change, sentence",
     [
-        (dict(law=laws.typical("saint_venant_kirchhoff")), "needs a law with bulk apart"),
+        (dict(law=laws.typical("saint_venant_kirchhoff")), "needs a law whose energy is a shear part"),
         (dict(porosity=lj.Porosity(bulk=1.0, limit_bulk=2.0, fluid_fraction=0.5, permeability=1.0)), "sponge"),
         (dict(viscosity=lj.Prony(ratios=jnp.array([0.2]), relaxation_times=jnp.array([1.0]))), "part = 'isochoric'"),
     ],

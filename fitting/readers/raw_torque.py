@@ -31,7 +31,7 @@ HEADINGS = (
 
 
 class SampleShare(NamedTuple):
-    """The inertia of the instrument in a sweep."""
+    """The instrument's inertia, and the modulus that it would add to the sample's."""
 
     inertia: float  # I [N m s^2]; NaN if K is not known
     modulus: np.ndarray  # (n,) I omega^2 / K [Pa]

@@ -45,7 +45,7 @@ class Tied(Protocol):
         """The part of a field (V, 3) along the free motions. For forces it depends on the positions x (V, 3)."""
 
     def unknown(self, field: jax.Array, x: jax.Array) -> jax.Array:
-        """Put the numbers of the motions at positions x (V, 3) into the field (V, 3). `placed` is the inverse."""
+        """Write the numbers of the motion to positions x (V, 3) into a field (V, 3). `placed` inverts this."""
 
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
         """Positions (V, 3) from a field, at part s of the step."""

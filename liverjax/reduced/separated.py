@@ -102,7 +102,8 @@ def separated_displacement(model: SeparatedModel, values: Mapping[str, Any]) -> 
         value = jnp.asarray(values[name], model.fields.dtype)
         if not isinstance(value, jax.core.Tracer) and not low <= value <= high:
             raise InputError(
-                f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make it wider"
+                f"{name} = {float(value):g} is outside of {float(low):g} to {float(high):g}: make the model with a "
+                "wider range"
             )
         product = product * (function @ _chebyshev(2 * (value - low) / (high - low) - 1, function.shape[1]))
     return jnp.tensordot(product, model.fields, axes=1)

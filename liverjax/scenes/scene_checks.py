@@ -222,7 +222,9 @@ def _own_volumes(scene: Scene) -> None:
     several = laws_of(scene.law, scene.region)
     for law in several:
         if laws.isochoric_part(law) is None or laws.volumetric_part(law) is None:
-            raise InputError(f"{name} needs a law with bulk apart from its shear, unlike {type(law).__name__}")
+            raise InputError(
+                f"{name} needs a law whose energy is a shear part and a volumetric part, unlike {type(law).__name__}"
+            )
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
         raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
 

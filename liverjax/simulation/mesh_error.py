@@ -2,10 +2,10 @@
 
 The positions of a step, with nothing added, are put into quadratic elements (those of quadratic elements into cubic
 ones). The forces out of balance, r, and the tangent K give du = -K^-1 r, which the elements of the run cannot
-represent. A reaction changes by its derivative along du. Memories of viscosity, fluid and inertia are those of the
-richer run. In the richer space a surface touches an obstacle at other points: with contact, solves go on until these
-are found. With only the contact points of the first solve, the stated error of a flat punch's force was 1/4; the true
-error was 1/100.
+represent. A reaction changes by its derivative along du. A second run in this space goes along with the first one, and
+the memories of viscosity, fluid and inertia are its own. In the richer space a surface touches an obstacle at other
+points: with contact, solves go on until these are found. With only the contact points of the first solve, the stated
+error of a flat punch's force was 1/4; the true error was 1/100.
 
 The estimate is hierarchical (Bank and Smith 1993). For linear elements du is 0.8 to 1.3 of the error in small and in
 moderate strain; with du added, about a tenth is left. For quadratic elements the cubic functions show about two thirds

@@ -81,7 +81,7 @@ def _metric(f: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _tension(slopes: tuple[jax.Array, ...]) -> list[list[jax.Array]]:
-    """T from the derivatives by C_11, or by C_11, C_12 and C_22."""
+    """Stress T from the derivatives of the energy by C_11, or by C_11, C_12 and C_22."""
     if len(slopes) == 1:
         return [[2 * slopes[0]]]
     return [[2 * slopes[0], slopes[1]], [slopes[1], 2 * slopes[2]]]
