@@ -157,3 +157,12 @@ def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):
     assert main([*command, "--shape", "cone"]) == 0
     told = capsys.readouterr().err
     assert "a half-angle of 45 degrees is assumed" in told and "--radius is for a sphere or a punch" in told
+
+
+def test_an_approach_as_long_as_the_layer_is_thick_is_fitted():
+    """The search tries contact points before the first reading: depths beyond the thickness are only tried there."""
+    depth = np.linspace(-8e-3, 1e-3, 181)
+    for rig in (Indenter("sphere", H, 0.5, R), Indenter("punch", H, 0.5, R / 5), Indenter("cone", H, 0.5)):
+        layer = Layer(rig)
+        found = fit_contact(depth, E * layer.force(depth), layer.force)
+        assert np.isclose(found.modulus, E, rtol=1e-4) and abs(found.contact_point) < 1e-7

@@ -7,7 +7,7 @@ import pytest
 from conftest import ROOT
 
 from fitting.readers.curves import read_curves
-from fitting.readers.rheometer import read_sweep
+from fitting.readers.rheometer import read_all_sweeps, read_sweep
 from liverjax import InputError
 
 HEADER = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa\n"
@@ -440,6 +440,9 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
         "temperature_C", (20, 37)
     )
     assert "the strains are 0.01 to 0.5" in notes("strain_%", (1, 50))
+    notes("temperature_C", (20, 37))  # who shifts sweeps by temperature reads them apart, without this advice
+    ((_, apart),) = read_all_sweeps(tmp_path / "s.csv")
+    assert not any("--master" in note for note in apart.notes)
     assert notes("temperature_C", (20, 21)).endswith("a measurement of its own") == notes(
         "strain_%", (1, 1.2)
     ).endswith("own")

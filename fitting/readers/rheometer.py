@@ -48,7 +48,8 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     chosen, notes = choose_table(str(path), tables, table)
-    return _sweep(str(path), tables[chosen], notes)
+    found = _sweep(str(path), tables[chosen], notes)
+    return found._replace(notes=(*found.notes, *_what_differs(found)))
 
 
 def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
@@ -112,7 +113,6 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
         notes.append(f"{repeated} frequencies are repeated; each line counts as a measurement of its own")
-        notes += _what_differs({name: v[good] for name, v in table.raw.items()})
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
@@ -122,9 +122,11 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
 WARMER, STRAINED = 2.0, 1.5
 
 
-def _what_differs(raw: dict[str, np.ndarray]) -> list[str]:
+def _what_differs(sweep: Sweep) -> list[str]:
     """Notes if lines at the same frequency were measured at other temperatures or strains."""
-    out = []
+    out, raw = [], sweep.raw or {}
+    if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
+        return []
     heat, strain = (raw[q][np.isfinite(raw[q])] if q in raw else np.empty(0) for q in ("temperature", "strain"))
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))

@@ -117,21 +117,21 @@ class Layer:
         check_indenter(rig)
         self.rig = rig
         if rig.shape == "punch":
-            self._punch, self.deepest = punch_factor(rig.radius, rig.thickness, rig.poisson), rig.thickness
+            self._punch, self.deepest = punch_factor(rig.radius, rig.thickness, rig.poisson), np.inf
             return
         table = factors(rig.poisson, rig.shape)
         self._factor = scipy.interpolate.CubicSpline(table.reach, table.factor)
         unit = reach(rig, np.ones(1))[0]
         #: Largest depth [m] in the table.
-        self.deepest = min(float((table.reach[-1] / unit) ** (2 if rig.shape == "sphere" else 1)), rig.thickness)
+        self.deepest = float((table.reach[-1] / unit) ** (2 if rig.shape == "sphere" else 1))
 
     def force(self, depth: np.ndarray) -> np.ndarray:
         """Force [N] per unit Young's modulus [Pa] at depths [m] up to `deepest`, 0 before contact."""
         largest = float(np.max(depth, initial=0.0))
         if not largest <= self.deepest:
             raise InputError(
-                f"depth = {largest:.4g} m is not below the {self.deepest:.4g} m that the layer and its table allow: "
-                "leave deeper points out"
+                f"depth = {largest:.4g} m is not within the {self.deepest:.4g} m that the layer's table covers: leave "
+                "deeper points out"
             )
         alone = half_space(self.rig, depth)
         return alone * (self._punch if self.rig.shape == "punch" else self._factor(reach(self.rig, depth)))
