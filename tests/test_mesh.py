@@ -160,6 +160,17 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
     assert np.isclose(float(lj.read_mesh(tmp_path / "large.vtk", "mm").volumes.sum()), 0.28**3)
 
 
+@pytest.mark.parametrize("top", [[0.2, 0.2, 2.0], [0.2, 0.2, 0.5]], ids=["around", "inside"])
+def test_elements_on_one_side_of_a_face_are_refused(top):
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], top])
+    with pytest.raises(lj.InputError, match=r"1 faces have two of them on the same side .*of element 0"):
+        lj.check_mesh(lj.tet_mesh(corners, np.array([[0, 1, 2, 3], [0, 1, 2, 4]])))
+    # The other side of the face z = 0 is free.
+    lj.check_mesh(
+        lj.tet_mesh(corners - 2.5 * np.eye(5)[4][:, None] * [0, 0, 1], np.array([[0, 1, 2, 3], [0, 2, 1, 4]]))
+    )
+
+
 #: Name of a file -> its text and what the sentence says of it. Gmsh's manual, "MSH file format version 1 (Legacy)".
 FOREIGN = {
     "old.msh": (

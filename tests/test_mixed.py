@@ -276,7 +276,10 @@ def test_a_robust_step_of_a_mixed_body(order):
 
 def test_mixed_refuses_what_it_cannot_be():
     for scene, words in (
-        (replace(_cook(2, 1, 10.0, volumetric="mixed"), law=lj.laws.typical("saint_venant_kirchhoff")), "shear part and a volumetric part"),
+        (
+            replace(_cook(2, 1, 10.0, volumetric="mixed"), law=lj.laws.typical("saint_venant_kirchhoff")),
+            "shear part and a volumetric part",
+        ),
     ):
         with pytest.raises(lj.InputError, match=words):
             lj.check_scene(scene)

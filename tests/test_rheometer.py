@@ -446,3 +446,24 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
     assert notes("temperature_C", (20, 21)).endswith("a measurement of its own") == notes(
         "strain_%", (1, 1.2)
     ).endswith("own")
+
+
+@pytest.mark.parametrize("wrong", [1.0, 1.1])
+@pytest.mark.parametrize(
+    ("heading", "values"),
+    [
+        ("tan_delta", lambda S, L: L / S),
+        ("phase_deg", lambda S, L: np.degrees(np.arctan(L / S))),
+        ("complex_modulus_kPa", lambda S, L: 1e-3 * np.hypot(S, L)),
+    ],
+    ids=["tangent", "phase", "complex"],
+)
+def test_a_column_that_contradicts_the_moduli_is_told(tmp_path, heading, values, wrong):
+    """Rounded to two digits a column contradicts nothing; one that is a tenth off does."""
+    omega = np.geomspace(0.1, 100.0, 13)
+    S, L = 1000 * omega**0.1, 200 * omega**0.15
+    lines = [f"{w:.6g},{s:.6g},{k:.6g},{x:.2g}" for w, s, k, x in zip(omega, S, L, wrong * values(S, L), strict=True)]
+    file = tmp_path / "sweep.csv"
+    file.write_text("\n".join([f"angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,{heading}", *lines]))
+    told = [note for note in read_sweep(file).notes if "contradicts G' and G''" in note]
+    assert len(told) == (wrong != 1.0) and all(heading in note for note in told)

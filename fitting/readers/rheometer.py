@@ -103,6 +103,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     if len(np.unique(omega)) < 2:
         raise InputError(f"{path}: it has {len(np.unique(omega))} frequency; give at least two different ones")
     values = storage_and_loss(values, notes)
+    notes += _contradictions(path, [(c, written[good]) for c, written in table.beside], values)
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
             f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is there; give both or none"
@@ -139,6 +140,31 @@ def _what_differs(sweep: Sweep) -> list[str]:
             f"the strains are {strain.min():.3g} to {strain.max():.3g}, and one linear material is fitted: give a file "
             "for each strain"
         )
+    return out
+
+
+#: Difference [1] of a column from the other two, in the median, that gets a note.
+CONTRADICTS = 0.03
+
+
+def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: Content) -> list[str]:
+    """Notes on columns of |G*|, phase or tan(delta) that differ from what G' and G'' say of them."""
+    G = values["storage"] + 1j * values["loss"]
+    expected = {"complex": np.abs(G), "phase": np.angle(G), "tangent": values["loss"] / values["storage"]}
+    out = []
+    for column, written in beside:
+        if not np.isfinite(written).any() or (column.quantity == "phase" and column.unit is None):
+            continue
+        found, known = column_in_si(path, column, written, []), expected[column.quantity]
+        seen = np.isfinite(found)
+        steps = np.diff(np.unique(found[seen]))
+        rounding = 0.5 * steps.min() if steps.size else 0.0
+        apart = np.maximum(np.abs(found - known)[seen] - rounding, 0.0) / known[seen]
+        if np.median(apart) > CONTRADICTS:
+            out.append(
+                f"column {column.name!r} is not used; it contradicts G' and G'' by {100 * np.median(apart):.2g} % "
+                "(median): find out which column is wrong or was corrected"
+            )
     return out
 
 

@@ -196,7 +196,7 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
     Raises:
         InputError: no elements, node numbers out of range, positions that are not finite, flat or inverted elements,
-            elements that occur twice, nodes that belong to no element.
+            elements that occur twice or overlap at a face, nodes that belong to no element.
     """
     points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
     if tets.size == 0:
@@ -221,6 +221,27 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
             f"{name}: {int((copies - 1).sum())} tetrahedra occur twice (first: {again}, nodes "
             f"{tets[again].tolist()}); remove the copies"
         )
+    _refuse_overlaps(tets, name)
     unused = np.setdiff1d(np.arange(mesh.number_of_vertices), tets)
     if len(unused):
         raise InputError(f"{name}: {len(unused)} nodes belong to no tetrahedron (first: {unused[0]}); remove them")
+
+
+#: The faces of a tetrahedron, counterclockwise from outside.
+_FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+
+
+def _refuse_overlaps(tets: np.ndarray, name: str) -> None:
+    """Raise `InputError` if two elements are on the same side of a face: then they overlap."""
+    faces = tets[:, _FACES].reshape(-1, 3)
+    first = faces.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).astype(np.int64)
+    nodes = int(tets.max()) + 1
+    keys = (turned[:, 0] * nodes + turned[:, 1]) * nodes + turned[:, 2]
+    _, place, copies = np.unique(keys, return_index=True, return_counts=True)
+    if np.any(copies > 1):
+        own = int(place[copies > 1].min())
+        raise InputError(
+            f"{name}: tetrahedra overlap: {int((copies > 1).sum())} faces have two of them on the same side (first: "
+            f"nodes {faces[own].tolist()}, of element {own // 4}); remesh, or remove one of the two"
+        )

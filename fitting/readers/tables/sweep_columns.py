@@ -72,6 +72,27 @@ def header_columns(cells: list[str]) -> list[Column]:
     return columns
 
 
+def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> list[Column]:
+    """Columns of |G*|, phase and tan(delta) that a sweep does not need, with known units; the first of each.
+
+    Args:
+        cells: headings.
+        units: units from a line of their own; may be empty.
+        used: the columns that are read.
+    """
+    needed, found = {c.quantity for c in used}, {}
+    for k, cell in enumerate(cells):
+        quantity, unit = quantity_of(cell) or ("", None)
+        if quantity not in ("complex", "phase", "tangent") or quantity in needed or quantity in found:
+            continue
+        if quantity == "tangent":
+            unit = unit or "1"
+        own = Column(k, cell.strip(), quantity, unit or (units[k].strip('"[]() ') if k < len(units) else None))
+        if known_unit(quantity, own.unit) and not is_tensile(own):
+            found[quantity] = own
+    return list(found.values())
+
+
 def is_tensile(column: Column) -> bool:
     """Whether the heading names a modulus of tension or bending, E."""
     return bool(re.match(r"\s*e['′’_ ]|\s*epp?\b|\s*[(|]?e\b|\s*tensile", column.name.lower().replace('"', "'")))

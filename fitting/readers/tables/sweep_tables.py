@@ -10,6 +10,7 @@ from fitting.readers import raw_torque
 from fitting.readers.tables.sweep_columns import (
     NEEDED,
     Column,
+    columns_beside,
     condition_columns,
     first_missing,
     header_columns,
@@ -32,6 +33,7 @@ class Table(NamedTuple):
     numbers: list[int]  # line numbers in the file
     raw: dict[str, np.ndarray]  # raw measurements of the instrument, one value per row
     strain_unit: str = ""  # unit of the strain column, as the file states it
+    beside: tuple[tuple[Column, np.ndarray], ...] = ()  # columns that the sweep does not need, for comparison
 
     @property
     def frequencies(self) -> int:
@@ -126,7 +128,9 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
             sign = decimal_sign(row[c.place] for row in own for c in columns if c.place < len(row))
             raw = _raw(cells, units, own, delimiter, sign)
             unit = raw_torque.unit_of("strain", cells, units[-1] if units else [])
-            tables.append(Table(name, columns, rows, numbers, raw, unit))
+            others = [c for c in columns_beside(cells, units[-1] if units else [], columns) if c.place < len(cells)]
+            beside = tuple((c, _cells_of(c.place, own, delimiter, sign)) for c in others)
+            tables.append(Table(name, columns, rows, numbers, raw, unit, beside))
         free = k
     return tables, headers
 
@@ -145,6 +149,12 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
         if all(v is not None and (np.isfinite(v) or quantity == "strain") for v in values):
             found[quantity] = factor * np.array(values, float) + offset
     return found
+
+
+def _cells_of(place: int, rows: list[list[str]], delimiter: str, sign: str) -> np.ndarray:
+    """Numbers of a column; NaN where a cell has none."""
+    found = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
+    return np.array([np.nan if value is None else value for value in found])
 
 
 def _title(above: list[str]) -> str:
