@@ -80,7 +80,8 @@ def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> li
         units: units from a line of their own; may be empty.
         used: the columns that are read.
     """
-    needed, found = {c.quantity for c in used}, {}
+    needed = {c.quantity for c in used}
+    found: dict[str, Column] = {}
     for k, cell in enumerate(cells):
         quantity, unit = quantity_of(cell) or ("", None)
         if quantity not in ("complex", "phase", "tangent") or quantity in needed or quantity in found:

@@ -151,7 +151,7 @@ def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
     return found
 
 
-def _cells_of(place: int, rows: list[list[str]], delimiter: str, sign: str) -> np.ndarray:
+def _cells_of(place: int, rows: list[list[str]], delimiter: str, sign: str | None) -> np.ndarray:
     """Numbers of a column; NaN where a cell has none."""
     found = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
     return np.array([np.nan if value is None else value for value in found])
