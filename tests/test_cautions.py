@@ -113,3 +113,21 @@ def test_they_stand_in_the_report_and_in_the_results(tmp_path, capsys):
     assert len(lines) == 2 and "3 m long" in lines[0] and "grew above J = 5" in lines[1] and "load step 7" in lines[1]
     with h5py.File(tmp_path / "result.h5") as file:
         assert [f"caution: {s}" for s in json.loads(file.attrs["warnings"])] == lines
+
+
+@pytest.mark.parametrize(
+    ("peak", "told"), [(0.15, "0.15 s between two steps, and the run misses 33 % of it"), (0.2, None)]
+)
+def test_a_peak_of_a_history_between_two_steps_is_told(peak, told):
+    """Steps end at 0.1, 0.2 and 0.3 s; a pull that rises and falls within one of them is not what the run has."""
+    top = lj.boundary.boundary_triangles(BOX)[:1]
+    load = lj.Traction(
+        triangles=top, value=np.array([0.0, 0.0, 5.0]), times=np.array([0.1, peak, 0.3]), history=np.array([0.0, 1, 0])
+    )
+    pulled = replace(scene(BOX, dt=0.1, steps=3), traction=(load,))
+    said = cautions_of_run(pulled, run(BOX, [np.eye(3)] * 3, [0.1, 0.2, 0.3]))
+    if told is None:
+        assert said == []
+    else:
+        (sentence,) = said
+        assert sentence.startswith("the history of traction.0 has a peak at") and told in sentence

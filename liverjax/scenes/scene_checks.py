@@ -124,17 +124,21 @@ def _known_nodes(scene: Scene) -> None:
             raise InputError(f"mesh has {wrong} elements that are inside out or without volume: correct their vertices")
 
 
-def _refuse_what_moves_in_time(scene: Scene) -> None:
-    """Refuse histories in harmonic motion, and obstacles that move."""
+def histories(scene: Scene) -> dict[str, object]:
+    """Every load, motion, inlet and further physics that has a history, by its name."""
     inlets = () if scene.porosity is None else scene.porosity.inlet
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
         parts |= {f"{key}.{k}": part for k, part in enumerate(several)}
-    physics = dict(_named_physics(scene))
-    for name, part in (parts | physics).items():
-        if getattr(part, "history", None) is not None:
-            raise InputError(f"{name}.history is for runs in time: give harmonic motion its amplitudes alone")
-    for name, part in physics.items():
+    parts |= dict(_named_physics(scene))
+    return {name: part for name, part in parts.items() if getattr(part, "history", None) is not None}
+
+
+def _refuse_what_moves_in_time(scene: Scene) -> None:
+    """Refuse histories in harmonic motion, and obstacles that move."""
+    for name in histories(scene):
+        raise InputError(f"{name}.history is for runs in time: give harmonic motion its amplitudes alone")
+    for name, part in _named_physics(scene):
         if getattr(part, "by", None) is not None:
             raise InputError(
                 f"{name}.by is for runs in time: give the obstacle its place in harmonic motion as position"

@@ -10,6 +10,7 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene_checks import histories
 from liverjax.simulation.automatic import qualities
 from liverjax.simulation.run import Result
 
@@ -34,7 +35,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         scene: `Scene`, not traced.
         result: `Result` of its run.
     """
-    return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_volumes(scene, result)]
+    return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_histories(scene, result), *_of_volumes(scene, result)]
 
 
 def cautions_of_waves(scene: Scene) -> list[str]:
@@ -114,6 +115,30 @@ def _of_locking(scene: Scene) -> list[str]:
         f"the bulk modulus is {ratio:.3g} times the shear modulus, where these elements are too stiff: write "
         "volumetric = 'mixed' in [solve]"
     ]
+
+
+#: Part of a history's range that may be left between two steps without a word.
+MISSED = 0.05
+
+
+def _of_histories(scene: Scene, result: Result) -> list[str]:
+    """A sentence on every history that has a peak between two steps, where no step sees it."""
+    said = []
+    steps = np.concatenate([[0.0], np.asarray(result.times)])
+    for name, part in histories(scene).items():
+        times, values = (np.asarray(getattr(part, column)) for column in ("times", "history"))
+        values = values.reshape(len(times), -1)
+        inside = (times >= 0) & (times <= steps[-1])
+        seen = np.stack([np.interp(steps, times, column) for column in values.T], axis=1)
+        scale = np.abs(values).max()
+        beyond = np.maximum(values - seen.max(axis=0), seen.min(axis=0) - values).max(axis=1) * inside
+        peak = int(beyond.argmax())
+        if beyond[peak] > MISSED * scale:
+            said.append(
+                f"the history of {name} has a peak at {times[peak]:.4g} s between two steps, and the run misses "
+                f"{100 * beyond[peak] / scale:.2g} % of it: take a smaller dt, or one that divides {times[peak]:.4g} s"
+            )
+    return said
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:
