@@ -99,6 +99,20 @@ def test_fibres_pull_as_springs_of_their_stretch(given):
     assert np.allclose(np.moveaxis(K.blocks[0, :, 0], -1, 0), exact, atol=1e-9)
 
 
+@pytest.mark.parametrize("given", [{"pre_tension": 0.0}, {"rest_length": 0.06}])
+def test_a_straight_fibre_without_tension_has_its_whole_stiffness(given):
+    """Where it begins to pull it is a spring along its line; that of max(l - l0, 0)^2 / 2 is a quarter."""
+    corner = {"x_min": SIDE, "y_min": SIDE, "z_min": SIDE}
+    table = {"where": corner, "to": [SIDE, SIDE, SIDE + 0.06], "stiffness": 90.0, **given}
+    scene = scene_from(content(ligament=[table]))
+    mesh, own = scene.mesh, scene.physics[0].freeze(None, type("Step", (), {"mesh": scene.mesh}))
+    assert scene.physics[0].is_straight_without_tension(mesh, mesh.points)
+    assert not scene.physics[0].is_straight_without_tension(mesh, 1.01 * mesh.points)
+    K = own.attached(mesh, mesh.points, 1.0).blocks[0, :, 0, :, 0]
+    assert np.allclose(K, np.diag([0.0, 0.0, 90.0]), atol=1e-9)
+    assert np.allclose(own.force(mesh, mesh.points, 1.0), 0.0, atol=1e-12)
+
+
 @pytest.mark.slow
 @ORDERS
 def test_a_stiff_cube_hangs_from_its_ligament(order):

@@ -1,5 +1,7 @@
 """Harmonic motion: against waves in closed form, against runs in time, and its derivatives."""
 
+import json
+
 import h5py
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.laws.base import Law
+from liverjax.simulation.cautions import cautions_of_waves
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -341,6 +344,7 @@ def test_scene_files(tmp_path, capsys):
     (tmp_path / "still.toml").write_text(still + pulled)
     assert main(["simulate", str(tmp_path / "still.toml"), "--out", str(tmp_path / "still")]) == 0
     assert main(["simulate", str(scene), *out, "--about", str(tmp_path / "still" / "result.h5")]) == 0
+    assert "relaxed body" not in capsys.readouterr().out
     with h5py.File(tmp_path / "out" / "result.h5") as file, h5py.File(tmp_path / "still" / "result.h5") as state:
         about = lj.harmonic(lj.load_scene(scene), about=state["positions"][-1])
         assert np.array_equal(file["displacement"][()], about.displacement)
@@ -352,6 +356,40 @@ def test_scene_files(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "told"), [(0.1, True), (1e4, False)])
+def test_a_run_that_has_not_rested_is_told(tmp_path, capsys, seconds, told):
+    """Four fifths of its stiffness relax in 100 s: after 0.1 s the forces are five times those at rest."""
+    viscous = FILE.split("[[displaced]]")[0] + "[viscosity]\nratios = [0.8]\nrelaxation_times = [100.0]\n"
+    pulled = "[[fixed]]\nwhere = {x_max = 0.0}\n[[displaced]]\nwhere = {x_min = 0.03}\nby = [0.003, 0.0, 0.0]\n"
+    (tmp_path / "pull.toml").write_text(f"{viscous}{pulled}history = [[0, 0], [0.1, 1]]\n[solve]\ndt = {seconds}\n")
+    (tmp_path / "waves.toml").write_text(
+        viscous + "[[displaced]]\nwhere = {x_max = 0.0}\nby = [0.0, 1e-5, 0.0]\n"
+        '[solve]\nkind = "harmonic"\nfrequencies = [40.0]\n'
+    )
+    assert main(["simulate", str(tmp_path / "pull.toml"), "--out", str(tmp_path)]) == 0
+    about = ["--about", str(tmp_path / "result.h5"), "--out", str(tmp_path / "out")]
+    assert main(["simulate", str(tmp_path / "waves.toml"), *about]) == 0
+    assert ("the relaxed body has other forces in the state of --about" in capsys.readouterr().out) == told
+    with h5py.File(tmp_path / "out" / "result.h5") as file:
+        assert len(json.loads(file.attrs["warnings"])) == told
+
+
+def test_what_acts_in_one_direction_is_told_and_a_motion_without_a_drive():
+    scene = slab(2, 1)
+    side = lj.boundary.boundary_triangles(
+        scene.mesh, np.flatnonzero(scene.mesh.points[:, 0] > 0.999 * scene.mesh.points[:, 0].max())
+    )
+    wall = lj.Obstacle(
+        triangles=jnp.asarray(side), position=(scene.mesh.points[:, 0].max(), 0.0, 0.0), axis=(-1.0, 0.0, 0.0)
+    )
+    (said,) = cautions_of_waves(replace(scene, physics=(wall,)))
+    assert said.startswith("obstacle.0 touches the body without pressure")
+    assert cautions_of_waves(replace(scene, physics=(wall,)), 0.99 * scene.mesh.points) == []
+    assert cautions_of_waves(replace(scene, physics=(wall,)), 1.01 * scene.mesh.points) == []
+    (said,) = cautions_of_waves(replace(scene, displaced=()))
+    assert said.startswith("nothing drives the motion")
+
+
 def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
     heavy = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]") + "frequencies = [40.0]\n"
     (tmp_path / "scene.toml").write_text(heavy)
@@ -418,6 +456,7 @@ def test_an_obstacle_stands_where_it_begins():
         ('frequencies = [60.0]\nreduced = "model.h5"\n', [], "reduced is for runs in time"),
         ("frequencies = [-60.0]\n", [], "frequencies"),
         ("frequencies = [60.0]\n", ["--png"], "--png is for runs in time"),
+        ("frequencies = [60.0]\ndt = 0.01\n", [], "[solve] dt is for runs in time"),
         ("frequencies = [60.0]\n", ["--about", "none.h5"], "holds no positions"),
     ],
 )

@@ -23,7 +23,9 @@ def run(options: argparse.Namespace, scene: "Scene", text: str) -> int:
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
     ran = waves.solved_waves(scene, options.about, options.mesh_error)
-    waves.write_waves(target, scene, ran, {"scene": text, "run_time_s": ran.seconds, "versions": versions()})
+    waves.write_waves(
+        target, scene, ran, {"scene": text, "run_time_s": ran.seconds, "warnings": ran.cautions, "versions": versions()}
+    )
     written = [str(target)]
     if options.vtu:
         written.append(str(waves.write_waves_vtu(options.out / "vtu", scene, ran.found)))
@@ -45,8 +47,6 @@ def _refuse_options(options: argparse.Namespace) -> None:
 
 
 def _tell(scene: "Scene", ran: "Waves") -> None:
-    from liverjax.simulation.cautions import cautions_of_waves
-
     u = np.linalg.norm(np.asarray(ran.found.displacement), axis=-1)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {len(u)} frequencies in "
@@ -58,5 +58,5 @@ def _tell(scene: "Scene", ran: "Waves") -> None:
             off, moved = np.linalg.norm(np.asarray(ran.mesh_error[k])), np.linalg.norm(u[k])
             line += f", the mesh leaves out about {off / moved:.2g} of the motion" if moved else ", nothing moves"
         print(line)
-    for sentence in cautions_of_waves(scene):
+    for sentence in ran.cautions:
         print(f"caution: {sentence}")

@@ -16,8 +16,10 @@ from liverjax.core.files import whole
 from liverjax.core.struct import replace
 from liverjax.jobs.output import read_by_step
 from liverjax.mesh.files import meshio_cells
-from liverjax.scenes.scene import Scene
-from liverjax.simulation.run import simulate
+from liverjax.scenes.scene import Scene, Solve
+from liverjax.simulation.cautions import cautions_of_waves
+from liverjax.simulation.equations import forces_at
+from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import harmonic_mesh_error
@@ -26,12 +28,17 @@ from liverjax.waves.mesh_error import harmonic_mesh_error
 _FOR_LONG = 1e12
 
 
+#: Part of a run's reactions by which those of the relaxed body may differ without a word.
+_RESTED = 0.05
+
+
 class Waves(NamedTuple):
-    """Amplitudes of a scene, and the time and iterations of the solve."""
+    """Amplitudes of a scene, and the time of the solve."""
 
     found: Harmonic
     mesh_error: jax.Array | None  # (F, V, 3) complex [m]
     seconds: float
+    cautions: list[str]
 
 
 def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
@@ -46,11 +53,15 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     Raises:
         InputError: as `harmonic`; a file that is not a result of this mesh.
     """
-    x = _under_its_weight(scene) if about is None else _last_positions(about, scene)
+    x, reactions = (_under_its_weight(scene), None) if about is None else _last_state(about, scene)
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
     seconds = time.perf_counter() - begin
-    return Waves(found, harmonic_mesh_error(scene, found, about=x) if mesh_error else None, seconds)
+    error = harmonic_mesh_error(scene, found, about=x) if mesh_error else None
+    said = cautions_of_waves(scene, x)
+    if x is not None and reactions is not None:
+        said += _of_rest(scene, x, reactions, f"--about {about}")
+    return Waves(found, error, seconds, said)
 
 
 def _under_its_weight(scene: Scene) -> jax.Array | None:
@@ -67,12 +78,14 @@ def _under_its_weight(scene: Scene) -> jax.Array | None:
         raise InputError(f"no state of rest under gravity was found ({error}): give one by --about") from None
 
 
-def _last_positions(file: Path, scene: Scene) -> jax.Array:
+def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:
+    """Positions and reactions (V, 3) of the last step in the file."""
     import h5py
 
     try:
         with h5py.File(file) as given:
-            x, code = np.asarray(given["positions"][-1]), int(np.ravel(read_by_step(given, "status"))[-1])
+            x, reactions = (np.asarray(given[name][-1]) for name in ("positions", "reactions"))
+            code = int(np.ravel(read_by_step(given, "status"))[-1])
     except (OSError, KeyError, IndexError) as error:
         raise InputError(f"--about {file} holds no positions: give result.h5 of a run of this scene") from error
     if x.shape != scene.mesh.points.shape:
@@ -81,7 +94,28 @@ def _last_positions(file: Path, scene: Scene) -> jax.Array:
         )
     if code not in (status.CONVERGED, status.ONE_STEP):
         raise InputError(f"--about {file}: its last step is {status.NAMES[code]}: give a run that ended in balance")
-    return jnp.asarray(x)
+    return jnp.asarray(x), reactions
+
+
+def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> list[str]:
+    """A sentence if the run's reactions (V, 3) [N] are not those of the relaxed body at x: then its stress is another.
+
+    A sponge, whose pressure the file does not tell, is not compared.
+    """
+    pulled = np.linalg.norm(reactions, axis=1)
+    if scene.porosity is not None or not pulled.any():
+        return []
+    at = pulled > 0.01 * pulled.max()
+    still = resting(replace(scene, traction=(), fixed=(), displaced=(), physics=()))
+    still = replace(still, solve=Solve(volumetric=scene.solve.volumetric))
+    relaxed = np.asarray(jax.jit(forces_at)(prepared(still), x))
+    apart = float(np.linalg.norm((relaxed - reactions)[at]) / np.linalg.norm(reactions[at]))
+    if apart <= _RESTED:
+        return []
+    return [
+        f"the relaxed body has other forces in the state of {name} than the run had there ({100 * apart:.2g} % apart), "
+        "and moves with these: let the run rest for much longer than its relaxation times, and give both one material"
+    ]
 
 
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:

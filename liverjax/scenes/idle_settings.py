@@ -34,6 +34,9 @@ def refuse_idle(content: Content) -> None:
     for key in ("fields", "reactions"):
         if motion == "harmonic" and output.get(key):
             raise InputError(f"[output] {key} is for runs in time, [solve] kind is 'harmonic': leave it out")
+    for place, key in (("solve", "dt"), ("solve", "steps"), ("porosity", "initial_pressure")):
+        if motion == "harmonic" and key in content.get(place, {}):
+            raise InputError(f"[{place}] {key} is for runs in time, [solve] kind is 'harmonic': leave it out")
     if motion == "harmonic" and content.get("body", {}).get("mass") == "lumped":
         raise InputError(
             "[body] mass = 'lumped' is for runs in time, harmonic motion has consistent masses: leave it out, or call "

@@ -130,7 +130,7 @@ def histories(scene: Scene) -> dict[str, object]:
     parts: dict[str, object] = {"body": scene.body}
     for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
         parts |= {f"{key}.{k}": part for k, part in enumerate(several)}
-    parts |= dict(_named_physics(scene))
+    parts |= dict(named_physics(scene))
     return {name: part for name, part in parts.items() if getattr(part, "history", None) is not None}
 
 
@@ -138,7 +138,7 @@ def _refuse_what_moves_in_time(scene: Scene) -> None:
     """Refuse histories in harmonic motion, and obstacles that move."""
     for name in histories(scene):
         raise InputError(f"{name}.history is for runs in time: give harmonic motion its amplitudes alone")
-    for name, part in _named_physics(scene):
+    for name, part in named_physics(scene):
         if getattr(part, "by", None) is not None:
             raise InputError(
                 f"{name}.by is for runs in time: give the obstacle its place in harmonic motion as position"
@@ -240,7 +240,7 @@ def check_bounds(scene: Scene) -> None:
         InputError: one sentence with the number's dotted name, value, bound and remedy.
     """
     bounds.check(scene, leave=("mesh", "physics"))
-    for name, physics in _named_physics(scene):
+    for name, physics in named_physics(scene):
         bounds.check(physics, name)
     if scene.viscosity is not None:
         viscosity.check_series(scene.viscosity)
@@ -276,7 +276,7 @@ def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
     Raises:
         InputError: one sentence that begins with the name of the physics.
     """
-    for name, physics in _named_physics(scene):
+    for name, physics in named_physics(scene):
         if only is None or name in only:
             physics.check(scene.mesh, name)
             if scene.points_are != "loaded":
@@ -325,7 +325,7 @@ def check_scene(scene: Scene) -> None:
 
 def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
     """Name of each further physics (as in `check_physics`) -> number of nodal directions that it holds at first."""
-    named = [(name, physics) for name, physics in _named_physics(scene) if only is None or name in only]
+    named = [(name, physics) for name, physics in named_physics(scene) if only is None or name in only]
     return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
 
 
@@ -380,7 +380,7 @@ def _inlets_that_act(sponge: porosity.Porosity) -> None:
             )
 
 
-def _named_physics(scene: Scene) -> list[tuple[str, Physics]]:
+def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
     """Every further physics with the name that scene files give it: support.0."""
     places = {k: f"{p.section}.{n}" for p in scene.physics for n, k in enumerate(scene.named(p.section))}
     return [(places[k], physics) for k, physics in enumerate(scene.physics)]
@@ -393,7 +393,7 @@ def _no_two_normals(scene: Scene) -> None:
     for physics in scene.physics:
         if isinstance(physics, SlidingSupport) and physics.axis:
             mask[np.asarray(physics.nodes), AXES.index(physics.axis)] = False
-    for name, physics in _named_physics(scene):
+    for name, physics in named_physics(scene):
         if not isinstance(physics, SlidingSupport) or physics.axis:
             continue
         across = np.abs(np.asarray(physics.normal)) > 1e-12
@@ -423,7 +423,7 @@ def check_motion_in_planes(scene: Scene) -> None:
     Raises:
         InputError: one sentence that begins with the name of the motion.
     """
-    for name, physics in _named_physics(scene):
+    for name, physics in named_physics(scene):
         if not isinstance(physics, SlidingSupport):
             continue
         nodes, normals = physics.holds(scene.mesh)

@@ -8,9 +8,11 @@ from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import histories
+from liverjax.scenes.scene_checks import histories, named_physics
 from liverjax.simulation.automatic import qualities
 from liverjax.simulation.run import Result
 
@@ -38,11 +40,29 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
     return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_histories(scene, result), *_of_volumes(scene, result)]
 
 
-def cautions_of_waves(scene: Scene) -> list[str]:
-    """Sentences about the mesh, the volumes and the masses of a scene of harmonic motion."""
+def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]:
+    """Sentences about the mesh, the volumes, the masses and the drive of a scene of harmonic motion.
+
+    Args:
+        scene: `Scene`, not traced.
+        about: positions (V, 3) [m] about which it moves; None: the reference shape.
+    """
     said = [*_of_mesh(scene.mesh), *_of_locking(scene)]
     if scene.body is None:
         said.append("the scene has no [body], so the motion has no inertia: write density = 1060.0 in [body]")
+    inlets = () if scene.porosity is None else scene.porosity.inlet
+    if not scene.displaced and not scene.traction and not inlets:
+        said.append("nothing drives the motion: give amplitudes as [[displaced]] or [[traction]]")
+    x = scene.mesh.points if about is None else about
+    for name, physics in named_physics(scene):
+        if isinstance(physics, Ligament) and physics.is_straight_without_tension(scene.mesh, x):
+            said.append(
+                f"{name} is straight but has no tension: it pulls only, and here it acts as a spring in both directions"
+            )
+        if isinstance(physics, Obstacle) and touches_without_pressure(physics, scene.mesh, x):
+            said.append(
+                f"{name} touches the body without pressure: it cannot pull, and here it holds in both directions"
+            )
     return said
 
 
@@ -117,28 +137,42 @@ def _of_locking(scene: Scene) -> list[str]:
     ]
 
 
-#: Part of a history's range that may be left between two steps without a word.
+#: Part of a history, of its largest number or of its sum over time, that may fall between two steps without a word.
 MISSED = 0.05
 
 
 def _of_histories(scene: Scene, result: Result) -> list[str]:
-    """A sentence on every history that has a peak between two steps, where no step sees it."""
+    """A sentence on every history that changes within a step so that the steps, which see it at their ends, miss it."""
     said = []
     steps = np.concatenate([[0.0], np.asarray(result.times)])
     for name, part in histories(scene).items():
         times, values = (np.asarray(getattr(part, column)) for column in ("times", "history"))
-        values = values.reshape(len(times), -1)
-        inside = (times >= 0) & (times <= steps[-1])
-        seen = np.stack([np.interp(steps, times, column) for column in values.T], axis=1)
-        scale = np.abs(values).max()
-        beyond = np.maximum(values - seen.max(axis=0), seen.min(axis=0) - values).max(axis=1) * inside
+        every = np.union1d(steps, times[(times > 0) & (times < steps[-1])])
+        table, at_steps = (_at_times(at, times, values) for at in (every, steps))
+        seen = _at_times(every, steps, at_steps)
+        apart, whole = np.abs(table - seen), np.abs(table)
+        beyond = np.maximum(table - at_steps.max(axis=0), at_steps.min(axis=0) - table).max(axis=1)
         peak = int(beyond.argmax())
-        if beyond[peak] > MISSED * scale:
+        if beyond[peak] > MISSED * whole.max():
             said.append(
-                f"the history of {name} has a peak at {times[peak]:.4g} s between two steps, and the run misses "
-                f"{100 * beyond[peak] / scale:.2g} % of it: take a smaller dt, or one that divides {times[peak]:.4g} s"
+                f"the history of {name} has a peak at {every[peak]:.4g} s between two steps, and the run misses "
+                f"{100 * beyond[peak] / whole.max():.2g} % of it: take a smaller dt, or one that divides "
+                f"{every[peak]:.4g} s"
+            )
+            continue
+        lost, everything = (np.trapezoid(a, every, axis=0).max() for a in (apart, whole))
+        if lost > MISSED * everything:
+            said.append(
+                f"the history of {name} bends within steps, and the run, which sees it at their ends, is off by "
+                f"{100 * lost / everything:.2g} % of its sum over time: take a smaller dt"
             )
     return said
+
+
+def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Numbers (n, k) of a table, linear in between, at other times (n,)."""
+    columns = values.reshape(len(times), -1).T
+    return np.stack([np.interp(at, times, column) for column in columns], axis=1)
 
 
 def _of_volumes(scene: Scene, result: Result) -> list[str]:

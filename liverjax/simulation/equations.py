@@ -266,6 +266,14 @@ def forces(
     return Forces(mjed.nodal_force(e.mesh, P), [a.force(e.mesh, x, s) for a in e.nodal], pressure, x, F)
 
 
+def forces_at(scene: Scene, x: jax.Array) -> jax.Array:
+    """Forces (V, 3) [N] that keep the nodes of a scene at rest, in which nothing is held, at positions x (V, 3)."""
+    none = jnp.zeros(())
+    e = equations(scene, initial_state(scene), 1.0, Sizes(none, none))
+    q = unknowns(e, x)
+    return forces(e, q if e.mixed is None else settled(e, q), 1.0).total
+
+
 def _unknown_pressure(e: Equations, q: jax.Array) -> jax.Array:
     """Unknown pressures (V,) [Pa] of the vertices."""
     return e.mixed.unit * q[3 * e.mesh.number_of_nodes :]

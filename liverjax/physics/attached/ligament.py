@@ -75,18 +75,18 @@ class Ligament(Physics):
             most = float(np.asarray(self.stiffness) * lengths.min())
             raise InputError(f"{name}.pre_tension = {self.pre_tension} N must be below its limit, {most:.3g} N")
 
-    def _vectors(self, mesh: TetMesh) -> jax.Array:
-        """Vectors (m, 3) along the fibres in the reference shape."""
-        f = jnp.einsum("am,ami->mi", jnp.asarray(self.weights), mesh.points[self.nodes])
+    def _vectors(self, x: jax.Array) -> jax.Array:
+        """Vectors (m, 3) along the fibres at positions x (V, 3)."""
+        f = jnp.einsum("am,ami->mi", jnp.asarray(self.weights), x[self.nodes])
         return f if self.to is None else f - jnp.asarray(self.to)[None]
 
-    def _lengths(self, mesh: TetMesh) -> jax.Array:
-        f = self._vectors(mesh)
+    def _lengths(self, x: jax.Array) -> jax.Array:
+        f = self._vectors(x)
         return jnp.sqrt(jnp.sum(f * f, axis=1))
 
     def _rest(self, mesh: TetMesh) -> jax.Array:
         """Rest lengths (m,) [m]."""
-        L = self._lengths(mesh)
+        L = self._lengths(mesh.points)
         return jnp.full_like(L, self.rest_length) if self.pre_tension is None else L - self.pre_tension / self.stiffness
 
     def freeze(self, memory: None, step: Step) -> "Fibres":
@@ -100,14 +100,19 @@ class Ligament(Physics):
             return np.zeros(0, int), np.zeros((0, 3))
         lengths, rest = map(np.asarray, _lengths_and_rest(self, mesh))
         taut = lengths >= (1 - _ROUNDED) * rest
-        f = np.asarray(self._vectors(mesh))[taut]
+        f = np.asarray(self._vectors(mesh.points))[taut]
         return np.asarray(self.nodes)[0, taut], f / lengths[taut, None]
+
+    def is_straight_without_tension(self, mesh: TetMesh, x: jax.Array) -> bool:
+        """Whether a fibre has its rest length at positions x (V, 3): a small motion would leave it slack by turns."""
+        lengths, rest = np.asarray(self._lengths(x)), np.asarray(self._rest(mesh))
+        return bool(np.any(np.abs(lengths - rest) <= _ROUNDED * rest))
 
 
 @jax.jit  # compiled, since checks of a sweep compute them for each row
 def _lengths_and_rest(ligament: Ligament, mesh: TetMesh) -> tuple[jax.Array, jax.Array]:
     """Lengths (m,) of the fibres in the reference shape, and at rest [m]."""
-    return ligament._lengths(mesh), ligament._rest(mesh)
+    return ligament._lengths(mesh.points), ligament._rest(mesh)
 
 
 def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: Any) -> Ligament:
@@ -159,5 +164,7 @@ class Fibres(Elements):
 
     def energies(self, mesh: TetMesh, C: tuple[jax.Array, ...]) -> jax.Array:
         """Half the stiffness times the square of the elongation; 0 if the fibre is slack."""
-        longer = jnp.maximum(jnp.sqrt(C[0]) - self.rest[None], 0.0)
+        length, rest = jnp.sqrt(C[0]), self.rest[None]
+        # A fibre at its rest length is taut: the derivatives of a maximum there would be those of a softer one.
+        longer = jnp.where(length >= (1 - _ROUNDED) * rest, length - rest, 0.0)
         return 0.5 * self.spring * longer * longer

@@ -287,6 +287,13 @@ def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
     return d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
 
 
+def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:
+    """Whether the surface at positions x (V, 3) touches the obstacle at its first place, and nowhere presses on it."""
+    d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
+    nothing = d.value >= -_TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
+    return bool(just_touching(obstacle, mesh, d).any() & nothing.all())
+
+
 def _triangle_areas(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
     """Areas (m,) [m^2] of the triangles in the reference shape."""
     normal = surface.areas(mesh.points, obstacle.triangles)
