@@ -217,6 +217,7 @@ def test_what_decides_a_program_is_in_its_name(switched, cube, monkeypatch):
     names.append(compiled_module._key(mjed.energy, (mesh, law, x.astype("float32"))))
     names.append(compiled_module._key(partial(mjed.energy, terms="chapter"), (mesh, law, x)))
     names += [compiled_module._key(partial(mjed.energy, one=f), (mesh, law, x)) for f in (mjed.energy, exit_code)]
+    names.append(compiled_module._key(mjed.energy, (mesh, law, x), {"xla_cpu_use_fusion_emitters": False}))
     with pytest.raises(compiled_module._Unknown):  # what a function made in another holds, no source tells
         compiled_module._key(partial(mjed.energy, one=lambda: mesh), (mesh, law, x))
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")

@@ -349,7 +349,9 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     draws = found.chains.draws.reshape(-1, parameters)
     some = draws[np.linspace(0, len(draws) - 1, SIMULATED).astype(int)]
     modes = some[:, : len(fit.solution.u)]
-    program = compiled(partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data)
+    program = compiled(
+        partial(simulated_rheometer.with_jacobian, simulation=simulation, kind=fit.kind), modes[0], data, short=True
+    )
     exact = np.stack([np.asarray(program(jax.numpy.asarray(u), data)[0]) for u in modes])
     exact += own.residuals(some) - residuals(modes)  # change by the errors of the instrument
     likelihood = log_likelihood(np.sum(exact**2, axis=-1), exact.shape[-1], own.deviations_given)

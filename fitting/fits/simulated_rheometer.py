@@ -179,7 +179,7 @@ def through_torsion(
     u0, kind = jnp.asarray(start.solution.u), start.kind
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()
-        program = compiled(partial(with_jacobian, simulation=simulation, kind=kind), u0, data)
+        program = compiled(partial(with_jacobian, simulation=simulation, kind=kind), u0, data, short=True)
         compiling = time.perf_counter() - begin
         seen = {}
 
@@ -235,7 +235,7 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     if simulation.precompression:
         meshless, exact = _of_finer_mesh(fit, scaled, prony, omega, simulation)
     else:
-        program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega)
+        program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega, short=True)
         meshless, exact = (np.asarray(G) for G in program(scaled, prony, omega))
     natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 

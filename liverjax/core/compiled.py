@@ -28,29 +28,35 @@ from liverjax.core.files import whole
 OWN = ("liverjax.", "fitting.")
 
 
+#: Options of a program that takes longer to compile than to run. XLA's newer kernels run up to twice as fast and take
+#: half as long again to compile; jax 0.11 and later know no others.
+_QUICK: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+
+
 class _Unknown(Exception):
     """Something that the key cannot describe, such as a law of the user's own or a function inside another one."""
 
 
-def compiled(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], *arguments: Any, short: bool = False) -> Callable[..., Any]:
     """Compile `function` for arguments like these, on one device. A call with such arguments then only runs it.
 
     Args:
         function: defined at the top of a module, or `functools.partial` of such a function; its keywords become
             constants of the program.
         arguments: pytrees of arrays and numbers. With structs of the user's own, nothing is kept on disk.
+        short: the program runs for a second or less, so that its compilation counts for more than its speed.
     """
-    folder = program_cache.folder()
+    folder, options = program_cache.folder(), _QUICK if short and jax.default_backend() == "cpu" else {}
     if folder is None or jax.default_backend() != "cpu":  # other devices use only JAX's own cache so far
-        return jax.jit(function).lower(*arguments).compile()
+        return jax.jit(function).lower(*arguments).compile(options)
     try:
-        file = folder / f"whole_{_function_name(function)}-{_key(function, arguments)}-cache"
+        file = folder / f"whole_{_function_name(function)}-{_key(function, arguments, options)}-cache"
     except _Unknown:
-        return jax.jit(function).lower(*arguments).compile()
-    return _found(file) or _made(file, function, arguments)
+        return jax.jit(function).lower(*arguments).compile(options)
+    return _found(file) or _made(file, function, arguments, options)
 
 
-def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callable[..., Any]:
+def _made(file: Path, function: Callable[..., Any], arguments: tuple, options: dict) -> Callable[..., Any]:
     """Compile the function for flat lists of arrays, whose structure can be saved, and save the program if possible."""
     structure = jax.tree.structure(arguments)
     shape: list[Any] = []
@@ -65,7 +71,7 @@ def _made(file: Path, function: Callable[..., Any], arguments: tuple) -> Callabl
     keep_from = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", math.inf)
     try:
-        program = jax.jit(flat).lower(*jax.tree.leaves(arguments)).compile()
+        program = jax.jit(flat).lower(*jax.tree.leaves(arguments)).compile(options)
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", keep_from)
     try:
@@ -112,13 +118,19 @@ def _top(function: Any) -> str:
     return f"{module}.{name}"
 
 
-def _key(function: Callable[..., Any], arguments: tuple) -> str:
+def _key(function: Callable[..., Any], arguments: tuple, options: dict | None = None) -> str:
     """Digest of everything that the program depends on, except the sources."""
     fixed = function.keywords if isinstance(function, partial) else {}
     if isinstance(function, partial) and function.args:
         raise _Unknown
     config = {k: str(v) for k, v in jax.config.values.items() if "cache" not in k and "log" not in k}
-    said = [_said(fixed, static=True), _said(arguments), sorted(config.items()), os.environ.get("XLA_FLAGS")]
+    said = [
+        _said(fixed, static=True),
+        _said(arguments),
+        sorted(config.items()),
+        os.environ.get("XLA_FLAGS"),
+        options or {},
+    ]
     return hashlib.sha256(repr((jax.default_backend(), said)).encode()).hexdigest()
 
 

@@ -105,8 +105,13 @@ def _run_parts(scene: Scene, count: int, folder: Path | None, report: Callable[[
     return Ran(whole, computed, run_time, compile_time)
 
 
+#: Quadrature points times steps of a run that takes about a second.
+_SHORT = 100_000
+
+
 def _compiled_part(scene: Scene, state: Any, count: int) -> Callable:
-    return compiled(partial(simulate_part, count=count), scene, state, 1.0)
+    short = scene.mesh.weights.size * scene.solve.steps < _SHORT
+    return compiled(partial(simulate_part, count=count), scene, state, 1.0, short=short)
 
 
 def _content(result: Result, state: Any) -> dict[str, np.ndarray]:
