@@ -283,6 +283,22 @@ def test_few_numbers_of_several_scenes(problem):
     assert found.standard_errors[0] < 20
 
 
+@pytest.mark.filterwarnings("ignore:the mesh moves")
+def test_displacements_in_another_unit_are_told(tmp_path, capsys):
+    """Ten times too large: a modulus of a tenth, with a small error. The misfit tells."""
+    scene = _scene(tmp_path, mu=1000.0)
+    _write(tmp_path / "u.csv", scene, 5e-5)
+    rows = np.loadtxt(tmp_path / "u.csv", delimiter=",", skiprows=1)
+    head = (tmp_path / "u.csv").read_text().splitlines()[0]
+    rows[:, [head.split(",").index(name) for name in ("ux", "uy", "uz")]] *= 10
+    np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header=head, comments="")
+    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "5e-5"]
+    main([*command, "--parameters", "law.mu", "--out", str(tmp_path / "out")])
+    assert "per component, so the fit misses the displacements" in capsys.readouterr().err
+    found = json.loads((tmp_path / "out" / "field.json").read_text())
+    assert found["chi2_per_component"] > 1.5 and "look at the unit" in found["warnings"][0]
+
+
 @pytest.mark.slow
 def test_viscosity_from_a_time_series(tmp_path):
     """A block that creeps under its weight: ratio and relaxation time from a few nodes over time."""

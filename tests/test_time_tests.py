@@ -332,6 +332,29 @@ def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path,
     assert f.modes == 2 and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=0.06 if noise else 0.03)
 
 
+@pytest.mark.parametrize(
+    ("kind", "offset", "told"),
+    [("relaxation", 10.0, True), ("relaxation", -6.0, True), ("relaxation", 0.0, False), ("creep", 3e-3, True)],
+)
+def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset, told):
+    """Standard linear solid, 1000 and 600 Pa, loaded at 2 s after ten rows at rest; the answers scatter by 0.5 %."""
+    rng = np.random.default_rng(0)
+    t = np.r_[np.arange(0, 2.01, 0.2), 2 + np.geomspace(0.02, 60, 90)]
+    s, on = np.clip(t - 2, 0, None), t > 2.0001
+    if kind == "relaxation":
+        driven, answer, head = 0.1 * on, 0.1 * (600 + 400 * np.exp(-s / 3)), "time_s,strain [1],stress_Pa"
+    else:
+        creep = 1 / 600 - (1 / 600 - 1 / 1000) * np.exp(-s / 5)  # 5 s = 3 s G0/G_inf
+        driven, answer, head = 10.0 * on, 10 * creep, "time_s,stress_Pa,strain [1]"
+    answer = on * answer * (1 + 0.005 * rng.standard_normal(len(t))) + offset
+    test = read_time_test(write(tmp_path / "t.csv", head, t, driven, answer), kind)
+    assert any("as an offset of the sensor" in note for note in test.notes) == told
+    found = fits.fit(test)
+    assert found.modes == 1
+    G0, ratio = found.uncertainty.values[0], found.uncertainty.values[1]
+    assert abs(G0 / 1000 - 1) < 0.006 and abs(G0 * (1 - ratio) / 600 - 1) < 0.006
+
+
 def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):
     t = np.geomspace(0.02, 40, 60)
     file = write(tmp_path / "t.csv", "time_s,strain [1],stress_Pa", t, 0 * t + 0.01, 0.01 * relaxation(SOLID, t))

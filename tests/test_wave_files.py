@@ -201,3 +201,16 @@ def test_labels_on_voxels_of_another_size_are_refused(tmp_path):
         wave_field.read_waves(tmp_path / "waves.npz", labels=tmp_path / "labels.npz")
     np.savez(tmp_path / "labels.npz", labels=labels)
     assert np.all(wave_field.read_waves(tmp_path / "waves.npz", labels=tmp_path / "labels.npz").labels == 1)
+
+
+def test_rounded_places_tell_the_spacing_by_their_whole_length(tmp_path):
+    """Voxels of 1.5625 mm, written with five decimals: single steps are 1.56 and 1.57 mm."""
+    field = plane_waves((12, 5, 5))
+    text = written(tmp_path, ".csv", field).read_text().splitlines()
+    rows = [line.split(",") for line in text[1:]]
+    for row in rows:
+        row[1:4] = [f"{float(x) * 1.5625e-3 / H:.5f}" for x in row[1:4]]
+    (tmp_path / "waves.csv").write_text("\n".join([text[0], *(",".join(row) for row in rows)]) + "\n")
+    found = wave_field.read_waves(tmp_path / "waves.csv")
+    np.testing.assert_allclose(found.spacing, 1.5625e-3, rtol=1e-3)  # 5e-6 m in 6.25 mm
+    assert found.spacing[0] == pytest.approx(1.5625e-3, rel=3e-4) and found.mask.all()

@@ -84,6 +84,7 @@ def _fit_few_numbers(options: argparse.Namespace, problem: Problem) -> int:
     with bar:
         found = scene_numbers.fit_numbers(problem, names, progress=told)
     print(field_report.table_of_numbers(found))
+    _warn(field_report.misfit_sentence(found))
     field_report.write(options.out, problem.scenes[0].mesh, _files(options) | field_report.of_numbers(found), None)
     print(f"written: {options.out}/field.json")
     return 0 if found.converged else 1
@@ -110,17 +111,21 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
             "or the scene misses something (mesh, supports, loads)",
             file=sys.stderr,
         )
-    moved = field.bias_sentence(found)
-    if moved is not None:
-        print(f"warning: {moved}", file=sys.stderr)
+    _warn(field.bias_sentence(found))
     if options.sphere:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))
         print(field_report.table_of_numbers(sphere))
+        _warn(field_report.misfit_sentence(sphere))
         content["sphere"] = field_report.of_numbers(sphere)
         good = good and sphere.converged
     field_report.write(options.out, mesh, content, found)
     print(f"written: {options.out}/field.json, field.vtu, field.h5, field.png")
     return 0 if good else 1
+
+
+def _warn(sentence: str | None) -> None:
+    if sentence is not None:
+        print(f"warning: {sentence}", file=sys.stderr)
 
 
 def _files(options: argparse.Namespace) -> dict:

@@ -395,12 +395,33 @@ def _as_shear(path, form, columns, sample):
     return columns["displacement"] / h, columns["force"] / (3 * np.pi * r**2), [note]
 
 
+#: Fewest rows at rest whose mean is an offset, and the part of the largest answer below which it does not matter.
+RESTING, OFFSET = 3, 0.003
+
+
+def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
+    """The answers without their mean before the load, if it is more than their scatter; then a note."""
+    rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
+    count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
+    if count < RESTING:
+        return test.answer, []
+    mean, error = float(np.mean(test.answer[rest])), float(np.std(test.answer[rest], ddof=1)) / np.sqrt(count)
+    if not abs(mean) > max(3 * error, OFFSET * size):
+        return test.answer, []
+    what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
+    return test.answer - mean, [
+        f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, "
+        f"{100 * abs(mean) / size:.2g} % of the largest: it is taken off all rows, as an offset of the sensor"
+    ]
+
+
 def _checked(test: TimeTest, start: float) -> TimeTest:
     if not np.max(np.abs(test.driven)) > 0:
         word = "strain" if test.kind == "relaxation" else "stress"
         raise InputError(f"{test.source}: the {word} is zero throughout; a {test.kind} test needs one")
     sign = np.sign(test.driven[np.argmax(np.abs(test.driven))])
-    driven, answer = sign * test.driven, sign * test.answer
+    driven, (answer, told) = sign * test.driven, _without_offset(test)
+    answer = sign * answer
     used = test.used & np.isfinite(answer) & (test.time >= start) & (test.time > test.begun)
     if used.sum() < 4:
         raise InputError(
@@ -410,7 +431,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(
             f"{test.source}: most answers have the opposite sign of the {test.kind} test's input; correct the signs"
         )
-    notes, before = test.notes, int(np.sum(test.time <= test.begun))
+    notes, before = (*test.notes, *told), int(np.sum(test.time <= test.begun))
     if before > 2:
         notes = (*notes, f"the load begins at {test.begun:.3g} s: {before} rows before it are not fitted")
     return test._replace(driven=driven, answer=answer, used=used, notes=notes)

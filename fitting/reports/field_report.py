@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from fitting.fits.field import Field
-from fitting.methods.estimate import Estimate
+from fitting.methods.estimate import Estimate, bias_sentences
 from fitting.readers.displacements import locate
 from fitting.reports.sweep_report import numbers
 from liverjax.core.plotting import pyplot, save
@@ -20,6 +20,22 @@ from liverjax.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+#: chi^2 per component above which there is a warning that the model misses something.
+TOO_FAR = 1.5
+
+
+def misfit_sentence(found: Estimate) -> str | None:
+    """A warning if the fit misses the displacements by more than their noise; else None."""
+    ratio = found.chi2 / found.components
+    if not ratio > TOO_FAR:
+        return None
+    return (
+        f"chi2 stays at {ratio:.3g} per component, so the fit misses the displacements by {np.sqrt(ratio):.2g} times "
+        "their noise: the numbers may be wrong by much more than their errors; look at the unit (--unit), the origin "
+        "of the coordinates, node numbers (from 0), rows of zeros, loads and supports, or give a larger --noise"
+    )
 
 
 def of_numbers(found: Estimate) -> Content:
@@ -35,6 +51,7 @@ def of_numbers(found: Estimate) -> Content:
         "iterations": found.iterations,
         "converged": found.converged,
         "status": [NAMES[c] for c in found.codes],
+        "warnings": [sentence for sentence in (misfit_sentence(found), *bias_sentences(found)) if sentence],
         "run_time_s": found.seconds,
     }
 

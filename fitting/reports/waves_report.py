@@ -9,11 +9,12 @@ import meshio
 import numpy as np
 
 from fitting.reports.sweep_report import numbers
-from fitting.waves import voxels
+from fitting.waves import components, voxels
 from fitting.waves.elastography import Found, Organ
 from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
+from liverjax.core.errors import InputError
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -47,7 +48,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "spacing_m": organ.field.spacing.tolist(),
         "voxels": int(organ.body.mesh.number_of_nodes),
         "elements": int(organ.body.mesh.number_of_elements),
-        "whole": _of_regions(organ, found.whole, found.mesh_bias)[0],
+        "whole": _of_regions(organ, found.whole, found)[0],
         "regions": _by_label(organ, found),
         "direct_inversion": _direct(organ, found, usual),
         "map": None if drawn is None else _of_map(drawn),
@@ -55,7 +56,8 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "versions": versions(),
     }
     content = numbers(content)
-    content["springpots"] = _springpots(_sweeps(out, organ, content))
+    content["springpots"], told = _springpots(_sweeps(out, organ, content))
+    content["warnings"] += told
     (out / "waves.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
     _write_voxels(out / "waves.h5", organ, drawn, usual)
     if drawn is not None:
@@ -64,48 +66,55 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     return content
 
 
-def _of_regions(organ: Organ, found: Regions, bias: np.ndarray) -> list[Content]:
+def _of_regions(organ: Organ, own: Regions, found: Found) -> list[Content]:
     """One dictionary per region, with lists over the frequencies. Errors contain noise, the uncertainty of the edges'
-    places, and the error of the elements.
+    places, and the error of the elements: its mean over the directions of waves, and how far these are apart.
     """
     omega, rows = organ.waves.omega, []
-    for r in range(found.modulus.shape[1]):
-        G, e = found.modulus[:, r], found.standard_errors[:, r]
+    for r in range(own.modulus.shape[1]):
+        G, e = own.modulus[:, r], own.standard_errors[:, r]
         c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
-        missed = G * bias
+        missed, along = G * found.mesh_bias, G[:, None] * found.bias_left
         rows.append(
             {
                 "storage_Pa": G.real.tolist(),
                 "loss_Pa": G.imag.tolist(),
-                "error_storage_Pa": np.hypot(e.real, missed.real).tolist(),
-                "error_loss_Pa": np.hypot(e.imag, missed.imag).tolist(),
+                "error_storage_Pa": np.sqrt(e.real**2 + missed.real**2 + np.sum(along.real**2, axis=1)).tolist(),
+                "error_loss_Pa": np.sqrt(e.imag**2 + missed.imag**2 + np.sum(along.imag**2, axis=1)).tolist(),
                 "standard_error_storage_Pa": e.real.tolist(),
                 "standard_error_loss_Pa": e.imag.tolist(),
-                "edges_farther_out_voxels": found.farther[:, r].tolist(),
+                "edges_farther_out_voxels": own.farther[:, r].tolist(),
                 "mesh_bias_storage_Pa": missed.real.tolist(),
                 "mesh_bias_loss_Pa": missed.imag.tolist(),
                 "phase_velocity_m_s": c.tolist(),
                 "attenuation_1_m": alpha.tolist(),
                 "voxels_a_wave": (2 * np.pi * c / omega / organ.field.spacing.max()).tolist(),
-                "chi2_per_component": (found.chi2 / found.components).tolist(),
-                "noise_factor": found.noise_factor.tolist(),
-                "iterations": found.iterations.tolist(),
-                "converged": found.converged.tolist(),
+                "chi2_per_component": (own.chi2 / own.components).tolist(),
+                "noise_factor": own.noise_factor.tolist(),
+                "iterations": own.iterations.tolist(),
+                "converged": own.converged.tolist(),
             }
         )
     return rows
 
 
-def _springpots(sweeps: dict[str, Path]) -> Content | None:
-    """The springpot model that `models.best_of_models` chooses per sweep, with its numbers; None without sweeps."""
+def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
+    """The springpot model that `models.best_of_models` chooses per sweep, with its numbers, None without sweeps; then
+    warnings.
+    """
     if not sweeps:
-        return None
+        return None, []
     from fitting.fits.families import models
     from fitting.readers import rheometer
 
-    found = {}
+    found, told = {}, []
     for name, file in sweeps.items():
-        sweep = rheometer.read_sweep(file)
+        try:
+            sweep = rheometer.read_sweep(file)
+        except InputError as error:
+            told.append(f"{name}: no springpot is fitted over the frequencies: {error}")
+            continue
+        told += [f"{name}: the springpot is fitted without some frequencies: {note}" for note in sweep.notes]
         fit, _ = models.best_of_models(models.fractional(sweep), sweep)
         u = fit.parameters
         assert u is not None
@@ -114,8 +123,9 @@ def _springpots(sweeps: dict[str, Path]) -> Content | None:
             "numbers": {k: float(v) for k, v in zip(u.names, u.values, strict=True)},
             "standard_errors": numbers({k: float(v) for k, v in zip(u.names, u.standard_errors, strict=True)}),
             "mean_relative_error": float(np.mean(fit.relative_errors(sweep))),
+            "frequencies": len(sweep.angular_frequency),
         }
-    return found
+    return found, told
 
 
 def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
@@ -143,7 +153,7 @@ def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
 def _by_label(organ: Organ, found: Found) -> Content | None:
     if found.parts is None or found.labels is None:
         return None
-    rows = _of_regions(organ, found.parts, found.mesh_bias)
+    rows = _of_regions(organ, found.parts, found)
     return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
 
 
@@ -178,6 +188,9 @@ def _of_map(drawn: WaveMap) -> Content:
 
 def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
+    order = components.order_sentence(organ.field)
+    if order is not None:
+        told.insert(0, order)
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
             continue
@@ -253,7 +266,7 @@ def table(content: Content) -> str:
         said = ", ".join(
             f"{k} = {v:.4g} ± {own['standard_errors'][k] or np.nan:.2g}" for k, v in own["numbers"].items()
         )
-        rows.append(f"{name:12s}{own['model']} over all frequencies: {said}")
+        rows.append(f"{name:12s}{own['model']} over {own['frequencies']} frequencies: {said}")
     if content["map"]:
         m = content["map"]
         rows.append(

@@ -1,5 +1,6 @@
 """An organ and its waves: moduli of the whole and of its regions, and the input of a map."""
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,9 +13,11 @@ from fitting.waves.voxels import VoxelBody
 from fitting.waves.wave_field import WaveField
 from liverjax.core.errors import InputError
 
-__all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_bias", "problem_of_map", "regions_of"]
-#: Directions and polarisations of plane waves, and how many of a voxel's 26 neighbours lie in such directions.
-DIRECTIONS = (((0, 0, 1), (1, 0, 0), 6), ((1, 0, 1), (1, 0, -1), 12), ((1, 1, 1), (1, -1, 0), 8))
+__all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_biases", "problem_of_map", "regions_of"]
+#: Directions of plane waves: to a voxel's neighbours, of two opposite ones the first. And how sharply waves along other
+#: directions than the data's count for less.
+DIRECTIONS = tuple(n for n in itertools.product((1, 0, -1), repeat=3) if n > (0, 0, 0))
+SHARPNESS = 4
 
 
 class Organ(NamedTuple):
@@ -34,6 +37,7 @@ class Found(NamedTuple):
     labels: np.ndarray | None  # (R,) of the regions
     parts: Regions | None
     mesh_bias: np.ndarray  # (F,) complex, relative: from plane waves with the modulus of the whole
+    bias_left: np.ndarray  # (F, D) how each direction of these waves adds to the uncertainty of this mean
 
 
 def body_of(field: WaveField) -> VoxelBody:
@@ -63,15 +67,19 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     m, waves, body = organ.matrices, organ.waves, organ.body
     start = regions.first_modulus(m, waves)
     whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress)
-    bias = np.array([plane_wave_bias(G, w, organ) for G, w in zip(whole.modulus[:, 0], waves.omega, strict=True)])
+    given = zip(whole.modulus[:, 0], waves.omega, directions_of_waves(organ.field), strict=True)
+    rows = [(plane_wave_biases(G, w, organ, weights), weights) for G, w, weights in given]
+    bias = np.array([each @ weights for each, weights in rows])
+    # As many waves as directions that count: their mean is known to the root of the sum of the squares of these.
+    left = np.array([weights * (each - each @ weights) for each, weights in rows])
     labels = organ.field.labels
     if labels is None:
-        return Found(whole, None, None, bias)
+        return Found(whole, None, None, bias, left)
     known = np.unique(labels[tuple(body.voxel.T)])
     each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
     matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
     parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress)
-    return Found(whole, known, parts, bias)
+    return Found(whole, known, parts, bias, left)
 
 
 def _uniform(m: Matrices, body: VoxelBody, density: float) -> edges.RegionMatrices:
@@ -84,16 +92,41 @@ def problem_of_map(organ: Organ, found: Found, length: float) -> stiffness_map.C
     return stiffness_map.course_of(organ.body, organ.matrices, organ.waves, found.whole.modulus[:, 0], length)
 
 
-def plane_wave_bias(G: complex, omega: float, organ: Organ) -> complex:
-    """Relative error of the modulus that these elements find in plane waves without noise; a mean over directions."""
+def directions_of_waves(field: WaveField) -> np.ndarray:
+    """Weights (F, D) of plane waves along `DIRECTIONS`: the squares of the displacement's slopes along them, sharpened.
+
+    The slopes along each axis are those between neighbours, without what the noise adds to them.
+    """
+    n = np.array([np.array(d) / np.linalg.norm(d) for d in DIRECTIONS])
+    rows = []
+    for u, noise in zip(field.displacement, field.noise, strict=True):
+        steep = np.empty(3)
+        for axis in range(3):
+            slope = np.diff(u, axis=axis)
+            steep[axis] = (np.nanmean(np.abs(slope) ** 2) - 4 * noise**2) / field.spacing[axis] ** 2
+        steep = np.maximum(np.nan_to_num(steep), 0.0)
+        along = (n**2 @ steep) ** SHARPNESS
+        rows.append(along / along.sum() if along.sum() > 0 else np.full(len(n), 1 / len(n)))
+    return np.array(rows)
+
+
+def plane_wave_biases(G: complex, omega: float, organ: Organ, weights: np.ndarray) -> np.ndarray:
+    """Relative errors (D,) of the modulus that these elements find in plane waves without noise along `DIRECTIONS`.
+
+    Args:
+        G: modulus [Pa].
+        omega: angular frequency [rad/s].
+        organ: its voxels and density.
+        weights: of the directions (D,); those that do not count are left out, with an error of 0.
+    """
     spacing, density = organ.field.spacing, organ.density
     body = voxels.voxel_body(np.ones((7, 7, 7), bool), spacing)
     uniform, X = _uniform(balance.matrices(body, density), body, density), np.asarray(body.mesh.points)
-    k, total, weight = omega * np.sqrt(density / G), 0j, 0
-    for along, across, count in DIRECTIONS:
-        n, a = (np.array(v) / np.linalg.norm(v) for v in (along, across))
-        d = (np.exp(-1j * k * (X @ n))[:, None] * a).ravel()
-        waves = MeasuredWaves(np.array([omega]), d[None], np.array([1e-3]))
-        own = regions.moduli_of_regions(uniform, waves, np.array([G]))
-        total, weight = total + count * (own.modulus[0, 0] / G - 1), weight + count
-    return total / weight
+    k, found = omega * np.sqrt(density / G), np.zeros(len(DIRECTIONS), complex)
+    for d in np.flatnonzero(weights > 1e-3):
+        n = np.array(DIRECTIONS[d]) / np.linalg.norm(DIRECTIONS[d])
+        across = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
+        u = (np.exp(-1j * k * (X @ n))[:, None] * across / np.linalg.norm(across)).ravel()
+        waves = MeasuredWaves(np.array([omega]), u[None], np.array([1e-3]))
+        found[d] = regions.moduli_of_regions(uniform, waves, np.array([G])).modulus[0, 0] / G - 1
+    return found

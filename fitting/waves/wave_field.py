@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitting.waves import formats
-from fitting.waves.unwrapping import unwrapped
+from fitting.waves.files import formats
+from fitting.waves.files.unwrapping import unwrapped
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Numbers
 

@@ -188,8 +188,10 @@ def _grid(path: Path, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         steps = np.diff(np.unique(np.round(X[:, a], 9)))
         if not len(steps):
             raise InputError(f"{path}: all voxels have the same {'xyz'[a]}: waves need a volume, not a slice")
-        spacing[a] = steps.min()
+        spacing[a] = steps[steps < 1.5 * steps.min()].mean()
     origin = X.min(axis=0)
+    # Places are rounded in a file: the whole length tells the spacing best.
+    spacing = np.ptp(X, axis=0) / np.rint(np.ptp(X, axis=0) / spacing)
     at = np.rint((X - origin) / spacing).astype(int)
     off = np.abs(X - origin - at * spacing).max(axis=0) / spacing
     if off.max() > 0.05:

@@ -1,0 +1,67 @@
+"""Whether the components of a wave's displacement follow the axes of its voxels, from the data alone.
+
+Shear waves keep the volume, so the divergence of the displacement is small. It is not if two components are exchanged
+or one has the other sign, as it happens between programs that count rows first and programs that count columns first.
+"""
+
+import itertools
+
+import numpy as np
+
+from fitting.waves.wave_field import WaveField
+
+#: Fewest voxels with all six neighbours.
+FEWEST = 100
+#: Part of the mean square divergence below which another order or sign of the components is the better one.
+SMALLER = 0.8
+
+
+def other_order(field: WaveField) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+    """Component and sign along each axis that have much less divergence than those given; None if there are none."""
+    slopes = _central_differences(field)
+    if slopes.shape[2] < FEWEST:
+        return None
+    # Products of all slopes d_a u_c give the mean square divergence of every order and sign.
+    flat = slopes.reshape(9, -1)
+    products = (flat @ flat.conj().T).real.reshape(3, 3, 3, 3)
+    best: tuple[tuple[int, ...], tuple[int, ...]] = ((0, 1, 2), (1, 1, 1))
+    least = given = float(np.einsum("aabb", products))
+    for order in itertools.permutations(range(3)):
+        for signs in ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)):
+            pairs = itertools.product(range(3), repeat=2)
+            found = sum(signs[a] * signs[b] * products[a, order[a], b, order[b]] for a, b in pairs)
+            if found < least:
+                best, least = (order, signs), float(found)
+    return best if least < SMALLER * given else None
+
+
+def order_sentence(field: WaveField) -> str | None:
+    """A warning if the components are in another order or have other signs than the axes; else None."""
+    found = other_order(field)
+    if found is None:
+        return None
+    order, signs = found
+    whole = -1 if sum(signs) < 0 else 1  # the sign of all together does not matter
+    names = ", ".join(("-" if whole * s < 0 else "") + "xyz"[c] for c, s in zip(order, signs, strict=True))
+    return (
+        f"the components of the displacement do not follow the axes of the voxels: as ({names}) they change the volume "
+        "much less, as shear waves do; give them in the order and with the signs of the axes"
+    )
+
+
+def _central_differences(field: WaveField) -> np.ndarray:
+    """Central differences d_a u_c (3, 3, n) at voxels with six measured neighbours; each frequency has a size of 1."""
+    U, rows = field.displacement, []
+    middle = tuple(slice(1, -1) for _ in range(3))
+    for u in U:
+        each = []
+        for axis in range(3):
+            ahead, behind = list(middle), list(middle)
+            ahead[axis], behind[axis] = slice(2, None), slice(None, -2)
+            each.append((u[tuple(ahead)] - u[tuple(behind)]) / (2 * field.spacing[axis]))
+        slopes = np.stack(each).reshape(3, -1, 3).transpose(0, 2, 1)
+        inside = np.isfinite(slopes).all(axis=(0, 1)) & field.mask[middle].ravel()
+        slopes = slopes[:, :, inside]
+        size = np.sqrt(np.mean(np.abs(slopes) ** 2)) if slopes.size else 0.0
+        rows.append(slopes / size if size > 0 else slopes[:, :, :0])
+    return np.concatenate(rows, axis=2)

@@ -1,0 +1,1 @@
+"""Formats of files of waves, and phases made continuous."""
