@@ -350,3 +350,18 @@ def test_every_lane_of_a_batch_is_checked(parameters, sentence):
 def test_numbers_to_differentiate_by_are_checked():
     with pytest.raises(lj.InputError, match=r"^law\.bulk = -500\.0 must be above 0 Pa"):
         lj.value_and_gradient(lambda result: result.reactions.sum(), PULLED, {"law.bulk": -500.0})
+
+
+@pytest.mark.parametrize(("by", "refused"), [((0.01, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False)])
+def test_nodes_that_are_fixed_are_not_moved_before_a_run(by, refused):
+    """A motion of 0 contradicts nothing; another one would win without a word."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    moved = lj.Displaced(nodes=mesh.node_sets["x_max"], by=jnp.array(by))
+    held = lj.Fixed(nodes=mesh.node_sets["z_min"])
+    scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=800.0, bulk=4000.0), fixed=(held,), displaced=(moved,))
+    if refused:
+        with pytest.raises(lj.InputError, match=r"fixed.0 and displaced.0 both prescribe node \d+ along x"):
+            scene_checks.check_before_run(scene)
+    else:
+        scene_checks.check_before_run(scene)
+    scene_checks.check_before_run(replace(scene, fixed=(replace(held, axes="yz"),)))

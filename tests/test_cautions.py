@@ -9,7 +9,8 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
-from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves
+from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves, mesh_sentence
+from liverjax.simulation.mesh_error import MeshError
 from liverjax.simulation.run import Result
 
 pytestmark = pytest.mark.quick_to_compile
@@ -139,3 +140,37 @@ def test_a_history_that_changes_within_a_step_is_told(times, history, told):
     said = cautions_of_run(pulled, run(BOX, [np.eye(3)] * 3, [0.1, 0.2, 0.3]))
     assert [sentence.startswith("the history of traction.0") for sentence in said] == [True] * (told is not None)
     assert told is None or told in said[0]
+
+
+@pytest.mark.parametrize(("cells", "told"), [(1, True), (20, False)])
+def test_a_sphere_between_the_points_of_contact_is_told(cells, told):
+    """A sphere of 10 mm, 4 mm deep in a face whose triangles are 100 or 5 mm wide; the body does not move."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (cells, cells, 1))
+    sphere = lj.Obstacle(
+        triangles=lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]),
+        shape="sphere",
+        radius=0.01,
+        position=np.array([0.05, 0.05, 0.111]),
+        by=np.array([0.0, 0.0, -0.005]),
+    )
+    said = cautions_of_run(replace(scene(mesh), physics=(sphere,)), run(mesh, [np.eye(3)], [1.0]))
+    assert any("in the body between the points at which contact is tested" in sentence for sentence in said) == told
+
+
+def test_a_lagged_pressure_that_goes_up_and_down_is_told():
+    sponge = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5, scheme="lagged")
+    still = replace(scene(BOX, dt=0.1, steps=6), porosity=sponge)
+    times = [0.1 * k for k in range(1, 7)]
+    rising = np.linspace(0.5, 1.0, 6)[:, None] * np.ones(BOX.number_of_nodes)
+    falling = np.array([0.0, 0.95, 0.05, 0.9, 0.1, 0.8])[:, None] * np.ones(BOX.number_of_nodes)
+    for pressure, told in ((rising, False), (falling, True)):
+        result = replace(run(BOX, [np.eye(3)] * 6, times), pressure=pressure)
+        assert any("scheme = 'lagged' does if it is unstable" in s for s in cautions_of_run(still, result)) == told
+
+
+def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
+    error = MeshError(positions=np.full((1, 8, 3), 1e-4), reactions=np.zeros((1, 8, 3)), found=np.array([False]))
+    result = replace(run(BOX, [np.eye(3)], [1.0]), mesh_error=error)
+    assert "does not move" not in mesh_sentence(scene(BOX), result) and "not found" in mesh_sentence(scene(BOX), result)
+    nothing = replace(error, positions=np.zeros((1, 8, 3)), found=np.array([True]))
+    assert "the body does not move" in mesh_sentence(scene(BOX), replace(result, mesh_error=nothing))

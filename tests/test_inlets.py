@@ -153,3 +153,11 @@ def test_inlets_that_would_do_nothing_are_refused():
     ):
         with pytest.raises(InputError, match=words):
             scene_from(content(inlets, **({"drained": drained} if drained else {})))
+
+
+def test_places_of_the_fluid_that_hold_middles_of_edges_alone_are_refused():
+    """Pressures belong to vertices: at x = 0.05, between vertices at 0.033 and 0.067, there are none."""
+    middle = {"x_min": 0.04, "x_max": 0.06}
+    for more in ({"inlet": [{"where": middle, "pressure": 5.0}]}, {"inlet": [], "drained": [middle]}):
+        with pytest.raises(InputError, match="meets only middles of edges, which have no pressure"):
+            scene_from(content(more["inlet"], 2, **{k: v for k, v in more.items() if k == "drained"}))

@@ -160,6 +160,15 @@ def test_copies_other_cells_and_millimetres_are_told(tmp_path):
     assert np.isclose(float(lj.read_mesh(tmp_path / "large.vtk", "mm").volumes.sum()), 0.28**3)
 
 
+def test_a_bound_in_millimetres_is_told():
+    """It would exclude nothing, and select the whole mesh. A bound far outside is a common way to select everything."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
+    with pytest.warns(UserWarning, match=r"where: z_max = 50 m excludes nothing.*write 0.05 if it is in mm"):
+        assert len(lj.boundary.select(mesh, {"z_max": 50})) == 27
+    for where in ({"z_min": -1.0}, {"z_max": 1e3}, {"x_max": 0.2}):
+        assert len(lj.boundary.select(mesh, where)) == 27
+
+
 @pytest.mark.parametrize("top", [[0.2, 0.2, 2.0], [0.2, 0.2, 0.5]], ids=["around", "inside"])
 def test_elements_on_one_side_of_a_face_are_refused(top):
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], top])

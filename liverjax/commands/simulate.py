@@ -122,6 +122,23 @@ def _with_mesh_error(scene: "Scene", result: "Result") -> "Result":
     return replace(result, mesh_error=compiled(estimated_error, *arguments)(*arguments))
 
 
+def _sizes_of_places(scene: "Scene") -> list[str]:
+    """What each traction and each region covers: only whole triangles and whole elements belong to a place."""
+    import numpy as np
+
+    from liverjax.mesh.surface import areas
+
+    out, volumes = [], np.asarray(scene.mesh.volumes)
+    for k, load in enumerate(scene.traction):
+        area = float(np.linalg.norm(np.asarray(areas(scene.mesh.points, load.triangles)), axis=1).sum())
+        out.append(f"traction.{k} acts on {area:.4g} m^2")
+    for k, region in enumerate(scene.region):
+        out.append(
+            f"region.{k} is {100 * volumes[np.asarray(region.elements)].sum() / volumes.sum():.3g} % of the volume"
+        )
+    return out
+
+
 def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: dict) -> None:
     """Write the results in place of the parts of the run; print its statistics and cautions."""
     import numpy as np
@@ -148,6 +165,8 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: 
         + f"compile {ran.compile_time:.3g} s"
         + (f"; {steps - ran.steps} steps found on disk" if ran.steps < steps else "")
     )
+    for line in _sizes_of_places(scene):
+        print(line)
     for sentence in said:
         print(f"caution: {sentence}")
     if ran.result.mesh_error is not None:

@@ -1,5 +1,6 @@
 """Parts of a mesh: nodes chosen by place or by name, triangles of its surface."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -45,12 +46,25 @@ def select(
         if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not np.isfinite(bound):
             raise InputError(f"{name}: {key} = {bound!r} is not a length: give a number in metres")
         x = points[:, AXES.index(key[0])]
+        _warn_of_millimetres(x, key, bound, name)
         inside &= x >= bound - tolerance if key.endswith("min") else x <= bound + tolerance
     if not inside.any():
         low, high = points.min(axis=0), points.max(axis=0)
         box = ", ".join(f"{a} {lo:.4g} to {hi:.4g}" for a, lo, hi in zip(AXES, low, high, strict=True))
         raise InputError(f"{name} = {where} meets no node: the mesh spans {box} m")
     return np.flatnonzero(inside)
+
+
+def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> None:
+    """Warn if a bound excludes nothing, but would lie within the mesh if it were in millimetres."""
+    low, high = x.min(), x.max()
+    idle = bound > high if key.endswith("max") else bound < low
+    if idle and abs(bound) > 1 and low < 1e-3 * bound < high:
+        warnings.warn(
+            f"{name}: {key} = {bound:g} m excludes nothing, since the mesh spans {low:.4g} to {high:.4g} m: bounds are "
+            f"in metres, write {1e-3 * bound:g} if it is in mm",
+            stacklevel=3,
+        )
 
 
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:

@@ -53,11 +53,13 @@ def check_before_run(scene: Scene) -> None:
     nothing.
 
     Raises:
-        InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume.
+        InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
+            nodes that are fixed and moved along one axis.
     """
     check_choices(scene)
     check_bounds(scene)
     _known_nodes(scene)
+    _moved_where_fixed(scene)
 
 
 def check_choices(scene: Scene) -> None:
@@ -132,6 +134,25 @@ def histories(scene: Scene) -> dict[str, object]:
         parts |= {f"{key}.{k}": part for k, part in enumerate(several)}
     parts |= dict(named_physics(scene))
     return {name: part for name, part in parts.items() if getattr(part, "history", None) is not None}
+
+
+def _moved_where_fixed(scene: Scene) -> None:
+    """Refuse a motion of nodes that are fixed along its axis; traced arrays and motions of 0 pass."""
+    for k, motion in enumerate(scene.displaced):
+        by = motion.history if motion.by is None else motion.by
+        if isinstance(by, jax.core.Tracer) or isinstance(motion.nodes, jax.core.Tracer):
+            continue
+        moved = np.any(np.asarray(by, float).reshape(-1, 3) != 0, axis=0)
+        for n, hold in enumerate(scene.fixed):
+            axes = [a for a in motion.axes if a in hold.axes and moved[AXES.index(a)]]
+            if not axes or isinstance(hold.nodes, jax.core.Tracer):
+                continue
+            both = np.intersect1d(np.asarray(motion.nodes), np.asarray(hold.nodes))
+            if len(both):
+                raise InputError(
+                    f"fixed.{n} and displaced.{k} both prescribe node {both[0]} along {axes[0]}: make their places "
+                    "differ"
+                )
 
 
 def _refuse_what_moves_in_time(scene: Scene) -> None:
@@ -352,12 +373,20 @@ def _places(scene: Scene) -> None:
         return
     if scene.porosity.drained is not None:
         check_nodes(scene.porosity.drained, mesh.number_of_nodes, "porosity.drained")
+        _has_vertices(mesh, scene.porosity.drained, "porosity.drained")
     for k, inlet in enumerate(scene.porosity.inlet):
         if inlet.nodes is not None:
             check_nodes(inlet.nodes, mesh.number_of_nodes, f"porosity.inlet.{k}.nodes")
+            _has_vertices(mesh, inlet.nodes, f"porosity.inlet.{k}")
         else:
             check_triangles(mesh, inlet.triangles, f"porosity.inlet.{k}.triangles")
     _inlets_that_act(scene.porosity)
+
+
+def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
+    """Refuse a place of the fluid that holds only middles of edges: pressures belong to vertices."""
+    if not np.any(np.asarray(nodes, int) < mesh.number_of_vertices):
+        raise InputError(f"{name} meets only middles of edges, which have no pressure: make its place hold vertices")
 
 
 def _inlets_that_act(sponge: porosity.Porosity) -> None:

@@ -9,7 +9,8 @@ from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.ligament import Ligament
-from liverjax.physics.contact.obstacle import Obstacle, touches_without_pressure
+from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
+from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene
 from liverjax.scenes.scene_checks import histories, named_physics
@@ -37,7 +38,14 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         scene: `Scene`, not traced.
         result: `Result` of its run.
     """
-    return [*_of_mesh(scene.mesh), *_of_locking(scene), *_of_histories(scene, result), *_of_volumes(scene, result)]
+    return [
+        *_of_mesh(scene.mesh),
+        *_of_locking(scene),
+        *_of_histories(scene, result),
+        *_of_contacts(scene, result),
+        *_of_pressures(scene, result),
+        *_of_volumes(scene, result),
+    ]
 
 
 def cautions_of_waves(scene: Scene, about: jax.Array | None = None) -> list[str]:
@@ -76,13 +84,15 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())
-    if size <= _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points)):
+    nothing = _ROUNDOFF * np.ptp(np.asarray(scene.mesh.points))
+    if size <= nothing and error <= nothing and np.all(np.asarray(result.mesh_error.found)):
         return "mesh error: the body does not move, so there is none"
-    part = 100 * error / max(size, 1e-300)
-    said = (
-        f"mesh error (estimate, last step): nodes are up to {error:.2g} m off, {part:.2g} % of the largest "
-        f"displacement ({size:.3g} m)"
+    part = (
+        f"{100 * error / size:.2g} % of the largest displacement ({size:.3g} m)"
+        if size > nothing
+        else "and do not move"
     )
+    said = f"mesh error (estimate, last step): nodes are up to {error:.2g} m off, {part}"
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
             f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse to say more"
@@ -167,6 +177,51 @@ def _of_histories(scene: Scene, result: Result) -> list[str]:
                 f"{100 * lost / everything:.2g} % of its sum over time: take a smaller dt"
             )
     return said
+
+
+#: Part of an indentation that may happen between the contact points of a triangle without a word.
+BETWEEN = 0.25
+
+
+def _of_contacts(scene: Scene, result: Result) -> list[str]:
+    """A sentence on every round obstacle that is in the body between the points at which contact is tested."""
+    said, steps = [], len(result.times)
+    for name, physics in named_physics(scene):
+        if not isinstance(physics, Obstacle) or isinstance(physics, PressedObstacle) or physics.shape == "plane":
+            continue
+        dt = 0.0 if scene.solve.dt is None else scene.solve.dt
+        moved = [physics.displacement(k, scene.solve.steps, dt) for k in range(1, steps + 1)]
+        farthest = int(np.argmax([float(jnp.linalg.norm(m)) for m in moved]))
+        for k in {farthest, steps - 1}:
+            x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
+            between, approach = missed_depth(physics, scene.mesh, x, moved[k])
+            if between > BETWEEN * approach:
+                said.append(
+                    f"{name} is {between:.2g} m in the body between the points at which contact is tested, of an "
+                    f"approach of {approach:.2g} m: the triangles are too large for its radius; refine the mesh there"
+                )
+                break
+    return said
+
+
+#: Times by which changes of the pressure from step to step exceed those over two steps if a scheme is unstable.
+ALTERNATING = 3.0
+
+
+def _of_pressures(scene: Scene, result: Result) -> list[str]:
+    """A sentence if the lagged pressure goes up and down from step to step."""
+    if scene.porosity is None or scene.porosity.scheme != "lagged" or result.pressure is None:
+        return []
+    P = np.asarray(result.pressure)
+    if len(P) < 4:
+        return []
+    once, twice = np.abs(np.diff(P, axis=0)).sum(), np.abs(P[2:] - P[:-2]).sum()
+    if not once > ALTERNATING * twice:
+        return []
+    return [
+        "the pressure goes up and down from step to step, as scheme = 'lagged' does if it is unstable: write scheme = "
+        "'implicit' in [porosity]"
+    ]
 
 
 def _at_times(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:

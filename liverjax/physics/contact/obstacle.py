@@ -287,6 +287,29 @@ def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
     return d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
 
 
+#: Fewest and most points along the edge of a triangle at which a depth between the points of contact is looked for.
+_FEWEST, _MOST = 6, 24
+
+
+def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> tuple[float, float]:
+    """How much deeper [m] a round obstacle, `moved` (3,), is in the body at positions x (V, 3) than the contact points
+    tell; and its depth [m] in the reference shape, or a tenth of its radius if it is outside there.
+    """
+    width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
+    radius = max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width)
+    n = int(np.clip(np.ceil(3 * width / radius), _FEWEST, _MOST))
+    lattice = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]).T / n
+    functions = jnp.asarray(surface.triangle_functions(mesh, lattice), x.dtype)
+    nodes = touching_nodes(obstacle, mesh)
+
+    def depth(y: jax.Array) -> float:
+        return float(-jnp.min(distances(obstacle, jnp.einsum("aq,ami->iqm", functions, y[nodes]), moved).value))
+
+    seen = float(largest_depth(obstacle, mesh, x, moved))
+    approach = depth(mesh.points)
+    return max(depth(x) - seen, 0.0), approach if approach > 0 else 0.1 * radius
+
+
 def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:
     """Whether the surface at positions x (V, 3) touches the obstacle at its first place, and nowhere presses on it."""
     d = _distances(obstacle, mesh, x, obstacle.displacement(0, 1, 0.0))
