@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from fitting.fits import simulated_rheometer, viscoelastic
+from fitting.fits import sample_inertia, simulated_rheometer, viscoelastic
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.rheometer import Sweep
@@ -140,11 +140,15 @@ def test_a_hundred_nodes_are_enough_at_small_strain(law, prony, radius, height):
     assert np.allclose(m.bias, torsion.geometry_factor(rig, law), rtol=1e-9)
 
 
-@pytest.mark.parametrize("part", ["all", pytest.param("isochoric", marks=pytest.mark.slow)])
-def test_the_linear_rig_has_the_derivatives_of_the_simulation(part):
-    """Along a random direction in all parameters, to the order of the strain; a fit needs no more."""
+@pytest.mark.parametrize(
+    ("part", "density"), [("all", None), ("all", 1060.0), pytest.param("isochoric", None, marks=pytest.mark.slow)]
+)
+def test_the_linear_rig_has_the_derivatives_of_the_simulation(part, density):
+    """Along a random direction in all parameters, to the order of the strain; a fit needs no more. With inertia the
+    mesh's error of the inertial part, a sixth of the modulus, counts too.
+    """
     sweep = Sweep(OMEGA, np.array([320.0, 480.0, 580.0]), np.array([50.0, 110.0, 130.0]))
-    simulation = simulated_rheometer.Simulation(cell_size=0.004, part=part)
+    simulation = simulated_rheometer.Simulation(cell_size=0.004, part=part, density=density, height=0.02)
     rig, law = simulated_rheometer.rig_of(simulation), lj.laws.typical("neo_hookean")
     torque = torsion.torque_for_strain(rig, np.hypot(sweep.storage, sweep.loss), simulation.strain)
     measured = np.concatenate([sweep.storage, sweep.loss])
@@ -155,16 +159,66 @@ def test_the_linear_rig_has_the_derivatives_of_the_simulation(part):
     slope = np.asarray(run(u, data)[1]) @ direction
     h = 1e-4  # truncation h^2, roundoff of the solved steps 1e-9 / h
     up, down = (np.asarray(run(u + s * h * direction, data)[0]) for s in (1, -1))
-    assert np.abs((up - down) / (2 * h) - slope).max() < simulation.strain * np.abs(slope).max()
+    allowed = simulation.strain if density is None else 0.02
+    assert np.abs((up - down) / (2 * h) - slope).max() < allowed * np.abs(slope).max()
 
 
 def test_inertia_and_large_strain_keep_the_derivative_and_the_mesh_of_the_simulation(monkeypatch):
     coarse = simulated_rheometer.rig_of(simulated_rheometer.Simulation()).mesh.number_of_nodes
-    for simulation in (simulated_rheometer.Simulation(density=1060.0), simulated_rheometer.Simulation(strain=0.05)):
+    heavy, pressed = (simulated_rheometer.Simulation(density=1060.0, precompression=e) for e in (0.0, 0.05))
+    for simulation in (heavy, simulated_rheometer.Simulation(strain=0.05)):
         assert simulated_rheometer.rig_of(simulation).mesh.number_of_nodes > 2 * coarse
+    for simulation in (pressed, simulated_rheometer.Simulation(strain=0.05)):
         monkeypatch.setattr(simulated_rheometer, "simulated_residuals", lambda u, *_: (u**2, None))
         _, J, _ = simulated_rheometer.with_jacobian(jnp.arange(3.0), (), simulation)
         assert np.allclose(J, np.diag([0.0, 2.0, 4.0]))
+
+
+def inertial(omega, G, height):
+    """What a cylinder of 1060 kg/m^3 shows: G k h cot(k h), written out."""
+    x = omega * height * np.sqrt(1060.0 / G)
+    return G * x * np.cos(x) / np.sin(x)
+
+
+@pytest.mark.parametrize("by", ["torque", "angle"])
+def test_a_cycle_with_inertia_begins_without_a_transient(law, prony, by, verified):
+    """One cycle is the torsional wave: a start on the cycle without inertia was 16 % off in G'' here.
+
+    The error is that of 111 nodes and 50 steps, both of second order: at 0.1 Hz they leave 0.1 %, and the inertial part
+    of 42 % is off by (k h)^2/15 and by the layers of the mesh.
+    """
+    height, omega = 0.005, 2 * np.pi * np.array([5.0, 20.0, 30.0])
+    rig = torsion.make_rig(0.010, height, cell_size=0.004, density=1060.0)
+    G = 770 * (1 - np.asarray(viscosity.complex_ratios(prony, jnp.asarray(omega)).sum(axis=0)))
+    exact = inertial(omega, G, height)
+    assert np.abs(exact / G - 1)[-1] > 0.4
+    drive = Drive(steps=50, by=by)
+    size = torsion.torque_for_strain(rig, np.abs(exact), STRAIN) if by == "torque" else STRAIN * height / 0.010
+    m = torsion.moduli(rig, law, prony, omega, size, drive)
+    off = np.abs(_complex(m) - exact) / np.abs(G)
+    assert np.all(off < 0.02) and float(m.defect.max()) < 1e-3
+    six = torsion.moduli(rig, law, prony, omega, size, drive._replace(cycles=6))
+    assert np.abs(_complex(six) - _complex(m)).max() < 1e-3 * np.abs(exact).min()
+    assert int(m.statistics.linear_iterations.max()) < 10  # 43 with the inverse of the stiffness alone
+    verified(f"inertia of a sample in torsion driven by {by}, one cycle", "torsional wave, k h cot(k h)", off[-1], 0.02)
+
+
+def test_inertia_is_taken_off_and_put_back():
+    omega = np.geomspace(1.0, 200.0, 20)
+    G = 300 + 900 * (1j * omega / 100) ** 0.4
+    seen = inertial(omega, G, 0.008)
+    assert np.abs(seen / G - 1).max() > 0.5
+    np.testing.assert_allclose(sample_inertia.shown(G, omega, 1060.0, 0.008), seen, rtol=1e-13)
+    np.testing.assert_allclose(sample_inertia.modulus_of(seen, omega, 1060.0, 0.008), G, rtol=1e-9)
+    sweep = Sweep(omega, seen.real, seen.imag)
+    own = sample_inertia.taken_off(sweep, 1060.0, 0.008)
+    np.testing.assert_allclose(own.storage + 1j * own.loss, G, rtol=1e-9)
+    assert "the inertia of the sample is taken off" in own.notes[-1]
+    back = sample_inertia.put_back(own, 1060.0, 0.008)
+    np.testing.assert_allclose(back.storage + 1j * back.loss, seen, rtol=1e-9)
+    # No modulus of a passive material shows so little loss where all is inertia.
+    with pytest.raises(lj.InputError, match="more inertia than modulus"):
+        sample_inertia.taken_off(Sweep(omega, 0 * omega + 1.0, 0 * omega - 50.0), 1060.0, 0.008)
 
 
 def test_the_linear_derivative_passes_through_any_model_and_its_prior(monkeypatch, law):

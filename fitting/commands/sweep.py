@@ -397,17 +397,22 @@ def _closed(options: argparse.Namespace, sweep: "Sweep", dense: "Spectrum") -> "
 
 def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sweep"]:
     """The fit in closed form, by default also the fit through the simulation, and the corrected sweep that they use."""
-    from fitting.fits import instrument, viscoelastic
+    from fitting.fits import instrument, sample_inertia, viscoelastic
     from fitting.fits.honesty import edges, total_error
     from fitting.methods import generalised_maxwell
     from fitting.readers import frequency_sweep
     from fitting.rigs import compression
 
+    simulation = _simulation(options)
+    if options.density is not None:
+        sweep, noted = sample_inertia.taken_off(sweep, options.density, simulation.height), sweep.notes
+        for note in sweep.notes[len(noted) :]:
+            print(f"note: {note}", file=sys.stderr)
     if options.modes != "auto":
         viscoelastic.check_modes(sweep, options.modes)
     dense = generalised_maxwell.refuse_impossible(sweep)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))
-    closed, simulation = _closed(options, sweep, dense), _simulation(options)
+    closed = _closed(options, sweep, dense)
     if options.precompression:
         factors = compression.shares(laws.typical(options.law), options.precompression)
         closed = instrument.of_compressed_sample(closed, sweep, factors)
@@ -421,6 +426,8 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
     if corrected is not sweep:
         dense = generalised_maxwell.spectrum(corrected)
     fits = [edges.honest(closed, corrected, dense)]
+    if options.density is not None:
+        fits[0].details["density_kg_m3"] = options.density
     if options.method != "closed-form":
         fits.append(_simulated(options, corrected, fits[0], simulation))
     for fit in fits if options.precompression else ():
@@ -431,12 +438,19 @@ def _fits(options: argparse.Namespace, sweep: "Sweep") -> tuple[list["Fit"], "Sw
 
 
 def _simulated(options: argparse.Namespace, sweep: "Sweep", closed: "Fit", simulation: "Simulation") -> "Fit":
-    """The fit through the torsion simulation."""
-    from fitting.fits import simulated_rheometer
+    """The fit through the torsion simulation. With a density it is compared with moduli that contain the inertia."""
+    from fitting.fits import sample_inertia, simulated_rheometer
 
+    density, height = simulation.density, simulation.height
+    if density is not None:
+        sweep = sample_inertia.put_back(sweep, density, height)
     bar, told = cost_bar("evaluations", f"torsion simulation of {len(sweep.angular_frequency)} frequencies")
     with bar:
-        return simulated_rheometer.through_torsion(sweep, closed, simulation, options.optimizer, told)
+        fit = simulated_rheometer.through_torsion(sweep, closed, simulation, options.optimizer, told)
+    if density is None:
+        return fit
+    G = sample_inertia.modulus_of(fit.storage + 1j * fit.loss, sweep.angular_frequency, density, height)
+    return fit._replace(storage=G.real, loss=G.imag)
 
 
 def _simulation(options: argparse.Namespace) -> "Simulation":

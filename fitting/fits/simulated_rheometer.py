@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.fits import sample_inertia
 from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, BestPoint, Fit, Kind, by_importance, fit_at, timed
 from fitting.methods import uncertainty
 from fitting.methods.estimate import Estimate, mesh_bias, with_shared_errors
@@ -37,8 +38,14 @@ class Simulation(NamedTuple):
     density: float | None = None  # of the sample [kg/m^3]; None: the instrument has corrected the moduli
     precompression: float = 0.0  # part of the height at rest by which the plates compress the sample (`compression`)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the response without a mesh is known: small strain, and no inertia of a compressed sample."""
+        return self.strain <= LINEAR_STRAIN and not (self.density is not None and self.precompression)
 
-#: Up to this strain at the rim the linear rig gives the derivatives; their relative error is below the strain.
+
+#: Up to this strain at the rim the linear rig gives the derivatives. Their relative error is below the strain; with
+#: inertia it is that of the mesh in the inertial part.
 LINEAR_STRAIN = 1e-2
 
 
@@ -80,11 +87,11 @@ def with_jacobian(
 ) -> tuple[jax.Array, jax.Array, torsion.Moduli]:
     """Residuals, their derivative by u (rows, P), and the simulated moduli. See `simulated_residuals`.
 
-    The derivative is that of the linear rig, or that of the simulation if strain is large or inertia is simulated. With
-    the derivative of the linear rig Gauss-Newton finds the same minimum in a small part of the time
-    (experiments/benchmarks/torsion_speed.py).
+    The derivative is that of the linear rig without a mesh, or that of the simulation if strain is large, or if a
+    compressed sample has inertia. With the derivative of the linear rig Gauss-Newton finds the same minimum in a small
+    part of the time (experiments/benchmarks/torsion_speed.py).
     """
-    if simulation.density is not None or simulation.strain > LINEAR_STRAIN:
+    if not simulation.is_linear:
 
         def twice(u):
             r, m = simulated_residuals(u, data, simulation, kind)
@@ -110,7 +117,11 @@ def _linear_moduli(
     if simulation.precompression:
         scale = model.shear_modulus / law.shear_modulus()
         return scale * torsion.held_moduli(torsion.held(rig, law), rig, prony, omega, simulation.steps)
-    return torsion.linear_moduli(scaled, prony, omega, simulation.steps)
+    G = torsion.linear_moduli(scaled, prony, omega, simulation.steps)
+    if simulation.density is None:
+        return G
+    rate = sample_inertia.rate_in_steps(omega, simulation.steps)
+    return sample_inertia.shown(G, rate, simulation.density, simulation.height)
 
 
 def rig_of(simulation: Simulation) -> torsion.Rig:
@@ -208,7 +219,7 @@ def through_torsion(
     advice = () if worst == status.CONVERGED else (f"in the simulation, {status.advice(worst)}",)
     at = BestPoint("torsion", found, storage, loss, advice)
     fit = fit_at(sweep, at, kind, (running, compiling), details)
-    if simulation.density is None and simulation.strain <= LINEAR_STRAIN and kind.prior is None:
+    if simulation.is_linear and kind.prior is None:
         fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
@@ -237,6 +248,10 @@ def _with_biases(fit: Fit, data: tuple, simulation: Simulation) -> Estimate:
     else:
         program = compiled(partial(_of_no_mesh, steps=simulation.steps), scaled, prony, omega, short=True)
         meshless, exact = (np.asarray(G) for G in program(scaled, prony, omega))
+    if simulation.density is not None:
+        inertia, rate = (simulation.density, simulation.height), np.asarray(omega)
+        exact = sample_inertia.shown(exact, rate, *inertia)
+        meshless = sample_inertia.shown(meshless, sample_inertia.rate_in_steps(rate, simulation.steps), *inertia)
     natural_of = partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
 
     def moved(missing: np.ndarray) -> np.ndarray:
@@ -314,7 +329,7 @@ def _bias(closed: Fit, simulated: Fit) -> list[str]:
     cause, remedy = "the simulation's discretisation moves", "raise --steps or trust the closed form"
     if simulated.details.get("precompression_strain"):
         cause, remedy = "the plates, which hold the sides of the sample, move", "for smooth plates use closed-form"
-    if simulated.details.get("density_kg_m3") is not None:  # the closed form has no inertia
+    if simulated.details.get("density_kg_m3") and not closed.details.get("density_kg_m3"):  # the closed form has none
         cause, remedy = "the sample's inertia and the discretisation move", "raise --steps to see which it is"
     out = []
     for name, d, e, v in zip(simulated.uncertainty.names, shift, errors, closed.uncertainty.values, strict=True):

@@ -17,6 +17,7 @@ from fitting.rigs.plates import (
 from liverjax.core.struct import Number, replace
 from liverjax.elements import mjed
 from liverjax.laws import Law, isochoric_part, volumetric_part
+from liverjax.mesh.nodal import nodal_volumes
 from liverjax.physics import viscosity
 from liverjax.physics.viscosity import Prony
 from liverjax.tensors.material_axes import symmetric
@@ -69,6 +70,17 @@ def geometry_factor(rig: Rig, law: Law) -> jax.Array:
     return _response(inverse[:, -1]).stiffness / exact_stiffness(rig, law)
 
 
+class Vibrations(NamedTuple):
+    """Vibrations of the elastic rig: K v = value M v, with vectors of unit mass. They have no derivative."""
+
+    values: jax.Array  # (n,) [1/s^2]
+    vectors: jax.Array  # (n, n) [kg^-1/2]
+
+    def solve(self, r: jax.Array, stiffness: Number, mass: Number) -> jax.Array:
+        """x (n,) with (stiffness K + mass M) x = r."""
+        return jnp.asarray(self.vectors @ ((self.vectors.T @ r) / (stiffness * self.values + mass)))
+
+
 class Linearised(NamedTuple):
     """The linearised rig, before a frequency is given."""
 
@@ -76,10 +88,37 @@ class Linearised(NamedTuple):
     relaxing: jax.Array | None  # relaxing part of the stiffness; then its constant part; None: all relaxes
     standing: jax.Array | None
     bias: jax.Array | None = None  # of the mesh of a compressed sample: `geometry_factor` at rest
+    mass: jax.Array | None = None  # (n,) [kg] of each coordinate, with inertia; then stiffness and vibrations
+    elastic: jax.Array | None = None  # (n, n) [N/m]
+    modes: Vibrations | None = None
 
 
 def linearised_rig(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
-    """The stiffness of the rig for all frequencies, and its inverse."""
+    """The stiffness of the rig for all frequencies, and its inverse; with inertia its masses and vibrations too."""
+    rest = _without_inertia(rig, law, prony)
+    if rig.density is None:
+        return rest
+    mass = rest_masses(rig)
+    if rest.relaxing is None or rest.standing is None:
+        elastic = rest_stiffness(rig, law)
+    else:
+        elastic = rest.relaxing + rest.standing
+    root = jax.lax.stop_gradient(jnp.sqrt(mass))
+    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(elastic) / root[:, None] / root[None])
+    return rest._replace(mass=mass, elastic=elastic, modes=Vibrations(values, vectors / root[:, None]))
+
+
+def rest_masses(rig: Rig) -> jax.Array:
+    """Lumped masses (n,) [kg] of the rig's coordinates: nodes, then lift and turn of the plate."""
+    assert rig.density is not None
+    mass = rig.density * nodal_volumes(rig.mesh)
+    plate, X = mass[-rig.top :], rig.mesh.points[-rig.top :]
+    turn = jnp.sum(plate * (X[:, 0] ** 2 + X[:, 1] ** 2)) / rig.radius**2
+    last = [jnp.sum(plate), turn] if rig.free_height else [turn]
+    return jnp.concatenate([jnp.repeat(mass[rig.bottom : -rig.top], 3), jnp.stack(last)])
+
+
+def _without_inertia(rig: Rig, law: Law, prony: Prony | None) -> Linearised:
     if rig.held is not None:
         relaxing, standing, bias = held(rig, law)
         standing = standing * (1.0 if prony is None else 1 - jnp.sum(jnp.asarray(prony.ratios)))
@@ -163,6 +202,25 @@ class Held(NamedTuple):
 def held(rig: Rig, law: Law) -> Held:
     """Input of `held_moduli` from a rig of `compression.compressed`."""
     return Held(*about_held(rig, law), geometry_factor(replace(rig, held=None, height=rest_height(rig)), law))
+
+
+def moving_response(rest: Linearised, modulus: Number, square: Number) -> Response:
+    """`steady_response` with inertia: accelerations are -`square` [1/s^2] times displacements."""
+    assert rest.mass is not None and rest.elastic is not None and rest.modes is not None
+    mass, modes, elastic = rest.mass, rest.modes, rest.elastic
+    unit = jnp.zeros(len(mass), complex).at[-1].set(1.0)
+    if rest.relaxing is not None and rest.standing is not None:
+        K = modulus * rest.relaxing + rest.standing - square * jnp.diag(mass)
+        return _response(jnp.linalg.solve(K, unit))
+
+    def product(v: jax.Array) -> jax.Array:
+        return jnp.asarray(modulus * (elastic @ v) - square * mass * v)
+
+    def solved(_: object, r: jax.Array) -> jax.Array:
+        return modes.solve(r, jax.lax.stop_gradient(modulus), -jax.lax.stop_gradient(square))
+
+    column: jax.Array = jax.lax.custom_linear_solve(product, unit, solved, symmetric=True)
+    return _response(column)
 
 
 def held_moduli(of: Held, rig: Rig, prony: Prony, omega: jax.Array, steps: int | None) -> jax.Array:

@@ -8,6 +8,7 @@ The run starts on the steady cycle of the linearised discrete problem, so in the
 """
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ from fitting.rigs.linear_torsion import (  # noqa: F401  names that users find h
     held_moduli,
     linear_moduli,
     linearised_rig,
+    moving_response,
     steady_response,
     torque_for_strain,
 )
@@ -143,6 +145,11 @@ class _Oscillation(NamedTuple):
         """Time step [s]."""
         return 2 * jnp.pi / (self.omega * self.drive.steps)
 
+    @property
+    def rate(self) -> Number:
+        """Velocity over displacement [rad/s] in a steady cycle of Newmark's average accelerations."""
+        return 2 / self.dt * jnp.tan(self.omega * self.dt / 2)
+
     def positions(self, q: jax.Array) -> jax.Array:
         """Positions (V, 3) [m] of all coordinates."""
         return sample_positions(self.rig, *coordinates(self.rig, q))
@@ -163,7 +170,7 @@ class _Cycle(NamedTuple):
 
     steady: Response
     arc: Number | complex  # amplitude of the last coordinate [m]
-    inverse: jax.Array  # of the elastic stiffness of the unknowns
+    precondition: Callable[[jax.Array], jax.Array]  # nearly the inverse of the tangent of the unknowns
     twist: Number = (
         0.0  # force [N] that turns a compressed mesh, never quite symmetric, without a load: it is subtracted
     )
@@ -177,12 +184,12 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
     """The run, and the bias of the mesh at this frequency (complex if only the isochoric part relaxes)."""
     rig, drive = o.rig, o.drive
     modulus = 1.0 if o.prony is None else 1 - jnp.sum(viscosity.complex_ratios(o.prony, o.omega, o.dt), axis=0)
-    steady = steady_response(rest, modulus)
+    still = steady_response(rest, modulus)
+    steady = still if rig.density is None else moving_response(rest, modulus, o.rate**2)
     # A sin(w t) = Re(-i A e^(i w t)); the complex arc of the linearised discrete problem.
     arc = -1j * o.amplitude * (1 / (steady.stiffness * rig.radius) if o.by_torque else rig.radius)
-    inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
     twist = 0.0 if rig.held is None else jax.lax.stop_gradient(_twist(o))
-    cycle = _Cycle(steady, arc, inverse, twist)
+    cycle = _Cycle(steady, arc, _preconditioner(o, rest), twist)
     q, memories = _initial(o, steady.shape, arc)
     times = o.dt * jnp.arange(1, drive.steps * drive.cycles + 1)
     _, (angle, torque, lift, statistics) = jax.lax.scan(partial(_time_step, o, cycle), (q, memories), times)
@@ -195,8 +202,25 @@ def _oscillate(o: _Oscillation, rest: Linearised) -> tuple[Run, jax.Array]:
         jnp.append(lift_0, lift),
         statistics,
     )
-    bias = steady.stiffness / (modulus * exact_stiffness(rig, o.law)) if rest.bias is None else rest.bias + 0j
+    bias = still.stiffness / (modulus * exact_stiffness(rig, o.law)) if rest.bias is None else rest.bias + 0j
     return run, bias
+
+
+def _preconditioner(o: _Oscillation, rest: Linearised) -> Callable[[jax.Array], jax.Array]:
+    """Nearly the inverse of a step's tangent: of the elastic stiffness, and of Newmark's masses if there is inertia."""
+    if rest.modes is None:
+        inverse = jax.lax.stop_gradient(rest.inverse if o.by_torque else _without_last(rest.inverse))
+        return lambda r: inverse @ r
+    modes, heavy = rest.modes, jax.lax.stop_gradient(4 / o.dt**2)
+    if o.by_torque:
+        return lambda r: modes.solve(r, 1.0, heavy)
+    own = modes.solve(jnp.zeros(len(modes.values)).at[-1].set(1.0), 1.0, heavy)
+
+    def without_last(r: jax.Array) -> jax.Array:
+        x = modes.solve(jnp.append(r, 0.0), 1.0, heavy)
+        return (x - own * x[-1] / own[-1])[:-1]
+
+    return without_last
 
 
 def _twist(o: _Oscillation) -> jax.Array:
@@ -228,7 +252,7 @@ def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tu
     q, statistics = newton.newton_root(
         lambda v: o.solved_part(forces(o.full(v, t)) - load),
         o.solved_part(guess),
-        lambda r: cycle.inverse @ r,
+        cycle.precondition,
         jnp.abs(cycle.steady.stiffness * cycle.arc),
         o.drive.options,
     )
@@ -278,7 +302,7 @@ def _initial(o: _Oscillation, shape: jax.Array, arc: Number | complex) -> tuple[
         return q, (history,)
     _, field = jax.linearize(o.positions, jnp.zeros_like(q))
     on = 1.0 if on_cycle else 0.0
-    return q, (history, Motion(*(field(on * jnp.real(c * shape * arc)) for c in (1j * o.omega, -(o.omega**2)))))
+    return q, (history, Motion(*(field(on * jnp.real(c * shape * arc)) for c in (1j * o.rate, -(o.rate**2)))))
 
 
 @partial(jax.jit, static_argnames="drive")
