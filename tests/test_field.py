@@ -12,7 +12,9 @@ import liverjax as lj
 from fitting.__main__ import main
 from fitting.fits import field, inclusion, scene_numbers
 from fitting.methods import prior
+from fitting.methods.estimate import Estimate
 from fitting.readers import displacements
+from fitting.reports import field_report
 from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
@@ -100,7 +102,8 @@ _BAD = {
     "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
     "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is no number: correct it, or leave it empty",
     "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is no number",
-    "": "cannot be read",
+    "": "is empty: export it again",
+    "node;ux;uy;uz\n5;1e-3;0;0;7": "row 1 has 5 cells under 4 headings",
 }
 
 
@@ -283,6 +286,33 @@ def test_few_numbers_of_several_scenes(problem):
     assert found.standard_errors[0] < 20
 
 
+@pytest.mark.parametrize(
+    "written",
+    [
+        "node;UX;UY;UZ\n5;0,001;;-2e-4\n6;0;0,25;1\n",
+        "# node,ux,uy,uz\n5,1e-3,,-2e-4\n# no more points\n6,0,0.25,1\n",
+        "node\tux\tuy\tuz\n5\t1e-3\tnan\t-2e-4\n6\t0\t0.25\t1\n",
+    ],
+    ids=["spreadsheet", "savetxt", "tabs"],
+)
+def test_tables_of_displacements_of_other_programs(tmp_path, written):
+    (tmp_path / "u.csv").write_text(written)
+    found = displacements.read_displacements(tmp_path / "u.csv", _scene(tmp_path), 1e-4, "mm")
+    assert found.nodes[:, 0].tolist() == [5, 6] and found.components == 5
+    assert np.allclose(found.measured, 1e-3 * np.array([[1e-3, 0, -2e-4], [0, 0.25, 1]]), rtol=1e-14)
+
+
+def test_a_fit_that_misses_the_data_says_so():
+    found = Estimate(
+        ("law.mu",), np.ones(1), np.ones((1, 1)), np.ones(1), np.ones((1, 1)), 90.0, 60, 1.0, 59.0, 3, True
+    )
+    assert field_report.misfit_sentence(found._replace(chi2=89.0)) is None
+    said = field_report.misfit_sentence(found._replace(chi2=240.0))
+    assert said is not None and "chi2 stays at 4 per component" in said and "by 2 times their noise" in said
+    assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said]
+
+
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the mesh moves")
 def test_displacements_in_another_unit_are_told(tmp_path, capsys):
     """Ten times too large: a modulus of a tenth, with a small error. The misfit tells."""

@@ -214,3 +214,10 @@ def test_rounded_places_tell_the_spacing_by_their_whole_length(tmp_path):
     found = wave_field.read_waves(tmp_path / "waves.csv")
     np.testing.assert_allclose(found.spacing, 1.5625e-3, rtol=1e-3)  # 5e-6 m in 6.25 mm
     assert found.spacing[0] == pytest.approx(1.5625e-3, rel=3e-4) and found.mask.all()
+
+
+def test_a_column_with_another_name_is_told(tmp_path):
+    path = written(tmp_path, ".csv", plane_waves((5, 5, 5)))
+    path.write_text(path.read_text().replace("frequency", "freq_Hz"))
+    with pytest.raises(InputError, match=r"name the column of the frequencies frequency \(not freq_hz\)"):
+        wave_field.read_waves(path)

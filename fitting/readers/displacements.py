@@ -1,6 +1,5 @@
 """Measured displacements of points of a body: read from CSV, and a simulation's displacements at these points."""
 
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fitting.readers.tables.text_tables import EMPTY
+from fitting.readers.tables.text_tables import decimal_sign, split_cells, split_line, text_of, to_number
 from liverjax.core.errors import InputError
 from liverjax.mesh.shape_functions import functions
 from liverjax.mesh.tetrahedra import UNITS, TetMesh
@@ -99,16 +98,18 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
 
 
 def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an empty file
-            # Spreadsheets write a mark before the first name.
-            data = np.genfromtxt(path, delimiter=",", names=True, comments="#", dtype=float, encoding="utf-8-sig")
-            data = np.atleast_1d(data)
-    except (OSError, ValueError, IndexError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{path} cannot be read ({reason}): give a CSV with columns x,y,z,ux,uy,uz") from None
-    names = data.dtype.names or ()
+    """Columns by name; NaN for an empty cell. The header may be a comment, as `numpy.savetxt` writes it."""
+    lines = [line for line in text_of(path, "displacements").splitlines() if line.strip(" \t#;,")]
+    if not lines:
+        raise InputError(f"{path} is empty: give a CSV with columns x,y,z,ux,uy,uz")
+    between, names = split_line(lines[0].lstrip("# "))
+    names = [name.lower() for name in names]
+    if not lines[0].lstrip().startswith("#") or set(names) & set(_COLUMNS):
+        lines = lines[1:]
+    else:  # comments before the header
+        lines = [line for line in lines if not line.lstrip().startswith("#")]
+        between, names = split_line(lines[0]) if lines else (between, names)
+        names, lines = [name.lower() for name in names], lines[1:]
     for name in names:
         if name not in _COLUMNS:
             raise InputError(f"{path}: column {name!r} is not known: use {', '.join(_COLUMNS)}")
@@ -117,20 +118,24 @@ def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:
             raise InputError(f"{path} has no column {needed}: give x,y,z (or node) and ux,uy,uz")
     if ("node" in names) == all(c in names for c in "xyz"):
         raise InputError(f"{path} needs either a column node or columns x,y,z: give one of them")
-    table = {name: np.asarray(data[name], float) for name in names}
-    if any(np.isnan(column).any() for column in table.values()):
-        _refuse_words(path, table)
-    return table
+    rows = [split_cells(line.partition("#")[0], between) for line in lines if not line.lstrip().startswith("#")]
+    return dict(zip(names, _rows_of_numbers(path, names, rows, between).T, strict=True))
 
 
-def _refuse_words(path: Path, table: dict[str, np.ndarray]) -> None:
-    """Raise `InputError` if a cell is neither empty nor a number: it would count as not measured."""
-    cells = np.atleast_2d(np.genfromtxt(path, delimiter=",", comments="#", dtype=str, encoding="utf-8-sig"))
-    for j, (name, column) in enumerate(table.items()):
-        for k in np.flatnonzero(np.isnan(column)):
-            cell = cells[k - len(column), j].strip().strip('"')  # the header, if it is there, is above
-            if cell.lower() not in EMPTY:
-                raise InputError(f"{path}: row {k + 1}: {name} = {cell!r} is no number: correct it, or leave it empty")
+def _rows_of_numbers(path: Path, names: list[str], rows: list[list[str]], between: str) -> np.ndarray:
+    """(n, columns). A cell that is neither empty nor a number is refused: it would count as not measured."""
+    sign, values = decimal_sign(cell for row in rows[:1000] for cell in row), np.full((len(rows), len(names)), np.nan)
+    for k, row in enumerate(rows):
+        if len(row) > len(names):
+            raise InputError(f"{path}: row {k + 1} has {len(row)} cells under {len(names)} headings: correct it")
+        for j, cell in enumerate(row):
+            value = to_number(cell, between, sign)
+            if value is None:
+                raise InputError(
+                    f"{path}: row {k + 1}: {names[j]} = {cell!r} is no number: correct it, or leave it empty"
+                )
+            values[k, j] = value
+    return values
 
 
 def _at_nodes(path: Path, mesh: TetMesh, node: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

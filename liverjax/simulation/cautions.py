@@ -1,5 +1,7 @@
 """Cautions about a run that converged: one sentence each, on the host."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -190,8 +192,9 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
         if not isinstance(physics, Obstacle) or isinstance(physics, PressedObstacle) or physics.shape == "plane":
             continue
         dt = 0.0 if scene.solve.dt is None else scene.solve.dt
-        moved = [physics.displacement(k, scene.solve.steps, dt) for k in range(1, steps + 1)]
-        farthest = int(np.argmax([float(jnp.linalg.norm(m)) for m in moved]))
+        place = partial(physics.displacement, steps=scene.solve.steps, dt=dt)
+        moved = jax.vmap(place)(jnp.arange(1, steps + 1))
+        farthest = int(jnp.argmax(jnp.linalg.norm(moved, axis=1)))
         for k in {farthest, steps - 1}:
             x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
             between, approach = missed_depth(physics, scene.mesh, x, moved[k])

@@ -22,7 +22,7 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; give the CSV file of {what}") from None
     if not data.strip():
-        raise InputError(f"{path} is empty: export the sweep again")
+        raise InputError(f"{path} is empty: export it again")
     if workbook.is_one(data):
         return workbook.text(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
     text = _decoded(path, data)

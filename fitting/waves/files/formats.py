@@ -159,7 +159,9 @@ def _voxel_table(path: Path) -> Content:
             raise InputError(f"{path}: row {lines[1 + empty[0]][0]} has no frequency: give every row its own, in Hz")
         hertz, of = np.unique(column["frequency"], return_inverse=True)
     if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
-        raise InputError(f"{path}: a voxel has two rows of one frequency: leave one of them")
+        unknown = [name for name in head if name not in (*COLUMNS, "frequency", "label")]
+        perhaps = f", or name the column of the frequencies frequency (not {unknown[0]})" if unknown else ""
+        raise InputError(f"{path}: a voxel has two rows of one frequency: leave one of them{perhaps}")
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
