@@ -106,7 +106,7 @@ def _add_sample(command: argparse.ArgumentParser) -> None:
         help="standard deviation of the friction of the instrument's bearing [N m s]: it is fitted too",
     )
     command.add_argument(
-        "--density", type=float, metavar="KG_M3", help="density of the sample, to simulate its inertia (default: none)"
+        "--density", type=float, metavar="KG_M3", help="density of the sample, to take its inertia off (default: none)"
     )
     command.add_argument(
         "--precompression",
@@ -469,7 +469,7 @@ def _simulation(options: argparse.Namespace) -> "Simulation":
 
 def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Posterior | None":
     """Samples of the posterior of the last fit, if the user asks for them and the model has few numbers."""
-    from fitting.fits import posterior
+    from fitting.fits import posterior, sample_inertia
 
     if not options.samples:
         return None
@@ -480,5 +480,10 @@ def _posterior(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> "Post
         )
         return None
     if fit.method == "torsion":
-        return posterior.of_simulation(fit, sweep, _simulation(options), options.samples)
+        simulation = _simulation(options)
+        if simulation.density is not None:  # it shows moduli that contain the inertia
+            inertia = (simulation.density, simulation.height)
+            G = sample_inertia.shown(fit.storage + 1j * fit.loss, sweep.angular_frequency, *inertia)
+            fit, sweep = fit._replace(storage=G.real, loss=G.imag), sample_inertia.put_back(sweep, *inertia)
+        return posterior.of_simulation(fit, sweep, simulation, options.samples)
     return posterior.of_sweep(fit, sweep, options.samples)

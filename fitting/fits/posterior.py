@@ -33,7 +33,6 @@ from fitting.methods.springpots import FRACTIONAL, Fractional
 from fitting.methods.uncertainty import parameter_names
 from fitting.readers.rheometer import Sweep
 from fitting.readers.time_tests import TimeTest
-from fitting.rigs import torsion
 from liverjax.core.compiled import compiled
 
 #: The prior of relaxation times ends this factor beyond the times that the data resolve.
@@ -329,13 +328,12 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
     difference between their simulated and their approximate log likelihood: it shows how good the approximation is.
     """
     data, scales = simulated_rheometer.simulation_data(sweep, simulation), np.concatenate(sweep.deviations)
-    law, omega, measured = data[1], data[2], data[4]
+    rig, law, omega, _, measured, _ = data
 
     @jax.jit
     @jax.vmap
     def linear(u):
-        sample = simulated_rheometer.law_and_prony(fit.kind.maxwell(u), law, simulation)
-        return torsion.linear_moduli(*sample, omega, simulation.steps)
+        return simulated_rheometer.small_strain_moduli(rig, fit.kind.maxwell(u), law, omega, simulation)
 
     added = (fit.storage + 1j * fit.loss) / np.asarray(linear(fit.solution.u[None]))[0]
 

@@ -1,7 +1,7 @@
 """Inertia of a cylinder in oscillating torsion, in closed form: what it adds to the modulus that a rheometer shows.
 
 Shear waves run along the axis, with the wave number k = omega sqrt(rho/G*). The torque at the plate that turns, over
-its angle, shows G* k h cot(k h) in place of G* (Schrag 1977, J. Rheol. 21, 399).
+its angle, shows G* k h cot(k h) in place of G* (Schrag 1977, Trans. Soc. Rheol. 21, 399).
 """
 
 import numpy as np

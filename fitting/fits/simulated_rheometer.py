@@ -102,14 +102,14 @@ def with_jacobian(
     rig, law, omega, _, _, scales = data
 
     def linear(u):
-        G = _linear_moduli(rig, kind.maxwell(u), law, omega, simulation)
+        G = small_strain_moduli(rig, kind.maxwell(u), law, omega, simulation)
         return _and_prior(jnp.concatenate([jnp.real(G), jnp.imag(G)]) / scales, u, kind)
 
     r, m = simulated_residuals(u, data, simulation, kind)
     return r, jax.jacfwd(linear)(u), m
 
 
-def _linear_moduli(
+def small_strain_moduli(
     rig: torsion.Rig, model: Maxwell, law: laws.Law, omega: jax.Array, simulation: Simulation
 ) -> jax.Array:
     """Complex moduli [Pa] (n,) that the simulation approaches as the strain goes to zero."""
