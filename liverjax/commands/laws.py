@@ -19,7 +19,8 @@ def run(options: argparse.Namespace) -> int:
     print(f"every law with bulk: volumetric = {' | '.join(VOLUMETRIC)} (default quadratic)")
     print("every law of I1, I2 and J: continued_below = 0.1, finite energy below that J (default off)")
     for name, cls in laws.LAWS.items():
-        print(f"{name}\n    {(cls.__doc__ or name).splitlines()[0]}")
+        energy = (cls.__doc__ or name).split("\n\n")[0].splitlines()
+        print("\n".join([name, *(f"    {line.strip()}" for line in energy)]))
         for field in laws.parameters(cls):
             m = field.metadata
             optional = ", optional" if field.default is None else ""

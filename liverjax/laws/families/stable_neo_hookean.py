@@ -11,10 +11,11 @@ from liverjax.laws.base import Law
 
 @struct
 class StableNeoHookean(Law):
-    """W = m/2 (I1 - 3) - m/2 ln((I1 + 1)/4) + l/2 [(J - a)^2 - (1 - a)^2], a = 1 + 3 m/(4 l).
+    """W = m/2 (I1 - 3) - m/2 ln((I1 + 1)/4) + l/2 [(J - a)^2 - (1 - a)^2], a = 1 + 3 m/(4 l),
+    m = 4/3 mu, l = lame_lambda + 5/6 mu.
 
-    Smith, De Goes, Kim 2018 (eq. 14, shifted to zero at rest), with m = 4/3 mu and l = lambda + 5/6 mu so that mu and
-    lambda are the Lame coefficients of the ground state (their section 3.4).
+    Smith, De Goes, Kim 2018 (eq. 14, shifted to zero at rest), with m and l such that mu and lame_lambda are the Lame
+    coefficients of the ground state (their section 3.4).
     """
 
     mu: Number = param("Pa", "shear modulus", above=0.0, typical=770.0)
