@@ -328,26 +328,30 @@ def test_deviations_of_a_modulus_are_those_of_samples():
     np.testing.assert_allclose(found.imag, samples.imag.std(axis=0), rtol=0.03)
 
 
-@pytest.mark.parametrize("noise", [0.0, 4e-7, 4e-6])
+@pytest.mark.parametrize("noise", [0.0, 4e-7])
 @pytest.mark.parametrize(
     ("order", "signs", "told"),
     [
-        ((0, 1, 2), (1, 1, 1), None),
         ((0, 2, 1), (1, 1, 1), "(x, z, y)"),
         ((1, 2, 0), (1, 1, 1), "(z, x, y)"),
         ((0, 1, 2), (-1, 1, 1), "-"),  # of x or of z: waves across y do not tell
-        ((0, 1, 2), (-1, -1, -1), None),
     ],
 )
 def test_components_that_do_not_follow_the_axes_are_told(noise, order, signs, told):
-    """Shear waves keep the volume. At 40 % of noise exchanged components may pass; sound ones are never accused."""
+    """Shear waves keep the volume; with exchanged components or a wrong sign they would not."""
     field = plane_waves((9, 9, 9), noise=noise)
-    given = field._replace(displacement=np.asarray(signs) * field.displacement[..., list(order)])
-    said = components.order_sentence(given)
-    if told is None or noise > 1e-6:
-        assert said is None or told is not None
-    else:
-        assert said is not None and f"{told}" in said and "they change the volume much less" in said
+    said = components.order_sentence(
+        field._replace(displacement=np.asarray(signs) * field.displacement[..., list(order)])
+    )
+    assert said is not None and told in said and "they change the volume much less" in said
+
+
+@pytest.mark.parametrize("noise", [0.0, 4e-7, 4e-6])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_components_that_follow_the_axes_are_never_accused(noise, sign):
+    """Noise changes the volume in every order alike; the sign of all together says nothing."""
+    field = plane_waves((9, 9, 9), noise=noise)
+    assert components.order_sentence(field._replace(displacement=sign * field.displacement)) is None
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -74,8 +74,8 @@ def taken_off(sweep: Sweep, density: float, height: float) -> Sweep:
     if change[k] > WORTH_A_NOTE:
         notes = (
             *notes,
-            f"the inertia of the sample is taken off: it changes the modulus by up to {100 * change[k]:.2g} % (at "
-            f"{hertz[k]:.3g} Hz)",
+            f"the inertia of the sample, {1e3 * height:.3g} mm high, is taken off: it changes the modulus by up to "
+            f"{100 * change[k]:.2g} % (at {hertz[k]:.3g} Hz)",
         )
     return sweep._replace(storage=G.real, loss=G.imag, notes=notes)
 

@@ -8,7 +8,7 @@ import numpy as np
 from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices
-from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.mesh.tetrahedra import FACES, TetMesh
 
 AXES = "xyz"
 
@@ -70,7 +70,7 @@ def _warn_of_millimetres(x: np.ndarray, key: str, bound: float, name: str) -> No
 def boundary_triangles(mesh: TetMesh, nodes: Indices | None = None) -> np.ndarray:
     """Outer triangles (m, 3), normals outwards; with `nodes` only those between these nodes."""
     tets = np.asarray(mesh.tetrahedra)
-    faces = np.concatenate([tets[:, f] for f in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))])
+    faces = np.concatenate([tets[:, f] for f in FACES])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     outer = faces[np.sort(first[count == 1])]
     return outer if nodes is None else outer[np.isin(outer, np.asarray(nodes)).all(axis=1)]
@@ -122,7 +122,7 @@ def check_triangles(mesh: TetMesh, triangles: Indices, name: str) -> None:
     touched[numbers] = True
     tets = np.asarray(mesh.tetrahedra)
     near = tets[touched[tets].sum(axis=1) >= 3]
-    faces = np.sort(np.concatenate([near[:, f] for f in ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))]), axis=1)
+    faces = np.sort(np.concatenate([near[:, f] for f in FACES]), axis=1)
     own = np.sort(numbers, axis=1)
     code = np.array([V * V, V, 1])
     lost = np.flatnonzero(~np.isin(own @ code, faces @ code))

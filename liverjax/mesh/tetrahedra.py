@@ -228,12 +228,12 @@ def check_mesh(mesh: TetMesh, name: str = "mesh") -> None:
 
 
 #: The faces of a tetrahedron, counterclockwise from outside.
-_FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 
 
 def _refuse_overlaps(tets: np.ndarray, name: str) -> None:
     """Raise `InputError` if two elements are on the same side of a face: then they overlap."""
-    faces = tets[:, _FACES].reshape(-1, 3)
+    faces = tets[:, FACES].reshape(-1, 3)
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1).astype(np.int64)
     nodes = int(tets.max()) + 1
