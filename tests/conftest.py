@@ -28,8 +28,11 @@ ROOT = Path(__file__).parent.parent
 SHARED = Path(os.environ.get("LIVERJAX_SHARED", ROOT.parent / "shared"))
 # XLA's newer way to write kernels takes two thirds of the time of a compilation; 0.11 knows no other. And a program in
 # one part compiles a seventh faster on the one core that a worker has.
-if "XLA_FLAGS" not in os.environ and version("jaxlib").startswith(("0.8.", "0.9.", "0.10.")):
-    os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+if "XLA_FLAGS" not in os.environ:
+    # A GPU adds in no fixed order unless it is told to: without this, equal runs differ in their last digits there.
+    os.environ["XLA_FLAGS"] = "--xla_gpu_deterministic_ops=true"
+    if version("jaxlib").startswith(("0.8.", "0.9.", "0.10.")):
+        os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 #: Files that take seconds: with -x they tell within half a minute what is broken.
 QUICK = {
@@ -149,6 +152,13 @@ def _compilation(request):
 @pytest.fixture(autouse=True)
 def _strict():
     assert jax.config.jax_enable_x64
+
+
+@pytest.fixture
+def processor() -> None:
+    """For what only the processor does."""
+    if jax.default_backend() != "cpu":
+        pytest.skip("programs run on another device than the processor")
 
 
 @pytest.fixture

@@ -183,7 +183,7 @@ def _whole(folder: Path) -> list[Path]:
     return sorted(folder.glob("*/whole_*-cache"))
 
 
-def test_a_whole_program_is_found_without_being_traced(switched, cube, monkeypatch):
+def test_a_whole_program_is_found_without_being_traced(processor, switched, cube, monkeypatch):
     (mesh, law, x), traced = cube, []
     energy = type(law).strain_energy
     monkeypatch.setattr(type(law), "strain_energy", lambda self, m: traced.append(1) or energy(self, m))
@@ -258,7 +258,7 @@ with kept_on_disk():
 """
 
 
-def test_a_program_that_factorises_runs_from_disk(tmp_path):
+def test_a_program_that_factorises_runs_from_disk(processor, tmp_path):
     first, second = (_ended(_started(["-c", FACTORISES], tmp_path)) for _ in range(2))
     assert first == second and _whole(tmp_path)
 
