@@ -56,7 +56,7 @@ from liverjax.simulation.gradients import Gradient, value_and_gradient
 from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result, simulate, unloaded
 from liverjax.waves.harmonic import Harmonic, harmonic
-from liverjax.waves.mesh_error import harmonic_mesh_error
+from liverjax.waves.mesh_error import harmonic_errors, harmonic_mesh_error
 
 __version__ = "0.1.0"
 
@@ -86,6 +86,7 @@ __all__ = [
     "check_mesh",
     "check_scene",
     "harmonic",
+    "harmonic_errors",
     "harmonic_mesh_error",
     "laws",
     "load_reduced",

@@ -223,6 +223,15 @@ def test_the_error_of_the_mesh(order, n):
     exact = standing(np.asarray(scene.mesh.points)[:, 2], modulus())
     missing = exact - np.asarray(found.displacement)[:, :, 0]
     assert np.all(np.linalg.norm(estimate - missing, axis=1) < 0.1 * np.linalg.norm(missing, axis=1))
+    # The force on the driven face, in closed form: the slope of the motion there.
+    low = np.asarray(scene.mesh.node_sets["z_min"])
+    area = np.ptp(np.asarray(scene.mesh.points)[:, :2], axis=0).prod()
+    k = 2 * np.pi * FREQUENCIES * np.sqrt(DENSITY / modulus())
+    force = -area * modulus() * 1e-4 * k * np.tan(k * LENGTH)
+    more, given = (
+        np.asarray(own.reactions)[:, low, 0].sum(axis=1) for own in (lj.harmonic_errors(scene, found), found)
+    )
+    assert np.all(np.abs(given + more - force) < 0.15 * np.abs(given - force))
     with pytest.raises(lj.InputError, match="nodes"):
         lj.harmonic_mesh_error(slab(2, 1), found)
 
@@ -336,6 +345,7 @@ def test_scene_files(tmp_path, capsys):
     with h5py.File(tmp_path / "out" / "result.h5") as file:
         assert np.array_equal(file["displacement"][()], expected.displacement)
         assert file["mesh_error/displacement"].shape == expected.displacement.shape
+        assert file["mesh_error/reactions"].shape == expected.reactions.shape
     shown = meshio.read(tmp_path / "out" / "vtu" / "frequency_002.vtu").point_data["displacement_imaginary"]
     assert np.array_equal(shown, np.asarray(expected.displacement[1]).imag)
     # About the last state of a run in time: there it is pulled by 10 %.

@@ -47,16 +47,20 @@ def _refuse_options(options: argparse.Namespace) -> None:
 
 
 def _tell(scene: "Scene", ran: "Waves") -> None:
+    from liverjax.jobs.waves import missing_parts
+
     u = np.linalg.norm(np.asarray(ran.found.displacement), axis=-1)
+    parts = None if ran.mesh_error is None else missing_parts(scene, ran)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {len(u)} frequencies in "
         f"{ran.seconds:.3g} s with compiling"
     )
     for k, frequency in enumerate(np.asarray(ran.found.frequencies_Hz)):
         line = f"{frequency:g} Hz: at most {1e3 * u[k].max():.4g} mm, residual {float(ran.found.residual[k]):.1e}"
-        if ran.mesh_error is not None:
-            off, moved = np.linalg.norm(np.asarray(ran.mesh_error[k])), np.linalg.norm(u[k])
-            line += f", the mesh leaves out about {off / moved:.2g} of the motion" if moved else ", nothing moves"
+        if parts is not None:
+            motion, force = (float(part[k]) for part in parts)
+            line += ", nothing moves" if np.isnan(motion) else f", the mesh leaves out about {motion:.2g} of the motion"
+            line += "" if np.isnan(force) else f" and {force:.2g} of the forces that hold it"
         print(line)
     for sentence in ran.cautions:
         print(f"caution: {sentence}")

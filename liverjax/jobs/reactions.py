@@ -27,7 +27,7 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
         names.extend(f"{name}.{axis}_{unit}" for axis in "xyz")
         columns.extend(np.asarray(vectors).T)
 
-    for name, held in _held_forces(scene, np.asarray(result.reactions)).items():
+    for name, held in held_forces(scene, np.asarray(result.reactions)).items():
         add(name, held, "N")
     for name, force in spring_forces(scene, result).items():
         add(name, force, "N")
@@ -41,7 +41,7 @@ def reaction_table(scene: Scene, result: Result) -> tuple[list[str], np.ndarray]
     return names, np.stack(columns, axis=1)
 
 
-def _held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
+def held_forces(scene: Scene, reactions: np.ndarray) -> dict[str, np.ndarray]:
     """Forces (T, 3) [N] of every fixed, displaced and sliding part, from those at the nodes (T, V, 3), by name.
 
     A part has the force along the axes that it holds, a sliding one along its normal. If two parts hold the same axis

@@ -15,6 +15,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.struct import replace
 from liverjax.jobs.output import read_by_step
+from liverjax.jobs.reactions import held_forces
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.scene import Scene, Solve
 from liverjax.simulation.cautions import cautions_of_waves
@@ -22,7 +23,7 @@ from liverjax.simulation.equations import forces_at
 from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
 from liverjax.waves.harmonic import Harmonic, harmonic
-from liverjax.waves.mesh_error import harmonic_mesh_error
+from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
 
 #: A time [s] after which nothing flows any more.
 _FOR_LONG = 1e12
@@ -36,7 +37,7 @@ class Waves(NamedTuple):
     """Amplitudes of a scene, and the time of the solve."""
 
     found: Harmonic
-    mesh_error: jax.Array | None  # (F, V, 3) complex [m]
+    mesh_error: HarmonicError | None
     seconds: float
     cautions: list[str]
 
@@ -57,7 +58,7 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
     seconds = time.perf_counter() - begin
-    error = harmonic_mesh_error(scene, found, about=x) if mesh_error else None
+    error = harmonic_errors(scene, found, about=x) if mesh_error else None
     said = cautions_of_waves(scene, x)
     if x is not None and reactions is not None:
         said += _of_rest(scene, x, reactions, f"--about {about}")
@@ -118,6 +119,24 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     ]
 
 
+def missing_parts(scene: Scene, waves: Waves) -> tuple[np.ndarray, np.ndarray]:
+    """What the mesh leaves out of the motion, (F,) [1], and of the largest force of a part that holds the body, (F,)
+    [1]; NaN where nothing moves or pulls. The error of the mesh must have been estimated.
+    """
+    error, found = waves.mesh_error, waves.found
+    if error is None:
+        raise ValueError("the mesh's error was not estimated")
+    sizes = [np.linalg.norm(np.asarray(u), axis=(1, 2)) for u in (error.displacement, found.displacement)]
+    more, force = (held_forces(scene, np.asarray(own)) for own in (error.reactions, found.reactions))
+
+    def largest(forces: dict[str, np.ndarray]) -> np.ndarray:
+        return np.max([np.linalg.norm(own, axis=1) for own in forces.values()], axis=0, initial=0.0)
+
+    sizes += [largest(more) if more else 0 * sizes[0], largest(force) if force else 0 * sizes[0]]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return sizes[0] / np.where(sizes[1] > 0, sizes[1], np.nan), sizes[2] / np.where(sizes[3] > 0, sizes[3], np.nan)
+
+
 def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str, object]) -> None:
     """Frequencies, complex displacements and reactions (F, V, 3), pressures (F, V), the mesh; and `attributes`."""
     import h5py
@@ -127,7 +146,8 @@ def write_waves(file: Path, scene: Scene, waves: Waves, attributes: Mapping[str,
         arrays["pressure"] = (waves.found.pressure, "Pa")
     arrays["reference"] = (scene.mesh.points, "m")
     if waves.mesh_error is not None:
-        arrays["mesh_error/displacement"] = (waves.mesh_error, "m")
+        arrays["mesh_error/displacement"] = (waves.mesh_error.displacement, "m")
+        arrays["mesh_error/reactions"] = (waves.mesh_error.reactions, "N")
     with whole(file) as new, h5py.File(new, "w") as out:
         for name, (values, unit) in arrays.items():
             out[name] = np.asarray(values)

@@ -4,12 +4,21 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, replace
+from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.scenes.enriched import enriched
 from liverjax.scenes.scene import Scene
+from liverjax.solvers.point_matrix import restricted
 from liverjax.waves.harmonic import Harmonic, harmonic
+
+
+@struct
+class HarmonicError:
+    """Estimated error of amplitudes: what an infinitely fine mesh would add."""
+
+    displacement: jax.Array = param("m", "complex (F, V, 3)")
+    reactions: jax.Array = param("N", "complex (F, V, 3); sums over the nodes of a support count")
 
 
 def harmonic_mesh_error(
@@ -19,7 +28,18 @@ def harmonic_mesh_error(
     about: jax.Array | None = None,
     motion: Number | None = None,
 ) -> jax.Array:
-    """Estimated error of amplitudes, complex (F, V, 3) [m]: what an infinitely fine mesh would add.
+    """Estimated error of displacements, complex (F, V, 3) [m]; `harmonic_errors` gives that of reactions too."""
+    return harmonic_errors(scene, found, factors, about, motion).displacement
+
+
+def harmonic_errors(
+    scene: Scene,
+    found: Harmonic,
+    factors: Number | None = None,
+    about: jax.Array | None = None,
+    motion: Number | None = None,
+) -> HarmonicError:
+    """Estimated error of amplitudes by the mesh.
 
     A result of linear elements is solved again with quadratic ones, and one of quadratic elements with cubic ones. With
     too few elements per wave the phase is wrong, and the error is as large as the motion. The cost is that of a mesh
@@ -48,7 +68,14 @@ def harmonic_mesh_error(
     if about is not None:
         about = _padded(rich.mesh, jnp.asarray(about))
     more = harmonic(rich, found.frequencies_Hz, factors, about, motion)
-    return more.displacement[:, :nodes] - found.displacement
+    force = more.reactions[:, :nodes]
+    if scene.mesh.order == 1:
+        # The force of a quadratic function belongs to the two linear ones that it refines, half to each.
+        columns = jnp.moveaxis(more.reactions, 1, -1)
+        force = jnp.moveaxis(jax.vmap(jax.vmap(lambda f: restricted(rich.mesh, f)))(columns), -1, 1)
+    return HarmonicError(
+        displacement=more.displacement[:, :nodes] - found.displacement, reactions=force - found.reactions
+    )
 
 
 def _padded(rich: TetMesh, x: jax.Array) -> jax.Array:
