@@ -47,6 +47,27 @@ def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
     assert re.search("nodes are up to .* m off.*take order = 2 in", mesh_sentence(scene, result))
 
 
+def test_a_bar_of_two_compressible_materials_has_no_mesh_error():
+    """Linear elements hold the exact motion, whose pressure jumps between the materials."""
+    mesh = lj.shapes.box((0.01, 0.01, 0.04), (1, 1, 2))
+    upper = np.flatnonzero(np.asarray(mesh.points)[np.asarray(mesh.tetrahedra), 2].mean(axis=1) > 0.02)
+    law = lj.laws.NeoHookean(mu=700.0, bulk=1000.0)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=law,
+        region=(lj.Region(elements=jnp.asarray(upper), law={"mu": 1800.0}),),
+        fixed=(
+            lj.Fixed(nodes=jnp.arange(mesh.number_of_nodes), axes="xy"),
+            lj.Fixed(nodes=mesh.node_sets["z_min"], axes="z"),
+        ),
+        displaced=(lj.Displaced(nodes=mesh.node_sets["z_max"], by=jnp.array([0.0, 0.0, 0.004]), axes="z"),),
+    )
+    result = lj.simulate(scene, mesh_error=True)
+    assert np.all(np.asarray(result.mesh_error.found))
+    # The tolerance of Newton's method, 1e-8, is left.
+    assert np.abs(result.mesh_error.positions).max() < 1e-8 * 0.004
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("order", "cells"), [(1, 2), (1, 3), (2, 2)])
 @pytest.mark.parametrize("by", [1e-6, 5e-4])

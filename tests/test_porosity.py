@@ -9,6 +9,7 @@ import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.physics import darcy, porosity
 from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation.cautions import cautions_of_run
 from liverjax.simulation.equations import initial_state
 from liverjax.simulation.run import _cast
 from liverjax.tensors.matrices import deformation_gradient
@@ -293,3 +294,19 @@ def test_sealed_fluid_in_float32_at_steps_far_beyond_diffusion():
         single = lj.simulate(replace(scene, body=weight, solve=replace(solve, precision="float32"))).check()
         off = np.abs(np.asarray(single.pressure, float) - exact.pressure).max() / np.abs(exact.pressure).max()
         assert off < 1e-3  # ten times the tolerance of Newton
+
+
+@pytest.mark.parametrize(("part", "told"), [(0.3, True), (2.0, False)])
+def test_a_pressure_that_overshoots_beside_the_drained_face_is_told(part, told):
+    """The load gives P = 1 at most. Steps of h^2/(4 kappa M) and more do not exceed it, shorter ones do by a third."""
+    layers, M = 6, 400.0 + 4 / 3 * SHEAR
+    step = part * (HEIGHT / layers) ** 2 / (4 * 2e-5 * M)
+    scene = column(layers, 3, 3 * step / DIFFUSION_TIME)
+    result = lj.simulate(scene)
+    loaded = abs(LOAD) * 2200.0 / (2200.0 + M)
+    assert (float(result.pressure.max()) > 1.05 * loaded) == told
+    (said,) = [s for s in cautions_of_run(scene, result) if "overshoots" in s] or [""]
+    assert bool(said) == told
+    if told:
+        advised = float(said.split("take a dt of ")[1].split(" s")[0])
+        assert advised == pytest.approx(0.4 * (HEIGHT / layers) ** 2 / (2e-5 * M), rel=0.06)

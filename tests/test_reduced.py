@@ -15,7 +15,7 @@ from liverjax.commands import reduce
 from liverjax.core.struct import replace
 from liverjax.reduced import training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
-from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
+from liverjax.reduced.model import as_matrix, refuse_unseen_numbers, solid_at_points, with_all_points
 from liverjax.reduced.sampling import MOST_STATES, Coordinates, nonnegative_weights, sampled, states_of
 from liverjax.reduced.step import _updated
 from liverjax.reduced.tangent import ReducedTangent, in_single_precision, solved_by_tangent, tangent_matrix
@@ -333,6 +333,35 @@ def test_derivatives_and_lanes(trained):
     assert errors.min() < 1e-7 and errors[0] > 1e3 * errors.min() and errors[-1] > errors.min()
     second = (jax.grad(tip)(800.1) - jax.grad(tip)(799.9)) / 0.2
     assert jax.hessian(tip)(800.0) == pytest.approx(float(second), rel=1e-5)
+
+
+def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_path):
+    """Under a load along another axis the stated error was a hundredth of the true one."""
+    scene, model, *_ = trained
+    q, V = np.random.default_rng(6).normal(size=(12, 6, 3)), len(scene.mesh.points)
+    fields = np.ones((2, V, 3)) * np.arange(2)[:, None, None]
+    learnt = learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(V), 0.1))
+    lj.save_reduced(replace(model, correction=learnt), tmp_path / "model.h5")
+    model = lj.load_reduced(tmp_path / "model.h5")
+    low, high = (float(bound) for bound in model.ranges["law.mu"])
+    inside = {"body.gravity": np.mean(model.ranges["body.gravity"], axis=0)}
+    for value in (high + 0.4 * (high - low), low - 0.4 * (high - low)):
+        refuse_unseen_numbers(model, lj.with_parameters(scene, inside | {"law.mu": value}))
+
+    def refused(numbers: dict, sentence: str) -> None:
+        with pytest.raises(lj.InputError, match=sentence):
+            lj.stated_error(model, lj.with_parameters(scene, inside | numbers), None)
+
+    for value in (high + 0.6 * (high - low), low - 0.6 * (high - low)):
+        refused({"law.mu": value}, "law.mu = .* is far out of its range .* take lj.reduced_error")
+    refused({"body.gravity": np.array([0.0, 9.0, -3.0])}, "body.gravity = .* is far out of its range")
+    refused({"body.density": 2000.0}, "body.density is not that of the model's rows")
+    # Traced numbers are not known.
+    jax.eval_shape(lambda density: refuse_unseen_numbers(model, _heavier(scene, density)), 2000.0)
+
+
+def _heavier(scene, density):
+    return lj.with_parameters(scene, {"body.density": density})
 
 
 def test_another_scene_and_other_physics_are_refused(trained, tmp_path):

@@ -12,6 +12,7 @@ from liverjax.core import bounds
 from liverjax.core.struct import replace
 from liverjax.physics.base import Step
 from liverjax.physics.rigid_plate import RigidPlate
+from liverjax.physics.sliding_support import SlidingSupport
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -121,6 +122,32 @@ def test_what_no_plate_can_use_is_refused(rig, sentence):
         plate = _plate(rig, **REFUSED[sentence])
         bounds.check(plate, "plate.0")
         plate.check(rig.mesh, "plate.0")
+
+
+def test_what_else_holds_or_moves_the_nodes_of_a_plate_is_refused(rig):
+    """It had no effect, without a word."""
+    law, plate = lj.laws.typical("neo_hookean"), _plate(rig)
+    low = lj.Fixed(nodes=jnp.arange(rig.bottom))
+    also = (
+        ("displaced", (lj.Displaced(nodes=plate.nodes[:3], by=jnp.array([0.0, 0.0, 1e-3]), axes="z"),), "displaced.0"),
+        ("fixed", (low, lj.Fixed(nodes=plate.nodes[-1:])), "fixed.1"),
+        ("physics", (plate, _plate(rig, turn=0.1)), "plate.0"),
+        ("physics", (plate, SlidingSupport(nodes=plate.nodes, axis="z")), "support.0"),
+    )
+    for key, parts, name in also:
+        scene = lj.Scene(**{"mesh": rig.mesh, "law": law, "physics": (plate,), "fixed": (low,), key: parts})
+        for refuses in (lj.check_scene, lj.simulate):
+            with pytest.raises(lj.InputError, match=rf"plate.[01] and {name} share node .* make their places differ"):
+                refuses(scene)
+
+
+def test_a_torque_without_times_grows_with_the_load_steps(rig):
+    plate = _plate(rig, turn=3e-3, by="torque")
+    for k, (before, after) in ((1, (0.0, 1e-3)), (3, (2e-3, 3e-3))):
+        tied = plate.tied(_step(rig, rig.mesh.points)._replace(k=k, steps=3))
+        assert np.allclose((tied.before, tied.after), (before, after), rtol=1e-14)
+    tied = plate.tied(_step(rig, rig.mesh.points)._replace(dt=0.1))
+    assert tied.before == tied.after == 3e-3
 
 
 def test_a_factorisation_is_refused(rig):

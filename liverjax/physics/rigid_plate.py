@@ -26,7 +26,9 @@ class RigidPlate(Physics):
     nodes: jax.Array = param("1", "node numbers (n,)", lower=0)
     turn: Number = param("rad or N m", "angle or torque; a number, or at times of a history (T,), linear in between")
     times: Numbers | None = param(
-        "s", "times of the history (T,), ascending; None: the turn stays as it is", default=None
+        "s",
+        "times of the history (T,), ascending; None: the turn stays, or a torque grows with load steps",
+        default=None,
     )
     axis: jax.Array = param("1", "direction of the axis (3,), of length 1", default=(0.0, 0.0, 1.0))
     centre: jax.Array = param("m", "a point of the axis (3,)", default=(0.0, 0.0, 0.0))
@@ -60,6 +62,9 @@ class RigidPlate(Physics):
     def tied(self, step: Step) -> "Plate":
         """The plate's nodes during a step."""
         before = after = jnp.asarray(self.turn)
+        if self.times is None and self.by == "torque" and step.dt is None:
+            # A torque grows with the load steps, as other loads do.
+            before, after = (n / step.steps * after for n in (step.k - 1, step.k))
         if self.times is not None:
             before, after = (jnp.interp(step.dt * n, jnp.asarray(self.times), after) for n in (step.k - 1, step.k))
         return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)

@@ -49,7 +49,7 @@ def save_reduced(model: ReducedModel, file: str | Path, scene_text: str = "") ->
                 out[f"pressures/{name}"].attrs["unit"] = unit
         for name, value in model.ranges.items():
             out[f"ranges/{name}"] = np.asarray(value)
-        out.attrs["identity"], out.attrs["scene"] = model.identity, scene_text
+        out.attrs["identity"], out.attrs["others"], out.attrs["scene"] = model.identity, model.others, scene_text
         out.attrs["versions"] = json.dumps(versions())
 
 
@@ -69,9 +69,10 @@ def load_reduced(file: str | Path) -> ReducedModel:
             arrays["slopes"] = np.ascontiguousarray(np.moveaxis(arrays["slopes"], 0, -1))
             arrays = {name: jnp.asarray(array) for name, array in arrays.items()}
             ranges = {name: jnp.asarray(value[()]) for name, value in stored.get("ranges", {}).items()}
-            identity = str(stored.attrs["identity"])
+            identity, others = str(stored.attrs["identity"]), str(stored.attrs.get("others", ""))
             correction, fluid = _correction(stored), _pressures(stored)
-        model = ReducedModel(**arrays, ranges=ranges, correction=correction, pressures=fluid, identity=identity)
+        told = {"ranges": ranges, "identity": identity, "others": others}
+        model = ReducedModel(**arrays, correction=correction, pressures=fluid, **told)
         wrong = _wrong(model)
     except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{file} is not a reduced model ({error}): make one with python -m liverjax reduce") from None

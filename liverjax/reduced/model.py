@@ -7,6 +7,7 @@ sum_p w_p P(F_p) : grad phi_k, is the reduced force. So a sum over points keeps 
 """
 
 import hashlib
+import json
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, static, struct
+from liverjax.core.struct import param, replace, static, struct
 from liverjax.laws import Law
 from liverjax.mesh.nodal import interpolated
 from liverjax.mesh.shape_functions import basis
@@ -27,9 +28,16 @@ from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.reduced.correction import Correction
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import laws_of
-from liverjax.scenes.scene import Scene
+from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.tensors.matrices import Matrix, deformation_gradient
 from liverjax.tensors.places import taken
+
+#: Part of the width of a range by which a number may leave it.
+BEYOND = 0.5
+#: Parts of a scene whose numbers decide its motion.
+_PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction")
+#: Numbers that lead through states which the rows may have shown too.
+_FREE = ("times", "history")
 
 
 @struct
@@ -54,6 +62,7 @@ class ReducedModel:
     correction: Correction | None = param("1", "correction of the error of modes and points, or None", default=None)
     pressures: PressureModes | None = param("1", "of a porous scene", default=None)
     identity: str = static(default="", about="digest of the scene for which the model is made")
+    others: str = static(default="", about="digests of the numbers that the rows did not vary, as JSON text")
 
     @property
     def number_of_modes(self) -> int:
@@ -178,3 +187,53 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
             f"the reduced model was made for scene {model.identity}, and this is {own} (mesh, held nodes, law, "
             "viscosity or kind differ): run python -m liverjax reduce for this scene"
         )
+
+
+def other_numbers(scene: Scene, varied: dict[str, Any]) -> str:
+    """Digests of the numbers that the rows do not vary, by their names, as JSON text.
+
+    Args:
+        scene: `Scene`, not traced.
+        varied: dotted names -> a value of each number that the rows vary.
+    """
+    scene = with_parameters(scene, {name: np.zeros_like(np.asarray(value, float)) for name, value in varied.items()})
+    found = {}
+    for part in _PARTS:
+        for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
+            name = ".".join([part, *(str(getattr(key, "name", getattr(key, "idx", key))) for key in path)])
+            if not name.endswith(_FREE):
+                found[name] = hashlib.sha256(np.asarray(leaf, float).tobytes()).hexdigest()[:8]
+    return json.dumps(found)
+
+
+def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
+    """Refuse numbers that the rows of a model have not shown; those of a traced scene pass.
+
+    Raises:
+        InputError: a number far out of its range in the rows, or another number than that of the rows' scene.
+    """
+    parts = [getattr(scene, part) for part in _PARTS]
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
+        return
+    for name, bounds in model.ranges.items():
+        value, (low, high) = np.asarray(numbers_at(scene, name), float), np.asarray(bounds)
+        if np.any(np.maximum(low - value, value - high) > BEYOND * (high - low) + 1e-9 * np.abs(high)):
+            raise InputError(
+                f"{name} = {np.array2string(value, precision=4)} is far out of its range in the model's rows, "
+                f"{np.array2string(low, precision=4)} to {np.array2string(high, precision=4)}, where nothing is known "
+                "of the error: take lj.reduced_error, or reduce with wider rows"
+            )
+    if not model.others:
+        return  # made by an earlier version
+    made, own = json.loads(model.others), json.loads(other_numbers(scene, {n: b[0] for n, b in model.ranges.items()}))
+    changed = sorted(name for name in made.keys() | own.keys() if made.get(name) != own.get(name))
+    if changed:
+        raise InputError(
+            f"{changed[0]} is not that of the model's rows, where nothing is known of the error: take "
+            "lj.reduced_error, or give it as a column of the rows"
+        )
+
+
+def without_rows(model: ReducedModel) -> ReducedModel:
+    """The model without what only its error needs: models that differ in this alone share one program."""
+    return replace(model, correction=None, ranges={}, others="")

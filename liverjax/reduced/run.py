@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, struct
+from liverjax.core.struct import param, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics.base import End, Free, Step
@@ -26,7 +26,15 @@ from liverjax.reduced.fluid import (
     pressure_coordinates,
     volume_stress,
 )
-from liverjax.reduced.model import ReducedModel, as_matrix, flat_gradient, refuse_another_scene, solid_at_points
+from liverjax.reduced.model import (
+    ReducedModel,
+    as_matrix,
+    flat_gradient,
+    refuse_another_scene,
+    refuse_unseen_numbers,
+    solid_at_points,
+    without_rows,
+)
 from liverjax.reduced.step import (
     ReducedEquations,
     ReducedMotion,
@@ -196,8 +204,7 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
     """
     refuse_another_scene(model, scene)
     check_before_run(scene)
-    # Leave out parts that the run does not need: models that differ only in these share one program.
-    return _reduced_run(replace(model, correction=None, ranges={}), scene)
+    return _reduced_run(without_rows(model), scene)
 
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
@@ -238,9 +245,11 @@ def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
         model, scene, result: as in `simulate_reduced`.
 
     Raises:
-        InputError: a model without a correction: made from few rows, or none made its errors smaller.
+        InputError: a model without a correction: made from few rows, or none made its errors smaller; numbers that
+            the rows have not shown (those of a traced scene pass).
     """
     if model.correction is None:
         raise InputError("this reduced model has no correction: make it from more rows, or take lj.reduced_error")
+    refuse_unseen_numbers(model, scene)
     moved = _free_motion(model, scene, result)
     return stated_at(model.correction, result.coordinates, moved, scene.solve.dt)

@@ -13,7 +13,7 @@ from liverjax.core.struct import replace
 from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.prescribed import free_degrees
 from liverjax.reduced.correction import FEWEST_RUNS, Correction, Learnt, correction_at, learnt_correction
-from liverjax.reduced.model import ReducedModel, refuse_unknown_physics, with_all_points
+from liverjax.reduced.model import ReducedModel, other_numbers, refuse_unknown_physics, with_all_points
 from liverjax.reduced.run import simulate_reduced
 from liverjax.reduced.sampling import Coordinates, sampled
 from liverjax.scenes.scene import Scene, with_parameters
@@ -109,7 +109,7 @@ def _model_of(scene: Scene, runs: _Runs, tolerance: float, most_modes: int, poin
     q = jnp.einsum("rtvc,nvc->rtn", u * volumes[:, None], whole.modes)
     model = sampled(whole, scene, runs.values, Coordinates(q, p), point_tolerance)
     ranges = {name: jnp.asarray(np.stack([v.min(axis=0), v.max(axis=0)])) for name, v in runs.values.items()}
-    model = replace(model, ranges=ranges)
+    model = replace(model, ranges=ranges, others=other_numbers(scene, {n: v[0] for n, v in runs.values.items()}))
     return replace(model, correction=_learnt_from(model, scene, runs))
 
 

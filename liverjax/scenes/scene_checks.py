@@ -54,12 +54,13 @@ def check_before_run(scene: Scene) -> None:
 
     Raises:
         InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
-            nodes that are fixed and moved along one axis.
+            nodes that are fixed and moved along one axis, or held while a plate moves them.
     """
     check_choices(scene)
     check_bounds(scene)
     _known_nodes(scene)
     _moved_where_fixed(scene)
+    _plates_alone(scene)
 
 
 def check_choices(scene: Scene) -> None:
@@ -151,6 +152,25 @@ def _moved_where_fixed(scene: Scene) -> None:
             if len(both):
                 raise InputError(
                     f"fixed.{n} and displaced.{k} both prescribe node {both[0]} along {axes[0]}: make their places "
+                    "differ"
+                )
+
+
+def _plates_alone(scene: Scene) -> None:
+    """Refuse a plate's node that something else holds or moves, which would have no effect; traced arrays pass."""
+    named = [(f"{kind}.{k}", part) for kind in ("fixed", "displaced") for k, part in enumerate(getattr(scene, kind))]
+    every = named_physics(scene)
+    plates = [(name, physics) for name, physics in every if physics.ties]
+    named += [(name, physics) for name, physics in every if isinstance(physics, SlidingSupport)]
+    for k, (name, plate) in enumerate(plates):
+        for other, part in named + plates[:k]:
+            nodes = [getattr(own, "nodes", None) for own in (plate, part)]
+            if any(own is None or isinstance(own, jax.core.Tracer) for own in nodes):
+                continue
+            both = np.intersect1d(*(np.asarray(own) for own in nodes))
+            if len(both):
+                raise InputError(
+                    f"{name} and {other} share node {both[0]}, whose motion the plate alone decides: make their places "
                     "differ"
                 )
 
@@ -317,6 +337,7 @@ def check_scene(scene: Scene) -> None:
     _places(scene)
     check_physics(scene)
     _no_two_normals(scene)
+    _plates_alone(scene)
     solve = scene.solve
     loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
     histories = any(getattr(load, "history", None) is not None for load in loads)

@@ -212,10 +212,12 @@ ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
-    """A sentence if the lagged pressure goes up and down from step to step."""
-    if scene.porosity is None or scene.porosity.scheme != "lagged" or result.pressure is None:
+    """A sentence if the pressure overshoots beside places where it is given, or the lagged one goes up and down."""
+    if scene.porosity is None or result.pressure is None:
         return []
     P = np.asarray(result.pressure)
+    if scene.porosity.scheme != "lagged":
+        return _of_overshoot(scene, P[:, : scene.mesh.number_of_vertices])
     if len(P) < 4:
         return []
     once, twice = np.abs(np.diff(P, axis=0)).sum(), np.abs(P[2:] - P[:-2]).sum()
@@ -224,6 +226,63 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
     return [
         "the pressure goes up and down from step to step, as scheme = 'lagged' does if it is unstable: write scheme = "
         "'implicit' in [porosity]"
+    ]
+
+
+#: Overshoot of a pressure, over the largest of its step, that is told.
+OVERSHOOT = 0.05
+#: Least dt over h^2/(kappa M): steps as long, in elements of height h and longitudinal modulus M, overshoot by less.
+_FOLLOWS = 0.4
+
+
+def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
+    """A sentence if pressures P (T, V) are higher beside the places where pressure is given than further inside.
+
+    The volume that leaves an element within a step belongs to all of its nodes, so that the coupling of neighbours
+    exceeds the flow between them where dt < h^2/(4 kappa M) (Vermeer and Verruijt 1981, for rows of elements). Elements
+    of a body need half as long again.
+    """
+    sponge, tets, V = scene.porosity, np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_vertices
+    assert sponge is not None
+    given = np.zeros(V, bool)
+    for nodes in (sponge.drained, *(inlet.nodes for inlet in sponge.inlet)):
+        if nodes is not None:
+            given[np.asarray(nodes)[np.asarray(nodes) < V]] = True
+    faces = given[tets]
+    at = np.flatnonzero(faces.sum(axis=1) == 3)
+    if not len(at):
+        return []
+    beside = np.zeros(V, bool)
+    beside[tets[at].ravel()] = True
+    beside &= ~given
+    inner = np.zeros((len(P), V))  # the largest pressure of neighbours further inside
+    for a, b in ((a, b) for a in range(4) for b in range(4) if a != b):
+        one = ~given[tets[:, b]] & ~beside[tets[:, b]]
+        np.maximum.at(inner, (slice(None), tets[one, a]), np.abs(P[:, tets[one, b]]))
+    known = beside & (inner.max(axis=0) > 0)
+    largest = np.abs(P).max(axis=1, initial=0.0)
+    if not known.any() or not largest.any():
+        return []
+    over = np.median(np.abs(P[:, known]) - inner[:, known], axis=1) / np.where(largest > 0, largest, 1.0)
+    worst = int(np.argmax(np.where(largest > 0.1 * largest.max(), over, 0.0)))
+    if not over[worst] > OVERSHOOT:
+        return []
+    corners = np.asarray(scene.mesh.points)[tets[at]]
+    base = corners[faces[at]].reshape(-1, 3, 3)
+    area = 0.5 * np.linalg.norm(np.cross(base[:, 1] - base[:, 0], base[:, 2] - base[:, 0]), axis=1)
+    height = float(np.median(3 * np.abs(np.asarray(scene.mesh.volumes)[at]) / area))
+    said = (
+        f"the pressure overshoots beside the places where it is given, by {100 * over[worst]:.2g} % at "
+        f"{float(scene.solve.dt) * (worst + 1):.3g} s, because the first steps are too short for the elements there"
+    )
+    try:
+        shear = np.median(np.asarray(scene.law.shear_modulus()))
+    except InputError:  # a law need not state its moduli
+        return [f"{said}: take a larger dt, or thinner elements there"]
+    flow = float(np.median(np.asarray(sponge.permeability)) * (np.median(np.asarray(sponge.bulk)) + 4 / 3 * shear))
+    return [
+        f"{said}: take a dt of {_FOLLOWS * height**2 / flow:.2g} s or more, or elements of "
+        f"{np.sqrt(float(scene.solve.dt) * flow / _FOLLOWS):.2g} m there (they are {height:.2g} m high)"
     ]
 
 

@@ -23,7 +23,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from liverjax.core import names
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, replace, struct
 from liverjax.elements.gradients import volume_ratios
@@ -32,6 +34,7 @@ from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.base import End
 from liverjax.scenes.by_element import sponge_at_points
 from liverjax.scenes.enriched import enriched
+from liverjax.scenes.regions import changed_numbers, laws_of, refused_name
 from liverjax.scenes.scene import Scene
 from liverjax.simulation import automatic, tangent
 from liverjax.simulation.equations import (
@@ -58,6 +61,8 @@ _TOLERANCE = 1e-2
 _WITH_PRESSURES = {1: 1e-5, 2: 1e-4}
 _FACTOR = {1: 1.0, 2: 1.5}
 BAR = 1.25
+#: K/mu up to which quadratic elements without pressures do not lock (experiments/TABLES.md).
+_LOCKS = 10.0
 #: With contact: most linear solves of a step, and the residual, over the forces at work, that ends them.
 _ROUNDS, _SETTLED = 24, 1e-3
 #: Most halvings of such a solve, if it makes the residual larger.
@@ -108,8 +113,9 @@ def richer(scene: Scene) -> Scene:
     """
     refuse(scene)
     rich = enriched(scene)
-    # Linear elements lock: their error is measured against elements that do not.
-    volumetric = "auto" if scene.mesh.order == 1 else scene.solve.volumetric
+    # Linear elements lock: their error is measured against elements that do not. Quadratic ones do not at a low bulk
+    # modulus, and have no pressures, which would have to be continuous where the material changes.
+    volumetric = "auto" if scene.mesh.order == 1 and _may_lock(scene) else scene.solve.volumetric
     # Under an indenter the iterations of mixed cubic elements do not end: factorise if the user has chosen it.
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
@@ -119,6 +125,23 @@ def richer(scene: Scene) -> Scene:
     body = None if rich.body is None else replace(rich.body, mass="consistent")
     rich = replace(rich, law=rich.mesh.at_points(rich.law), porosity=sponge, body=body, solve=solve)
     return replace(rich, solve=replace(solve, volumetric=automatic.form_of_volumes(rich)))
+
+
+def _may_lock(scene: Scene) -> bool:
+    """Whether a bulk modulus is, or may be, more than `_LOCKS` times the shear modulus."""
+    laws = list(laws_of(scene.law, scene.region))
+    for region in scene.region:
+        own = scene.law
+        for name, value in changed_numbers(region).items():
+            own = names.put(own, name, value, refused_name(name))
+        laws.append(own)
+    try:
+        numbers = [(a.bulk_modulus(), a.shear_modulus()) for a in laws]
+    except InputError:  # a law need not state its moduli
+        return True
+    if any(isinstance(a, jax.core.Tracer) for pair in numbers for a in pair):
+        return True
+    return any(bool(np.max(np.asarray(bulk) / np.asarray(shear)) > _LOCKS) for bulk, shear in numbers)
 
 
 def refuse(scene: Scene) -> None:
