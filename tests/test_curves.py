@@ -1,6 +1,7 @@
 """Laws from stress-stretch curves: known parameters come back, SciPy finds nothing better, bad files are refused."""
 
 import json
+import re
 import warnings
 from pathlib import Path
 
@@ -289,6 +290,45 @@ def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
     read([(s, p + 0.15 * stress.max()) for s, p in rows])
     assert main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)]) == 0
     assert "subtract the preload" in capsys.readouterr().err
+
+
+MEANINGS = {
+    "none": (lambda a, P: (a, P), ""),
+    "true stress": (lambda a, P: (a, P * a), "if the stress were true stress"),
+    "logarithm": (lambda a, P: (1 + np.log(a), P), r"if the stretch were 1 \+ logarithmic strain"),
+    "zero": (lambda a, P: (a + 0.05, P), "if the zero of the stretch were off by 0.05"),
+    "offset": (lambda a, P: (a, P + 150.0), "if an offset of 1[45].* Pa were in the stress"),
+}
+
+
+@pytest.mark.parametrize("meaning", MEANINGS)
+def test_columns_that_hold_something_else_are_named(meaning, tmp_path, capsys):
+    """A neo-Hookean sample of 1 kPa with 1 % of noise: the law followed 40 % off, without a word."""
+    change, words = MEANINGS[meaning]
+    stretch = np.linspace(1.0, 1.6, 25)
+    noise = np.random.default_rng(7).standard_normal(25)
+    a, P = change(stretch, 1000.0 * (stretch - stretch**-2) + 10.0 * noise)
+    rows = "".join(f"uniaxial,{x:.6g},{p:.6g}\n" for x, p in zip(a, P, strict=True))
+    (tmp_path / "c.csv").write_text("test,stretch,nominal_stress_Pa\n" + rows)
+    assert main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    assert ("structured misfit" in said) == bool(words) and re.search(words, said)
+    told = json.loads((tmp_path / "curves.json").read_text())["structured_misfit"]
+    if words:
+        assert 980 < float(told[0].split("G0 ")[1].split(" Pa")[0]) < 1020
+
+
+def test_a_law_that_misses_the_curve_is_not_taken_for_wrong_columns(tmp_path, capsys):
+    """A stiffening sample by a law that does not stiffen: no meaning of the columns makes it follow."""
+    stretch = np.linspace(1.0, 2.0, 40)
+    law = lj.laws.Yeoh(c1=500.0, c2=-80.0, c3=60.0, bulk=1.0)
+    P = np.asarray(homogeneous.response(law, "uniaxial", stretch))
+    P = P * (1 + 0.002 * np.random.default_rng(1).standard_normal(40))
+    rows = "".join(f"uniaxial,{x:.6g},{p:.6g}\n" for x, p in zip(stretch, P, strict=True))
+    (tmp_path / "c.csv").write_text("test,stretch,nominal_stress_Pa\n" + rows)
+    main(["curves", "neo_hookean", str(tmp_path / "c.csv"), "--out", str(tmp_path)])
+    said = capsys.readouterr().err
+    assert "the law misses something: try others" in said and "would follow" not in said
 
 
 @pytest.mark.core

@@ -427,6 +427,31 @@ def test_any_encoding_is_read(tmp_path, encoding):
     assert s.raw is not None and np.allclose(s.raw["temperature"], 293.15)
 
 
+def test_a_temperature_that_drifts_along_the_frequencies_is_told(tmp_path):
+    head = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,temperature_C\n"
+    for last, told in ((37, True), (21, False)):
+        rows = [f"{f},{1000 + f},100,{t}" for f, t in zip((0.1, 1.0, 10.0), np.linspace(20, last, 3), strict=True)]
+        (tmp_path / "s.csv").write_text(head + "\n".join(rows) + "\n")
+        assert any("the temperature changes by 17 K" in n for n in read_sweep(tmp_path / "s.csv").notes) == told
+
+
+def test_one_modulus_of_tension_makes_the_other_one_too(tmp_path):
+    """Only the one that said so was divided by 3: the loss was three times too large, without a word."""
+    rows = "".join(f"{f},{3000 + f},300\n" for f in (0.1, 1.0, 10.0))
+    (tmp_path / "s.csv").write_text("frequency_Hz,tensile_storage_modulus_Pa,loss_modulus_Pa\n" + rows)
+    found = read_sweep(tmp_path / "s.csv")
+    assert np.allclose(found.loss, 100) and any("loss_modulus_Pa are of tension" in n for n in found.notes)
+    (tmp_path / "s.csv").write_text("frequency_Hz,tensile_storage_modulus_Pa,shear_loss_modulus_Pa\n" + rows)
+    with pytest.raises(InputError, match="name both alike"):
+        read_sweep(tmp_path / "s.csv")
+
+
+def test_degrees_that_look_like_radians_are_told(tmp_path):
+    rows = "".join(f"{f},1000,{a}\n" for f, a in ((0.1, 0.2), (1.0, 0.3), (10.0, 0.4)))
+    (tmp_path / "s.csv").write_text("frequency_Hz,complex_modulus_Pa,phase_angle_deg\n" + rows)
+    assert any("if these are radians, name it phase_rad" in n for n in read_sweep(tmp_path / "s.csv").notes)
+
+
 def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
     head = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,"
     rows = [(f, 100.0 + f, 10.0) for f in (0.1, 1.0, 10.0)]

@@ -1,6 +1,7 @@
 """Several samples of one material: each by itself, and the population that they come from."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import scipy.stats
 from conftest import SHARED
 
 from fitting.__main__ import main
+from fitting.fits.samples import outliers
 from fitting.methods.population import population
 
 pytestmark = pytest.mark.quick_to_compile
@@ -99,6 +101,21 @@ def test_a_fluid_among_solids_is_no_sample_of_their_equilibrium_modulus():
     # The last one says nothing, so it is like a new sample.
     low, high = np.log(p.new_interval)
     assert np.isclose(p.pooled[4], p.mean, rtol=0.05) and 0.1 < p.pooled_errors[4] / ((high - low) / 3.92) < 2
+
+
+def test_a_sample_that_is_not_of_the_others_is_named():
+    """Four of 0.8 to 1.3 kPa, and one of five times that: the interval of a new one was 0.1 to 18 kPa."""
+    for last, told in ((5000.0, True), (1200.0, False)):
+        moduli = (800.0, 950.0, 1100.0, 1300.0, last)
+        sweeps = [SimpleNamespace(source=f"s{k}.csv") for k in range(5)]
+        found = SimpleNamespace(
+            sweeps=sweeps,
+            fits=moduli,
+            populations={"shear_modulus": None},
+            values=lambda k, own=moduli: {"shear_modulus": (own[k], 10.0)},
+        )
+        said = outliers(found)
+        assert len(said) == told and all(s.startswith("s4.csv: its shear_modulus is 4.9 times") for s in said)
 
 
 def write_samples(folder, count=5, spread=0.3, noise=0.01):

@@ -31,6 +31,7 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from fitting.fits import stress_stretch
+    from fitting.fits.honesty.wrong_columns import structured_curves
     from fitting.readers import curves
     from fitting.reports import curves_report
 
@@ -45,12 +46,13 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("curves.json", "curves.png"))
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [stress_stretch.fit(candidate, found) for candidate in bar]
-    curves_report.write(options.out, found, fits)
+    structured = structured_curves(found, curves_report.best_first(fits)[0])
+    curves_report.write(options.out, found, fits, structured)
     print(curves_report.table(fits))
     for fit in curves_report.best_first(fits):
         for sentence in fit.warnings:
             print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
-    for sentence in (*stress_stretch.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found)):
+    for sentence in (*stress_stretch.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found), *structured):
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/curves.json, curves.png")
     return 0 if curves_report.best_first(fits)[0].converged else 1

@@ -278,6 +278,8 @@ def _note_idle(options: argparse.Namespace) -> None:
     idle["--law"] = options.law != "neo_hookean" and not options.precompression
     for name in (name for name, changed in idle.items() if changed):
         print(f"note: {name} is for the simulation: it changes nothing in the closed form", file=sys.stderr)
+    if several and options.optimizer != "levenberg-marquardt":
+        print(f"note: --optimizer {options.optimizer} is for a single sweep: it changes nothing here", file=sys.stderr)
 
 
 def _refuse_copies(files: list[Path]) -> None:

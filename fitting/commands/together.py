@@ -21,6 +21,7 @@ def run(options: argparse.Namespace) -> int:
 
     first = shared_options.usable_sweep(options, options.sweep[0])
     tests = [first, *(read_any(options, path) for path in options.others)]
+    tests = _without_sample_inertia(tests, options.density, options.height)
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
@@ -35,6 +36,22 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/fit.json, fit.png")
     return 0 if found.converged else 1
+
+
+def _without_sample_inertia(tests: "list[Measured]", density: float | None, height: float | None) -> "list[Measured]":
+    """The tests with the inertia of the sample taken off the sweeps, if its density and height are given."""
+    from fitting.fits import sample_inertia
+    from fitting.readers.frequency_sweep import Sweep
+
+    if density is None:
+        return tests
+    if height is None:
+        print(
+            "note: --density without --height takes no inertia off the sweeps: give the height of the sample [m]",
+            file=sys.stderr,
+        )
+        return tests
+    return [sample_inertia.taken_off(t, density, height) if isinstance(t, Sweep) else t for t in tests]
 
 
 def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "Measured":

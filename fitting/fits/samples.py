@@ -1,9 +1,11 @@
 """Several samples of one material: each fitted by itself, with one model for all, and the population they come from."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy.stats
 
 from fitting.fits import viscoelastic
 from fitting.fits.families import choice, models
@@ -129,6 +131,30 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
             of_mean, of_new = ((low, min(1.0, high)) for low, high in (found.mean_interval, found.new_interval))
             found = found._replace(mean_interval=of_mean, new_interval=of_new)
         out[name] = found
+    return out
+
+
+#: Chance, for all samples together, below which one that differs from the others is named; fewest samples for it.
+_STRANGE, _FEWEST = 0.05, 4
+
+
+def outliers(found: Samples) -> list[str]:
+    """A sentence on each sample whose modulus does not belong to the others' (t-test on logarithms, Bonferroni)."""
+    name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
+    values = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
+    if len(values) < _FEWEST or np.any(values <= 0):
+        return []
+    logs, out = np.log(values), []
+    for k, sweep in enumerate(found.sweeps):
+        others = np.delete(logs, k)
+        apart = (logs[k] - others.mean()) / (max(others.std(ddof=1), 1e-12) * np.sqrt(1 + 1 / len(others)))
+        chance = min(1.0, 2 * len(logs) * float(scipy.stats.t.sf(abs(apart), len(others) - 1)))
+        if chance < _STRANGE:
+            out.append(
+                f"{Path(sweep.source).name}: its {name} is {np.exp(logs[k] - others.mean()):.2g} times the mean of the "
+                f"others, {np.exp(others.mean()):.4g} Pa (by chance: {chance:.1g}): check its units and sizes; it "
+                "widens the population's intervals"
+            )
     return out
 
 

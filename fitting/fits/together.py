@@ -14,7 +14,7 @@ import numpy as np
 
 from fitting.fits import time_tests, viscoelastic
 from fitting.fits.viscoelastic import FLUID, Kind
-from fitting.methods import generalised_maxwell, host, time_response, uncertainty
+from fitting.methods import generalised_maxwell, host, kramers_kronig, time_response, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import Solution, from_starts
@@ -303,6 +303,7 @@ def _told_of_all(chosen: Together, tried: list[Together], band: ResolvedBand) ->
     out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
     out += disagreements(chosen.shares)
     out += missed(chosen.shares)
+    out += structured(chosen)
     out += uncertainty.superfluous(band, chosen.uncertainty)
     low, high = band.resolved
     for k, tau in enumerate(chosen.model.relaxation_times):
@@ -333,6 +334,25 @@ def missed(shares: list[Share]) -> list[str]:
         for s in shares
         if s.misfit > MISSED and s.noise <= APART * s.alone
     ]
+
+
+def structured(fit: Together) -> list[str]:
+    """A sentence on each test whose residuals keep their sign over many numbers."""
+    out = []
+    for test, fitted in zip(fit.tests, fit.fitted, strict=True):
+        residuals = fitted - reported_numbers(test)[1]
+        parts = np.split(residuals, 2) if isinstance(test, Sweep) else [residuals]
+        if np.max(np.abs(residuals) / sizes_of(test)) <= viscoelastic.EXACT:
+            continue
+        for part, what in zip(parts, (" (G')", " (G'')") if len(parts) == 2 else ("",), strict=True):
+            runs, chance = kramers_kronig.runs_probability(np.sign(part))
+            if chance < kramers_kronig.CHANCE:
+                out.append(
+                    f"structured misfit of {test.source or name_of(test)}{what}: the residuals change sign {runs - 1} "
+                    f"times over {len(part)} numbers (by chance: {chance:.1g}); the model misses something, or the "
+                    "tests do not agree there"
+                )
+    return out
 
 
 def _shares(fit: Together) -> list[Share]:

@@ -124,11 +124,16 @@ WARMER, STRAINED = 2.0, 1.5
 
 
 def _what_differs(sweep: Sweep) -> list[str]:
-    """Notes if lines at the same frequency were measured at other temperatures or strains."""
+    """Notes if lines were measured at other temperatures, or lines at the same frequency at other strains."""
     out, raw = [], sweep.raw or {}
-    if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
-        return []
     heat, strain = (raw[q][np.isfinite(raw[q])] if q in raw else np.empty(0) for q in ("temperature", "strain"))
+    if len(np.unique(sweep.angular_frequency)) == len(sweep.angular_frequency):
+        if heat.size and np.ptp(heat) > WARMER:
+            out.append(
+                f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: what it does to the moduli is taken "
+                "for an effect of the frequency"
+            )
+        return out
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
         out.append(

@@ -135,7 +135,16 @@ def read_time_test(
             f"displacement and force; the file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
+        _refuse_another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
         time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp or 0.0)
+        if sample.radius is not None or sample.height is not None:
+            notes.append(f"the size of the sample is not used: the file has a column of {form[0]}")
+        if ramp is None:
+            word = "strain" if kind == "relaxation" else "stress"
+            notes.append(
+                f"no column shows how the {word} rose: a step at 0 s is assumed. If it took some time, give --ramp "
+                "SECONDS: what relaxed meanwhile is missing from G0 otherwise"
+            )
     else:
         if ramp:
             raise InputError(f"{path}: --ramp {ramp:g} is for a file without the {form[0]}; leave it out")
@@ -221,12 +230,59 @@ def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[
     share = np.mean(near[first:])
     if share < 0.5:  # cycles: differences of a few rows do not distinguish them from noise
         return driven, []
-    if share < 0.99:
+    # Scatter may bring a row of the ramp near before it ends.
+    first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))
+    if np.sum(near[first:]) < 0.9 * np.sum(near):
         return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
-    held, rest = driven.copy(), int(np.argmax(np.abs(driven) > 5 * noise))
+    rest = int(np.argmax(np.abs(driven) > 5 * noise))
+    rest_level = float(np.mean(driven[:rest])) if rest else 0.0
+    if first - rest >= _ROWS_OF_RAMP:
+        straight = _straight_ramp(time, driven, (rest, first, rest_level), noise)
+        if straight is not None:
+            begin, end, held = straight
+            return held, [
+                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant are taken; what the "
+                "scatter leaves in these times is not in the standard errors"
+            ]
+        told = f"{told}, and each reading of its ramp counts as a step, which makes G0 too small: smooth the ramp first"
+    held = driven.copy()
     held[first:] = np.mean(driven[first:])
-    held[:rest] = np.mean(driven[:rest]) if rest else 0.0
+    held[:rest] = rest_level
     return held, [f"{told}: from {time[first]:.3g} s on, where it is constant, its mean is taken"]
+
+
+#: Fewest rows of a ramp that a straight line replaces, and the largest misfit of such a line over the noise.
+_ROWS_OF_RAMP, _STRAIGHT = 4, 1.5
+
+
+def _straight_ramp(
+    time: np.ndarray, driven: np.ndarray, places: tuple[int, int, float], noise: float
+) -> tuple[float, float, np.ndarray] | None:
+    """Beginning and end [s] of a ramp, and rest, ramp and hold without scatter (n,); None if it is not straight.
+
+    `places`: first row of the load, first row of the hold, level at rest.
+    """
+    import scipy.optimize
+
+    rest, first, low = places
+
+    def line_from(begin: float, end: float, low: float) -> np.ndarray:
+        line = np.clip((time - begin) / float(np.maximum(end - begin, 1e-12)), 0.0, 1.0)
+        return low + line * (line @ (driven - low)) / float(np.maximum(line @ line, 1e-300))
+
+    def misfit(x: np.ndarray) -> float:
+        return float(np.sum((line_from(x[0], x[1], low) - driven) ** 2))
+
+    ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
+    near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
+    free = scipy.optimize.minimize(misfit, [time[max(rest - 1, 0)], time[first]], method="Nelder-Mead").x
+    # From 0 at the first row on; or else from the level at rest, from a time that is fitted too.
+    for begin, end, level in ((time[0], near, 0.0), (free[0], free[1], low)):
+        line = line_from(begin, end, level)
+        off = (line - driven) / noise
+        if max(np.sqrt(np.mean(part**2)) for part in (off, off[rest : first + 1])) < _STRAIGHT:
+            return float(begin), float(end), line
+    return None
 
 
 def kind_of(path: str | os.PathLike) -> str:
@@ -382,6 +438,46 @@ def _as_a_step(path, time, modulus, ramp):
     return times, np.minimum(times / ramp, 1.0) if ramp else np.ones(len(times)), answer
 
 
+#: Part of the largest modulus or compliance by which it may go the wrong way; in noise, times its deviation.
+_WRONG_WAY, _IN_NOISE = 0.1, 6.0
+
+
+def _refuse_another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> None:
+    """Refuse a modulus that rises, or a compliance that falls, where the load is constant; `given`: ramp and start [s].
+
+    Raises:
+        InputError: one sentence with the time, and what it may be.
+    """
+    ramp, start = given
+    rows = (time > 0) & (time >= start) & np.isfinite(values)
+    t, v = time[rows], values[rows] * np.sign(np.sum(values[rows]))
+    if len(t) < 4:
+        return
+    size = float(v.max())
+    allowed = max(_WRONG_WAY * size, _IN_NOISE * noise_of_series(v))
+    if kind == "creep":
+        fallen = np.maximum.accumulate(v) - v
+        if fallen.max() > allowed:
+            last = t[int(np.argmax(v[: int(np.argmax(fallen > allowed)) + 1]))]
+            raise InputError(
+                f"{path}: the compliance falls from {last:.3g} s on, as it does if the stress is taken away: give "
+                "strain and stress in two columns, or end the rows there"
+            )
+        return
+    peak = int(np.argmax(v))
+    if not ramp and v[peak] - v[: peak + 1].min() > allowed:
+        raise InputError(
+            f"{path}: the modulus rises until {t[peak]:.3g} s, and after a step of strain it can only fall: if the "
+            f"strain rose until then, give --ramp {t[peak]:.3g}, else leave the rows before it out (--min-time "
+            f"{t[peak]:.3g})"
+        )
+    if ramp and t[0] < 0.3 * ramp and v[0] > 0.7 * size:
+        raise InputError(
+            f"{path}: the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, and a ramp of "
+            f"{ramp:g} s would have {100 * t[0] / ramp:.0f} % of its strain then: correct --ramp"
+        )
+
+
 def _as_shear(path, form, columns, sample):
     """Shear strain, shear stress [Pa], and notes."""
     if form == ("strain", "stress"):
@@ -427,7 +523,7 @@ def _checked(test: TimeTest, start: float) -> TimeTest:
         raise InputError(
             f"{test.source}: {used.sum()} usable answers are left; give four or more (--min-time too late?)"
         )
-    if not np.median(answer[used]) > 0:
+    if not np.sum(driven[used] * answer[used]) > 0:
         raise InputError(
             f"{test.source}: most answers have the opposite sign of the {test.kind} test's input; correct the signs"
         )

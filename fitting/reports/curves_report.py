@@ -1,6 +1,7 @@
 """Files of a fit of stress-stretch curves: curves.json and curves.png, and a table on the terminal."""
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,8 +56,8 @@ def summary(fit: LawFit) -> Content:
     }
 
 
-def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
-    """Write curves.json and curves.png into the existing folder `out`."""
+def write(out: Path, curves: list[Curve], fits: list[LawFit], structured: Sequence[str] = ()) -> None:
+    """Write curves.json and curves.png into the existing folder `out`; `structured`: sentences on misfits."""
     ordered = best_first(fits)
     content = {
         "best": ordered[0].label,
@@ -66,6 +67,7 @@ def write(out: Path, curves: list[Curve], fits: list[LawFit]) -> None:
         ],
         "not_followed": unfollowed(curves, fits),
         "loaded_at_rest": loaded_at_rest(curves),
+        "structured_misfit": list(structured),
         "laws": [summary(f) for f in ordered],
         "versions": versions(),
     }

@@ -8,7 +8,7 @@ import numpy as np
 
 from fitting.fits.families import limits
 from fitting.fits.honesty import edges
-from fitting.fits.samples import Samples
+from fitting.fits.samples import Samples, outliers
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
 from fitting.reports.sweep_report import band_sensitivity, numbers, summary
@@ -125,6 +125,7 @@ def warnings(found: Samples) -> list[str]:
             if without:
                 out.append(f"{name}: {', '.join(without)} has none (a fluid?), so the population is that of the others")
     out += _limits_of_typical(found)
+    out += outliers(found)
     heat = np.array([np.mean(s.raw["temperature"]) for s in found.sweeps if s.raw and "temperature" in s.raw])
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))

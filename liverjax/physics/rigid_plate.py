@@ -64,7 +64,7 @@ class RigidPlate(Physics):
         before = after = jnp.asarray(self.turn)
         if self.times is None and self.by == "torque" and step.dt is None:
             # A torque grows with the load steps, as other loads do.
-            before, after = (n / step.steps * after for n in (step.k - 1, step.k))
+            before, after = (jnp.asarray(n / step.steps * after) for n in (step.k - 1, step.k))
         if self.times is not None:
             before, after = (jnp.interp(step.dt * n, jnp.asarray(self.times), after) for n in (step.k - 1, step.k))
         return Plate(self, step.mesh.points[self.nodes], step.x[self.nodes], before, after)

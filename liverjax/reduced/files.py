@@ -71,8 +71,9 @@ def load_reduced(file: str | Path) -> ReducedModel:
             ranges = {name: jnp.asarray(value[()]) for name, value in stored.get("ranges", {}).items()}
             identity, others = str(stored.attrs["identity"]), str(stored.attrs.get("others", ""))
             correction, fluid = _correction(stored), _pressures(stored)
-        told = {"ranges": ranges, "identity": identity, "others": others}
-        model = ReducedModel(**arrays, correction=correction, pressures=fluid, **told)
+        model = ReducedModel(
+            **arrays, ranges=ranges, correction=correction, pressures=fluid, identity=identity, others=others
+        )
         wrong = _wrong(model)
     except (OSError, KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{file} is not a reduced model ({error}): make one with python -m liverjax reduce") from None

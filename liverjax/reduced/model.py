@@ -8,6 +8,7 @@ sum_p w_p P(F_p) : grad phi_k, is the reduced force. So a sum over points keeps 
 
 import hashlib
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -189,7 +190,7 @@ def refuse_another_scene(model: ReducedModel, scene: Scene) -> None:
         )
 
 
-def other_numbers(scene: Scene, varied: dict[str, Any]) -> str:
+def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) -> str:
     """Digests of the numbers that the rows do not vary, by their names, as JSON text.
 
     Args:

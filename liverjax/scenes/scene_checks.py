@@ -167,7 +167,7 @@ def _plates_alone(scene: Scene) -> None:
             nodes = [getattr(own, "nodes", None) for own in (plate, part)]
             if any(own is None or isinstance(own, jax.core.Tracer) for own in nodes):
                 continue
-            both = np.intersect1d(*(np.asarray(own) for own in nodes))
+            both = np.intersect1d(np.asarray(nodes[0]), np.asarray(nodes[1]))
             if len(both):
                 raise InputError(
                     f"{name} and {other} share node {both[0]}, whose motion the plate alone decides: make their places "

@@ -255,15 +255,15 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     beside = np.zeros(V, bool)
     beside[tets[at].ravel()] = True
     beside &= ~given
-    inner = np.zeros((len(P), V))  # the largest pressure of neighbours further inside
+    inner = np.zeros((V, len(P)))  # the largest pressure of neighbours further inside
     for a, b in ((a, b) for a in range(4) for b in range(4) if a != b):
         one = ~given[tets[:, b]] & ~beside[tets[:, b]]
-        np.maximum.at(inner, (slice(None), tets[one, a]), np.abs(P[:, tets[one, b]]))
-    known = beside & (inner.max(axis=0) > 0)
+        np.maximum.at(inner, tets[one, a], np.abs(P[:, tets[one, b]]).T)
+    known = beside & (inner.max(axis=1) > 0)
     largest = np.abs(P).max(axis=1, initial=0.0)
     if not known.any() or not largest.any():
         return []
-    over = np.median(np.abs(P[:, known]) - inner[:, known], axis=1) / np.where(largest > 0, largest, 1.0)
+    over = np.median(np.abs(P[:, known]) - inner[known].T, axis=1) / np.where(largest > 0, largest, 1.0)
     worst = int(np.argmax(np.where(largest > 0.1 * largest.max(), over, 0.0)))
     if not over[worst] > OVERSHOOT:
         return []

@@ -294,6 +294,7 @@ def choose_together(
         best = best._replace(shares=_shares_of_springpots(best))
     out = [*best.warnings] if best.converged else ["the fit did not converge: take another --model", *best.warnings]
     out += together.disagreements(best.shares)
+    out += together.structured(best)
     out += models.undetermined(best)
     return best._replace(tried=rows, warnings=tuple(out), **seconds)
 

@@ -1,5 +1,7 @@
 """Storage and loss moduli from the columns that a file has: the moduli themselves, |G*|, the phase, tan(delta)."""
 
+import re
+
 import numpy as np
 
 from fitting.readers.tables.sweep_columns import Column, is_angular, is_tensile, pair_of
@@ -33,6 +35,12 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
     if not known_unit(quantity, unit):
         known = OFFERED.get(quantity, "Pa, kPa or MPa")
         raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known; use {known}")
+    seen = written[np.isfinite(written)]
+    if quantity == "phase" and ANGLE_UNITS[unit] != 1 and seen.size and seen.max() <= 0.5 * np.pi:
+        notes.append(
+            f"column {column.name!r} has {seen.min():.3g} to {seen.max():.3g} degrees, less than "
+            "tissues have: if these are radians, name it phase_rad"
+        )
     if quantity == "frequency":
         return written * _of_frequency(path, column, unit)
     return written * {"phase": ANGLE_UNITS, "tangent": TANGENT_UNITS}.get(quantity, MODULUS_UNITS)[unit]
@@ -69,14 +77,27 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
     return f"{column.name} = {written:g} {problem}", remedy
 
 
+def _names_shear(column: Column) -> bool:
+    return re.search(r"shear|(^|[^A-Za-z])[Gg]([^A-Za-z]|$)", column.name) is not None
+
+
 def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
     """Divide moduli of tension or bending by 3, in place; a note says so."""
-    tensile = [q for q, (c, _) in columns.items() if q.split("_")[0] in MODULI and is_tensile(c)]
+    moduli = [q for q in columns if q.split("_")[0] in MODULI]
+    tensile = [q for q in moduli if is_tensile(columns[q][0])]
+    if tensile:  # "tensile_storage_modulus, loss_modulus": both are of tension
+        sheared = [columns[q][0].name for q in moduli if q not in tensile and _names_shear(columns[q][0])]
+        if sheared:
+            raise InputError(
+                f"column {columns[tensile[0]][0].name} is of tension or bending and {sheared[0]} of shear: name both "
+                "alike"
+            )
+        tensile = moduli
     for q in tensile:
         columns[q] = columns[q][0], columns[q][1] / 3
     if not tensile:
         return []
-    names = " and ".join(columns[q][0].name for q in tensile)
+    names = " and ".join(dict.fromkeys(columns[q][0].name for q in tensile))
     return [f"{names} are of tension or bending: G = E / 3 is taken, as of an incompressible material"]
 
 

@@ -1,0 +1,131 @@
+"""What the columns of a stress-stretch curve may hold instead of stretch and nominal stress, if its misfit has
+structure."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+
+from fitting.fits.stress_stretch import LawFit
+from fitting.methods.kramers_kronig import CHANCE, runs_probability
+from fitting.readers.curves import Curve
+from liverjax.laws import Law, homogeneous
+
+#: Fewest points of a curve whose residuals are tested, and the misfit below which they are roundoff.
+_FEWEST, _EXACT = 8, 1e-6
+#: A cause is named if it lowers the criterion by more than this, and leaves residuals that look random.
+_BETTER, _RANDOM = 10.0, 0.05
+_stress = jax.jit(homogeneous.nominal_stress)
+
+
+class _Cause(NamedTuple):
+    """Another meaning of a curve's columns: (driven, number) -> driven, and (nominal stress, driven, number) -> column.
+
+    Numbers are in units of the range of `driven`, or of the curve's stress.
+    """
+
+    words: str
+    driven: Callable[[np.ndarray, float], np.ndarray]
+    column: Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+    free: bool = False  # whether it has a number
+    of_stress: bool = False  # whether this number is in units of the stress
+
+
+_CAUSES = (
+    _Cause("if the zero of the {driven} were off by {number:.2g}", lambda d, q: d - q, lambda P, d, q: P, free=True),
+    _Cause("if an offset of {number:.3g} Pa were in the stress", lambda d, q: d, lambda P, d, q: P + q, True, True),
+    _Cause("if the stress were true stress (force over present area)", lambda d, q: d, lambda P, d, q: P * d),
+    _Cause("if the stretch were 1 + logarithmic strain", lambda d, q: np.exp(d - 1), lambda P, d, q: P),
+)
+
+
+def structured_curves(curves: list[Curve], fit: LawFit) -> list[str]:
+    """A sentence for the curves whose residuals keep their sign over many points, with the cause if one is found.
+
+    Args:
+        curves: the curves.
+        fit: the best fit.
+    """
+    misfit = [(c, (_model(fit.law, c) - c.stress) / c.scale) for c in curves]
+    runs = {c.label: runs_probability(np.sign(r)) for c, r in misfit}
+    odd = [c for c, r in misfit if len(r) >= _FEWEST and np.abs(r).max() > _EXACT and runs[c.label][1] < CHANCE]
+    if not odd:
+        return []
+    curve = min(odd, key=lambda c: runs[c.label][1])
+    (count, chance), names = runs[curve.label], ", ".join(c.label for c in odd)
+    said = (
+        f"{names}: structured misfit of {fit.label}: the residuals change sign {count - 1} times over "
+        f"{len(curve.stress)} points (by chance: {chance:.1g})"
+    )
+    cause = _named_cause(curves, odd, fit)
+    return [f"{said}; {cause}" if cause else f"{said}; the law misses something: try others (LAW = all)"]
+
+
+def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
+    P = np.asarray(_stress(law, jnp.asarray(curve.F if F is None else F)))
+    return P[:, curve.component[0], curve.component[1]]
+
+
+def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
+    """The cause that lowers the criterion most and leaves random residuals; empty if there is none."""
+    found = [(_criterion(fit.law, curves, odd, None), "")]
+    limit = found[0][0].value - _BETTER
+    for cause in _CAUSES:
+        sheared = any(c.test not in ("uniaxial", "equibiaxial", "pure_shear") for c in odd)
+        if sheared and not cause.of_stress:
+            continue
+        refit = _criterion(fit.law, curves, odd, cause)
+        if refit.value < limit and refit.chance > _RANDOM:
+            number = refit.number * (odd[0].scale if cause.of_stress else np.ptp(odd[0].driven))
+            words = cause.words.format(driven="stretch", number=number)
+            modulus = _slope_at_rest(refit.law)
+            found.append((refit, f"the same law would follow {words}, with G0 {modulus:.4g} Pa: check that"))
+    return min(found, key=lambda each: each[0].value)[1]
+
+
+class _Refit(NamedTuple):
+    value: float  # Akaike's criterion, corrected for few points
+    chance: float  # of the residuals' order, the smallest of all odd curves
+    number: float
+    law: Law
+
+
+def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
+    """Refit a law from its best numbers, with another meaning of the columns of the odd curves."""
+    leaves, tree = jax.tree.flatten(law)
+    start = np.array([float(leaf) for leaf in leaves])
+    free = cause is not None and cause.free
+    labels = {c.label for c in odd}
+
+    def law_of(x: np.ndarray) -> Law:
+        return jax.tree.unflatten(tree, list(x[: len(start)] * np.where(start == 0, 1.0, np.abs(start))))
+
+    def parts(x: np.ndarray) -> list[np.ndarray]:
+        own, out = law_of(x), []
+        for c in curves:
+            if cause is None or c.label not in labels:
+                out.append((_model(own, c) - c.stress) / c.scale)
+                continue
+            q = (float(x[-1]) if free else 0.0) * (c.scale if cause.of_stress else np.ptp(c.driven))
+            driven = cause.driven(c.driven, q)
+            F = c.F if cause.of_stress else np.asarray(homogeneous.deformation_gradient(c.test, driven))
+            out.append((cause.column(_model(own, c, F), driven, q) - c.stress) / c.scale)
+        return out
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.nan_to_num(np.concatenate(parts(x)), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    begin = np.append(np.sign(start), np.zeros(int(free)))
+    found = scipy.optimize.least_squares(residuals, begin)
+    n, k = len(found.fun), len(begin) + 1
+    value = n * np.log(max(2 * found.cost / n, 1e-300)) + 2 * k * n / max(n - k - 1, 1)
+    own = [r for c, r in zip(curves, parts(found.x), strict=True) if c.label in labels]
+    chance = min(runs_probability(np.sign(r))[1] for r in own)
+    return _Refit(float(value), chance, float(found.x[-1]) if free else 0.0, law_of(found.x))
+
+
+def _slope_at_rest(law: Law) -> float:
+    return float(law.tangent(jnp.eye(3))[0, 1, 0, 1])
