@@ -296,7 +296,7 @@ def test_the_errors_of_a_cylinder_are_those_of_repeated_noise():
         noise = rng.normal(size=own.waves.motion.shape) + 1j * rng.normal(size=own.waves.motion.shape)
         found = regions.moduli_of_regions(m, own.waves._replace(motion=own.waves.motion + field.noise * noise), start)
         moduli.append(found.modulus[0, 1])
-    e = found.standard_errors[0, 1] / found.noise_factor[0]
+    e = found.standard_errors[0, 1] / found.noise_factor[0, 1]
     assert 0.5 < np.std(np.real(moduli), ddof=1) / e.real < 1.6 and 0.5 < np.std(np.imag(moduli), ddof=1) / e.imag < 1.6
 
 

@@ -1,5 +1,6 @@
 """Files of a fit to waves: waves.json, waves.h5, waves.vtu and waves.png."""
 
+import itertools
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,8 +10,9 @@ import meshio
 import numpy as np
 
 from fitting.reports.sweep_report import numbers
-from fitting.waves import components, voxels
+from fitting.waves import voxels
 from fitting.waves.elastography import Found, Organ
+from fitting.waves.files import components
 from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 #: chi^2 per equation above which there is a warning that the model misses something.
 TOO_FAR = 1.5
+#: The same, above which the moduli themselves may be wrong.
+WRONG = 10.0
 #: Fewest frequencies of a sweep.
 FEWEST = 3
 #: A node of the map counts as different from the organ's mean beyond this many standard deviations.
@@ -90,7 +94,7 @@ def _of_regions(organ: Organ, own: Regions, found: Found) -> list[Content]:
                 "attenuation_1_m": alpha.tolist(),
                 "voxels_a_wave": (2 * np.pi * c / omega / organ.field.spacing.max()).tolist(),
                 "chi2_per_component": (own.chi2 / own.components).tolist(),
-                "noise_factor": own.noise_factor.tolist(),
+                "noise_factor": own.noise_factor[:, r].tolist(),
                 "iterations": own.iterations.tolist(),
                 "converged": own.converged.tolist(),
             }
@@ -188,18 +192,14 @@ def _of_map(drawn: WaveMap) -> Content:
 
 def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
+    told += _of_scales(organ, found)
     order = components.order_sentence(organ.field)
     if order is not None:
         told.insert(0, order)
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
             continue
-        ratio = each.chi2[f] / each.components
-        if ratio > TOO_FAR:
-            told.append(
-                f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {'regions' if found.parts else 'moduli'}: "
-                "the organ is less uniform, or the noise larger; the standard errors are enlarged by its root"
-            )
+        told += _of_residuals(hertz, each, f, "regions" if found.parts else "moduli")
         bias, error = np.abs(found.mesh_bias[f]), each.standard_errors[f].real / np.abs(each.modulus[f])
         if bias > error.min():
             told.append(
@@ -222,6 +222,60 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, or "
             "a body that does not move like a viscous solid"
         )
+    return told
+
+
+def _of_residuals(hertz: float, each: Regions, f: int, uniform: str) -> list[str]:
+    """Sentences on residuals that are too large, or alike in neighbouring voxels."""
+    told, ratio = [], each.chi2[f] / each.components
+    alike = f < len(each.correlations) and each.correlations[f].seen
+    if alike:
+        told.append(
+            f"{hertz:g} Hz: neighbouring voxels share their residuals (correlation {each.correlations[f].beyond:.2g} "
+            "above that of independent noise): the data are smoothed, or the organ is less uniform than its "
+            f"{uniform}; standard errors are enlarged {each.noise_factor[f].max():.3g} times, those of a map are not"
+        )
+    if ratio > WRONG:
+        told.append(
+            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: unless the data are smoothed, the "
+            "moduli may be wrong by more than their errors; look for voxels that were not measured, and at the labels"
+        )
+    elif ratio > TOO_FAR and not alike:
+        told.append(
+            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: the organ is less uniform, or the "
+            "noise larger; the standard errors are enlarged by its root"
+        )
+    return told
+
+
+#: Speeds [m/s] of shear waves in soft tissue.
+SLOW, FAST = 0.4, 15.0
+
+
+def _of_scales(organ: Organ, found: Found) -> list[str]:
+    """Sentences on speeds that no soft tissue has, and on moduli that change with frequency as no material's do.
+
+    The balance of forces has no scale of its own, so that a wrong unit leaves its chi^2 as it is.
+    """
+    told, omega = [], organ.waves.omega
+    G, errors = found.whole.modulus[:, 0], np.abs(found.whole.standard_errors[:, 0])
+    speeds = velocity_and_attenuation(G.real, G.imag, omega, organ.density)[0]
+    odd = np.flatnonzero(~((speeds > SLOW) & (speeds < FAST)))
+    if odd.size:
+        told.append(
+            f"waves of {omega[odd[0]] / (2 * np.pi):g} Hz run at {speeds[odd[0]]:.2g} m/s, and in soft tissue at "
+            f"{SLOW:g} to {FAST:g} m/s: check the spacing (metres) and the frequencies (Hz, not rad/s)"
+        )
+    for a, b in itertools.pairwise(range(len(omega))):
+        span = np.log(omega[b] / omega[a])
+        slope = np.log(np.abs(G[b]) / np.abs(G[a])) / span
+        error = 3 * float(np.hypot(errors[a] / np.abs(G[a]), errors[b] / np.abs(G[b]))) / span
+        if slope + error < -0.1 or slope - error > 1.1:
+            told.append(
+                f"from {omega[a] / (2 * np.pi):g} to {omega[b] / (2 * np.pi):g} Hz |G*| changes as the frequency to "
+                f"the power of {slope:.2g}, which is 0 to 1 in all materials: check that the frequencies are in the "
+                "order of the fields"
+            )
     return told
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from fitting.waves import balance, edge_places, edges, regions, stiffness_map, voxels
 from fitting.waves.balance import Matrices, gigabytes
@@ -66,7 +67,7 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     """Moduli of the whole organ, and of its regions if labels are given."""
     m, waves, body = organ.matrices, organ.waves, organ.body
     start = regions.first_modulus(m, waves)
-    whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress)
+    whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress, body.voxel)
     given = zip(whole.modulus[:, 0], waves.omega, directions_of_waves(organ.field), strict=True)
     rows = [(plane_wave_biases(G, w, organ, weights), weights) for G, w, weights in given]
     bias = np.array([each @ weights for each, weights in rows])
@@ -78,7 +79,7 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     known = np.unique(labels[tuple(body.voxel.T)])
     each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
     matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
-    parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress)
+    parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress, body.voxel)
     return Found(whole, known, parts, bias, left)
 
 
@@ -113,20 +114,26 @@ def directions_of_waves(field: WaveField) -> np.ndarray:
 def plane_wave_biases(G: complex, omega: float, organ: Organ, weights: np.ndarray) -> np.ndarray:
     """Relative errors (D,) of the modulus that these elements find in plane waves without noise along `DIRECTIONS`.
 
+    One step of Gauss-Newton from the true modulus, in the organ's own body: edges and holes add to the error of the
+    elements.
+
     Args:
         G: modulus [Pa].
         omega: angular frequency [rad/s].
-        organ: its voxels and density.
+        organ: its body and density.
         weights: of the directions (D,); those that do not count are left out, with an error of 0.
     """
-    spacing, density = organ.field.spacing, organ.density
-    body = voxels.voxel_body(np.ones((7, 7, 7), bool), spacing)
-    uniform, X = _uniform(balance.matrices(body, density), body, density), np.asarray(body.mesh.points)
-    k, found = omega * np.sqrt(density / G), np.zeros(len(DIRECTIONS), complex)
+    m, X = organ.matrices, np.asarray(organ.body.mesh.points)
+    uniform, X = _uniform(m, organ.body, organ.density), X - X.mean(axis=0)
+    k, found = omega * np.sqrt(organ.density / G), np.zeros(len(DIRECTIONS), complex)
+    C = uniform.rows(np.array([G]), omega)
+    factor = balance.likeliest(C, uniform.pressure, np.zeros(C.shape[1]), 1.0).factor
     for d in np.flatnonzero(weights > 1e-3):
         n = np.array(DIRECTIONS[d]) / np.linalg.norm(DIRECTIONS[d])
         across = np.cross(n, np.eye(3)[int(np.argmin(np.abs(n)))])
-        u = (np.exp(-1j * k * (X @ n))[:, None] * across / np.linalg.norm(across)).ravel()
-        waves = MeasuredWaves(np.array([omega]), u[None], np.array([1e-3]))
-        found[d] = regions.moduli_of_regions(uniform, waves, np.array([G])).modulus[0, 0] / G - 1
+        wave = (np.exp(-1j * k * (X @ n))[:, None] * across / np.linalg.norm(across)).ravel()
+        q = scipy.linalg.cho_solve_banded((factor, True), C @ wave, check_finite=False)
+        slope = uniform.by_moduli(wave - C.conj().T @ q)[:, 0]
+        weighted = scipy.linalg.cho_solve_banded((factor, True), slope, check_finite=False)
+        found[d] = -np.vdot(slope, q) / (np.vdot(slope, weighted).real * G)
     return found

@@ -8,6 +8,7 @@ import scipy.sparse
 
 from fitting.waves import balance
 from fitting.waves.balance import Balanced, Matrices
+from fitting.waves.correlated_noise import Correlation, correlation
 from fitting.waves.edges import RegionMatrices
 
 #: Moduli [Pa] at which a search begins, and the loss over storage there.
@@ -34,17 +35,25 @@ class Regions(NamedTuple):
     components: int  # of one frequency
     iterations: np.ndarray  # (F,)
     converged: np.ndarray  # (F,) bool
+    correlations: tuple[Correlation, ...] = ()  # of the noise at each frequency, if asked for
 
     @property
     def noise_factor(self) -> np.ndarray:
-        """Ratio (F,) of the residuals to the noise, at least 1; errors are enlarged by it."""
-        return np.maximum(1.0, np.sqrt(self.chi2 / self.components))
+        """Factor (F, R), at least 1, by which errors exceed those of white noise with the given deviations.
+
+        It is the ratio of residuals to noise, or that of correlated noise.
+        """
+        factor = np.repeat(np.maximum(1.0, np.sqrt(self.chi2 / self.components))[:, None], self.modulus.shape[1], 1)
+        for f, own in enumerate(self.correlations):
+            if own.seen:
+                factor[f] = np.maximum(1.0, own.enlarged)
+        return factor
 
     @property
     def standard_errors(self) -> np.ndarray:
         """Standard errors of storage, and of loss as the imaginary part (F, R) [Pa]."""
-        sd = self.noise_factor[:, None] * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         R = self.modulus.shape[1]
+        sd = np.tile(self.noise_factor, 2) * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         return sd[:, :R] + 1j * sd[:, R:]
 
 
@@ -73,6 +82,7 @@ def moduli_of_regions(
     waves: MeasuredWaves,
     start: np.ndarray,
     progress: Callable[[int, float], None] = lambda iteration, cost: None,
+    voxel: np.ndarray | None = None,
 ) -> Regions:
     """Moduli by Gauss-Newton, every frequency by itself.
 
@@ -83,17 +93,23 @@ def moduli_of_regions(
         waves: the measured waves.
         start: complex modulus of each region (R,) [Pa] at the lowest frequency.
         progress: called after every iteration with its number, and with chi^2 per component.
+        voxel: place of each node (V, 3), to find the correlation of the noise; None: noise counts as white.
     """
-    found, G = [], np.asarray(start, complex)
+    found, G, correlations = [], np.asarray(start, complex), []
     for f in range(len(waves.omega)):
-        found.append(_one_frequency(m, waves, f, G, progress))
-        G = found[-1][0]
+        *one, now = _one_frequency(m, waves, f, G, progress)
+        found.append(one)
+        G = one[0]
+        if voxel is not None:
+            C = m.rows(now.G, waves.omega[f])
+            given = m.by_moduli(now.here.motion), waves.motion[f], waves.sd[f], voxel
+            correlations.append(correlation(C, now.here, *given))
     G, covariance, farther, chi2, iterations, converged = (np.array(each) for each in zip(*found, strict=True))
-    return Regions(G, covariance, farther, chi2, m.balances, iterations, converged)
+    return Regions(G, covariance, farther, chi2, m.balances, iterations, converged, tuple(correlations))
 
 
 def _one_frequency(m, waves, f, G, progress):
-    """Modulus (R,), covariance (2 R, 2 R), places of edges (R,), chi^2, iterations, and whether they ended."""
+    """Modulus (R,), covariance (2 R, 2 R), places of edges (R,), chi^2, iterations, whether they ended, the state."""
     R, at = len(G), (waves.omega[f], waves.motion[f], waves.sd[f])
     now, converged, k = _state_of_regions(m, G, *at), False, 0
     labels = _of_labels(m, R)
@@ -120,7 +136,7 @@ def _one_frequency(m, waves, f, G, progress):
         if converged or part < 1e-2:
             break
     farther = m.patches.means(step[2 * R :], R)
-    return now.G, covariance[: 2 * R, : 2 * R], farther, now.here.chi2, k, converged
+    return now.G, covariance[: 2 * R, : 2 * R], farther, now.here.chi2, k, converged, now
 
 
 def _in_errors(step: np.ndarray, covariance: np.ndarray, R: int) -> float:

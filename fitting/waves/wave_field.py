@@ -90,6 +90,10 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray) -> np.ndarray
     return values
 
 
+#: Part of the voxels up to which components of exactly 0 are told.
+FEW = 0.2
+
+
 def _leave_out_rest(U: np.ndarray) -> list[str]:
     """Set voxels that do not move to NaN, in place: many programs write 0 where they did not measure. Return notes."""
     notes, nothing = [], (U == 0) | np.isnan(U)
@@ -97,6 +101,22 @@ def _leave_out_rest(U: np.ndarray) -> list[str]:
     if np.any(still & np.any(U == 0, axis=(0, 4))):
         U[:, still] = np.nan
         notes.append(f"{still.sum()} voxels that do not move at all count as not measured")
+    for f, u in enumerate(U):
+        rests = np.all(u == 0, axis=-1)
+        if rests.any() and np.any(np.isfinite(u) & (u != 0)):
+            u[rests] = np.nan
+            notes.append(
+                f"{rests.sum()} voxels do not move in field {f + 1}, but in others: they count as not measured, at all "
+                "frequencies"
+            )
+        several = np.isfinite(u) & np.any(np.isfinite(u) & (u != 0), axis=-1, keepdims=True)
+        zeros = (u == 0) & several
+        zeros &= zeros.sum(axis=(0, 1, 2)) < FEW * several.sum(axis=(0, 1, 2))  # more: a wave of a plane symmetry
+        if zeros.any():
+            notes.append(
+                f"field {f + 1} has {zeros.sum()} components that are exactly 0 in voxels that move: write NaN where a "
+                "component was not measured"
+            )
     # A wave may have one direction only, so a component of zeros is kept.
     resting = np.all(nothing, axis=(0, 1, 2, 3)) & np.any(U == 0, axis=(0, 1, 2, 3))
     for axis in np.array(list("xyz"))[resting]:

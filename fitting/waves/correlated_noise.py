@@ -1,0 +1,140 @@
+"""Noise of neighbouring voxels that is alike: how much larger the errors of moduli are than those of white noise.
+
+Scanners and filters smooth, so that neighbours share their noise. Then fewer independent numbers are measured, and
+fourth differences see only a part of the noise. The residual motion d - u shows both. It is a projection of the noise,
+so that even white noise leaves residuals whose neighbours are slightly unlike. Draws of white and of smoothed noise,
+projected in the same way, tell which width of a Gaussian filter makes the correlation that is seen, along each axis,
+and which part of the noise is left in the residuals.
+
+The error of a modulus is a sum over the voxels, v^H n / H with v = C^H S^-1 C' u (`fitting.waves.balance`). So its
+variance is that of white noise, times sum_l R(l) sum_x conj(v(x)) v(x + l) / sum_x |v(x)|^2, where R is the noise's
+autocorrelation.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.ndimage
+import scipy.sparse
+
+from fitting.waves.balance import Balanced
+
+#: Widths [voxels] of the filters that are tried, the draws of each for `SMALL` voxels, and how far filters reach.
+WIDTHS = (0.0, 0.35, 0.45, 0.55, 0.65, 0.75, 0.9, 1.1, 1.4, 1.8)
+DRAWS, SMALL, REACH = 6, 1500, 6
+#: Correlation of neighbouring residuals, above that of white noise, from which noise counts as correlated; and the
+#: same in its standard deviations by chance.
+SEEN, BY_CHANCE = 0.04, 4.0
+
+
+class Correlation(NamedTuple):
+    """What the residuals of one frequency say of the noise."""
+
+    beyond: float  # largest correlation of neighbours along an axis, above that of white noise
+    seen: bool  # whether this is more than chance
+    enlarged: np.ndarray  # (R,) error of each modulus over that of white noise with the given deviation
+
+
+class _Projection(NamedTuple):
+    """The matrices of the likeliest motion, and the places of the measured unknowns."""
+
+    C: scipy.sparse.csr_array
+    here: Balanced
+    voxel: np.ndarray  # (V, 3)
+
+    @property
+    def measured(self) -> int:
+        return 3 * len(self.voxel)
+
+    def grid(self, values: np.ndarray) -> np.ndarray:
+        """Values (3 V,) of the nodes on the voxels, (nx, ny, nz, 3), 0 outside."""
+        out = np.zeros((*(self.voxel.max(axis=0) + 1), 3), complex)
+        out[tuple(self.voxel.T)] = values[: self.measured].reshape(-1, 3)
+        return out
+
+    def residual(self, noise: np.ndarray) -> np.ndarray:
+        """What the likeliest motion leaves of noise (nx, ny, nz, 3) that is added to it."""
+        n = np.zeros(self.C.shape[1], complex)
+        n[: self.measured] = noise[tuple(self.voxel.T)].ravel()
+        q = scipy.linalg.cho_solve_banded((self.here.factor, True), self.C @ n, check_finite=False)
+        return self.grid(self.C.conj().T @ q)
+
+
+def correlation(
+    C: scipy.sparse.csr_array, here: Balanced, columns: np.ndarray, d: np.ndarray, sd: float, voxel: np.ndarray
+) -> Correlation:
+    """The correlation of the noise, from the residuals at the fitted moduli.
+
+    Args:
+        C: rows of balance (I, U) at these moduli.
+        here: the likeliest motion.
+        columns: derivatives of C u by the moduli (I, R).
+        d: measured motion (3 V,) [m], x, y, z of a node together.
+        sd: deviation of real and imaginary part of one component that was taken [m].
+        voxel: place of each node (V, 3).
+    """
+    own = _Projection(C, here, voxel - voxel.min(axis=0))
+    left = own.grid(d - here.motion[: own.measured])
+    seen, draws = _of_neighbours(left), max(1, round(DRAWS * SMALL / len(voxel)))
+    rows = [_drawn(own, 0.0, draws)]
+    beyond = float(np.max(seen - rows[0][0]))
+    if beyond <= max(SEEN, BY_CHANCE / np.sqrt(2 * own.measured)):
+        return Correlation(beyond, False, np.ones(columns.shape[1]))
+    for width in WIDTHS[1:]:
+        rows.append(_drawn(own, width, draws))
+        if np.mean(rows[-1][0]) > np.max(seen):
+            break
+    means, parts = np.array([np.mean(r) for r, _ in rows]), np.array([part for _, part in rows])
+    widths = np.interp(seen, means, WIDTHS[: len(rows)])
+    level = np.sqrt(_mean_square(own, left)) / np.interp(np.mean(seen), means, parts)
+    return Correlation(beyond, True, level / sd * np.array([_enlargement(own, column, widths) for column in columns.T]))
+
+
+def _mean_square(own: _Projection, values: np.ndarray) -> float:
+    """Mean square of real and imaginary part over the measured components."""
+    return float(np.sum(np.abs(values) ** 2)) / (2 * own.measured)
+
+
+def _of_neighbours(values: np.ndarray) -> np.ndarray:
+    """Correlation (3,) of neighbours along the axes of values (nx, ny, nz, 3)."""
+    rows = [np.moveaxis(values, a, 0) for a in range(3)]
+    whole = max(float(np.sum(np.abs(values) ** 2)), 1e-300)
+    return np.array([np.sum(r[1:].conj() * r[:-1]).real / whole for r in rows])
+
+
+def _drawn(own: _Projection, width: float, draws: int) -> tuple[np.ndarray, float]:
+    """Correlation (3,) of neighbouring residuals of noise of this width, and the part of the noise that is left."""
+    rng, shape = np.random.default_rng(0), tuple(own.voxel.max(axis=0) + 1 + 2 * REACH)
+    inside = (slice(REACH, -REACH),) * 3
+    found, parts = [], []
+    for _ in range(draws):
+        noise = rng.standard_normal((*shape, 3)) + 1j * rng.standard_normal((*shape, 3))
+        if width:
+            kernel = _filter(width)
+            for axis in range(3):
+                noise = scipy.ndimage.convolve1d(noise, kernel, axis=axis)
+        noise = noise[inside] / np.sqrt(np.mean(np.abs(noise[inside]) ** 2) / 2)
+        left = own.residual(noise)
+        found.append(_of_neighbours(left))
+        parts.append(np.sqrt(_mean_square(own, left)))
+    return np.mean(found, axis=0), float(np.mean(parts))
+
+
+def _filter(width: float) -> np.ndarray:
+    """A Gaussian filter (2 `REACH` + 1,)."""
+    weights = np.exp(-0.5 * (np.arange(-REACH, REACH + 1) / width) ** 2)
+    return weights / weights.sum()
+
+
+def _enlargement(own: _Projection, column: np.ndarray, widths: np.ndarray) -> float:
+    """Error of one modulus by noise of these widths (3,), over that by white noise of the same size."""
+    q = scipy.linalg.cho_solve_banded((own.here.factor, True), column, check_finite=False)
+    v = own.grid(own.C.conj().T @ q)
+    smooth = v
+    for axis, width in enumerate(widths):
+        if width > 0:
+            kernel = _filter(width)
+            both = np.correlate(kernel, kernel, "full")  # autocorrelation of the filtered noise
+            smooth = scipy.ndimage.convolve1d(smooth, both / both.max(), axis=axis, mode="constant")
+    return float(np.sqrt(max(np.sum(v.conj() * smooth).real, 0.0) / max(np.sum(np.abs(v) ** 2), 1e-300)))
