@@ -456,6 +456,20 @@ def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
     assert found == {} and len(told) == 1 and told[0].startswith("whole: no springpot is fitted over the frequencies")
 
 
+def test_a_field_that_holds_no_number_is_named(tmp_path):
+    field = plane_waves((6, 6, 6), noise=1e-7)
+    for part, words in ((slice(None), "its noise at 100 Hz cannot .* leave this field out"), (slice(0, 3), "")):
+        U = field.displacement.copy()
+        U[1, part] = np.nan
+        np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)
+        found = wave_field.read_waves(tmp_path / "w.npz")
+        if words:
+            with pytest.raises(InputError, match=words):
+                wave_field.with_noise(found, None)
+        else:
+            assert any("108 of 216 voxels are not measured at every frequency" in n for n in found.notes)
+
+
 def test_zeros_at_one_frequency_are_no_measurement(tmp_path):
     """They were taken for motion: 2396 +- 35 for 3000."""
     field = plane_waves((6, 6, 6), noise=1e-7)

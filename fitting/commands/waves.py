@@ -32,7 +32,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
         epilog=EXIT_CODES,
     )
     command.add_argument(
-        "data", type=Path, metavar="DATA", help="complex displacements: .npz, .h5, .csv, .nii, .nii.gz"
+        "data", type=Path, metavar="DATA", help="complex displacements: .npz, .npy, .h5, .mat, .csv, .nii, .nii.gz"
     )
     command.add_argument("--frequencies", type=float, nargs="+", metavar="HZ", help="if the file does not state them")
     command.add_argument("--mask", type=Path, metavar="FILE", help="voxels of the organ, if the file has no mask")

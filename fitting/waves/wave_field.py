@@ -71,6 +71,11 @@ def read_waves(
     inside = measured if chosen is None else measured & (chosen != 0)
     if not inside.any():
         raise InputError(f"{name}: no voxel of the mask has a displacement: give the mask of these voxels")
+    now_and_then = inside & ~np.isfinite(U).any(axis=4).all(axis=0)
+    if now_and_then.any() and np.isfinite(U).any(axis=(1, 2, 3, 4)).all():
+        notes.append(
+            f"{now_and_then.sum()} of {inside.sum()} voxels are not measured at every frequency, and not used at any"
+        )
     regions = _whole_numbers(name, "labels", found.get("labels"), shape)
     order = np.argsort(hertz)
     field = WaveField(hertz[order], U[order], step, origin, inside, regions, np.zeros(len(U)), name, tuple(notes))
@@ -128,8 +133,12 @@ def with_noise(field: WaveField, noise: float | None) -> WaveField:
     """The field with this noise [m], or with its own noise, which must be above 0."""
     if noise is not None:
         return field._replace(noise=np.full(len(field.frequencies), noise))
-    if not np.all(field.noise > 0):
-        raise InputError(f"{field.source}: its noise cannot be estimated from the data: give --noise, in metres")
+    unknown = ~(field.noise > 0)
+    if unknown.any():
+        hertz = ", ".join(f"{f:g}" for f in field.frequencies[unknown])
+        blank = not np.isfinite(field.displacement[unknown]).any()
+        remedy = "leave this field out: it holds no number" if blank else "give --noise, in metres"
+        raise InputError(f"{field.source}: its noise at {hertz} Hz cannot be estimated from the data: {remedy}")
     return field
 
 
