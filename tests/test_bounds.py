@@ -1,7 +1,8 @@
 """Bounds of numbers: one place reads them, for scenes made in Python as for files, before anything is compiled."""
 
+import cProfile
+import pstats
 import re
-import time
 from typing import Any
 
 import jax
@@ -143,15 +144,13 @@ def test_parts_of_a_scene_checked_alone_use_the_same_place():
         lj.check_scene(replace(SOUND, region=(), law=lj.laws.Ogden(mu=(1.0, 2.0), alpha=(2.0,), bulk=10.0)))
 
 
-def test_bounds_cost_less_than_a_millisecond():
-    """Asked at every call of `simulate`: the best of ten, since other programs may hold the processor."""
+def test_bounds_are_cheap():
+    """Asked at every call of `simulate`: so few calls of functions take less than a millisecond."""
     scene_checks.check_bounds(SOUND)
-    times = []
-    for _ in range(10):
-        begin = time.perf_counter()
-        scene_checks.check_bounds(SOUND)
-        times.append(time.perf_counter() - begin)
-    assert min(times) < 1e-3
+    counted = cProfile.Profile()
+    counted.runcall(scene_checks.check_bounds, SOUND)
+    calls = pstats.Stats(counted).total_calls
+    assert calls < 2500
 
 
 FINE = lj.quadratic(MESH)
