@@ -356,6 +356,7 @@ def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_pa
         refused({"law.mu": value}, "law.mu = .* is far out of its range .* take lj.reduced_error")
     refused({"body.gravity": np.array([0.0, 9.0, -3.0])}, "body.gravity = .* is far out of its range")
     refused({"body.density": 2000.0}, "body.density is not that of the model's rows")
+    refused({"viscosity.relaxation_times": 0.1 + PRONY.relaxation_times}, "relaxation_times is not that of the model's")
     # Traced numbers are not known.
     jax.eval_shape(lambda density: refuse_unseen_numbers(model, _heavier(scene, density)), 2000.0)
 

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("curves.json", "curves.png"))
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
     fits = [stress_stretch.fit(candidate, found) for candidate in bar]
-    structured = structured_curves(found, curves_report.best_first(fits)[0])
+    structured = structured_curves(found, curves_report.best_first(fits)[0], options.law == "all")
     curves_report.write(options.out, found, fits, structured)
     print(curves_report.table(fits))
     for fit in curves_report.best_first(fits):

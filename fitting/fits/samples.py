@@ -136,23 +136,27 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
 
 #: Chance, for all samples together, below which one that differs from the others is named; fewest samples for it.
 _STRANGE, _FEWEST = 0.05, 4
+#: Least ratio to the others of a sample that is named, and largest error of the logarithm with which it is judged.
+_APART, _UNSURE = 1.3, 0.5
 
 
 def outliers(found: Samples) -> list[str]:
     """A sentence on each sample whose modulus does not belong to the others' (t-test on logarithms, Bonferroni)."""
     name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
-    values = np.array([found.values(k)[name][0] for k in range(len(found.fits))])
-    if len(values) < _FEWEST or np.any(values <= 0):
+    pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
+    known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
+    if len(known) < _FEWEST:
         return []
-    logs, out = np.log(values), []
-    for k, sweep in enumerate(found.sweeps):
-        others = np.delete(logs, k)
-        apart = (logs[k] - others.mean()) / (max(others.std(ddof=1), 1e-12) * np.sqrt(1 + 1 / len(others)))
+    logs, errors, out = np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0], []
+    for k, sample in enumerate(known):
+        sweep, others = found.sweeps[sample], np.delete(logs, k)
+        deviation = np.sqrt(others.var(ddof=1) * (1 + 1 / len(others)) + errors[k] ** 2)
+        apart = float((logs[k] - others.mean()) / max(deviation, 1e-12))
         chance = min(1.0, 2 * len(logs) * float(scipy.stats.t.sf(abs(apart), len(others) - 1)))
-        if chance < _STRANGE:
+        if chance < _STRANGE and abs(logs[k] - others.mean()) > np.log(_APART):
             out.append(
                 f"{Path(sweep.source).name}: its {name} is {np.exp(logs[k] - others.mean()):.2g} times the mean of the "
-                f"others, {np.exp(others.mean()):.4g} Pa (by chance: {chance:.1g}): check its units and sizes; it "
+                f"others, {np.exp(others.mean()):.4g} (by chance: {chance:.1g}): check its units and sizes; it "
                 "widens the population's intervals"
             )
     return out

@@ -135,7 +135,7 @@ def read_time_test(
             f"displacement and force; the file has {', '.join(columns)}"
         )
     if form[0] in ("modulus", "compliance"):
-        _refuse_another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
+        notes += _another_course(str(path), kind, time, columns[form[0]], (ramp or 0.0, start))
         time, driven, answer = _as_a_step(str(path), time, columns[form[0]], ramp or 0.0)
         if sample.radius is not None or sample.height is not None:
             notes.append(f"the size of the sample is not used: the file has a column of {form[0]}")
@@ -234,7 +234,8 @@ def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[
     first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))
     if np.sum(near[first:]) < 0.9 * np.sum(near):
         return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
-    rest = int(np.argmax(np.abs(driven) > 5 * noise))
+    rest = int(np.argmax(np.abs(driven - np.median(driven[:3])) > 5 * noise))
+    rest = rest if rest <= first else 0
     rest_level = float(np.mean(driven[:rest])) if rest else 0.0
     if first - rest >= _ROWS_OF_RAMP:
         straight = _straight_ramp(time, driven, (rest, first, rest_level), noise)
@@ -253,6 +254,8 @@ def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[
 
 #: Fewest rows of a ramp that a straight line replaces, and the largest misfit of such a line over the noise.
 _ROWS_OF_RAMP, _STRAIGHT = 4, 1.5
+#: Most rows of rest and of hold that such a line is fitted to.
+_OF_HOLD = 500
 
 
 def _straight_ramp(
@@ -265,10 +268,19 @@ def _straight_ramp(
     import scipy.optimize
 
     rest, first, low = places
+    whole, late = time, np.linspace(first, len(time) - 1, min(_OF_HOLD, len(time) - first)).astype(int)
+    rows = np.concatenate([np.arange(max(rest - _OF_HOLD, 0), first), late])
+    time, driven, rest, first = time[rows], driven[rows], rest - int(rows[0]), first - int(rows[0])
+
+    def rise(at: np.ndarray, begin: float, end: float) -> np.ndarray:
+        return np.clip((at - begin) / float(np.maximum(end - begin, 1e-12)), 0.0, 1.0)
+
+    def size(begin: float, end: float, low: float) -> float:
+        line = rise(time, begin, end)
+        return float(line @ (driven - low)) / float(np.maximum(line @ line, 1e-300))
 
     def line_from(begin: float, end: float, low: float) -> np.ndarray:
-        line = np.clip((time - begin) / float(np.maximum(end - begin, 1e-12)), 0.0, 1.0)
-        return low + line * (line @ (driven - low)) / float(np.maximum(line @ line, 1e-300))
+        return low + rise(time, begin, end) * size(begin, end, low)
 
     def misfit(x: np.ndarray) -> float:
         return float(np.sum((line_from(x[0], x[1], low) - driven) ** 2))
@@ -281,7 +293,7 @@ def _straight_ramp(
         line = line_from(begin, end, level)
         off = (line - driven) / noise
         if max(np.sqrt(np.mean(part**2)) for part in (off, off[rest : first + 1])) < _STRAIGHT:
-            return float(begin), float(end), line
+            return float(begin), float(end), level + rise(whole, begin, end) * size(begin, end, level)
     return None
 
 
@@ -439,31 +451,38 @@ def _as_a_step(path, time, modulus, ramp):
 
 
 #: Part of the largest modulus or compliance by which it may go the wrong way; in noise, times its deviation.
-_WRONG_WAY, _IN_NOISE = 0.1, 6.0
+_WRONG_WAY, _IN_NOISE = 0.25, 6.0
 
 
-def _refuse_another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> None:
+def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, given: tuple) -> list[str]:
     """Refuse a modulus that rises, or a compliance that falls, where the load is constant; `given`: ramp and start [s].
+
+    A running median leaves single wrong rows out. Returns notes.
 
     Raises:
         InputError: one sentence with the time, and what it may be.
     """
+    from scipy.ndimage import median_filter
+
     ramp, start = given
     rows = (time > 0) & (time >= start) & np.isfinite(values)
     t, v = time[rows], values[rows] * np.sign(np.sum(values[rows]))
-    if len(t) < 4:
-        return
+    if len(t) < 8:
+        return []
+    smooth = median_filter(v, size=5, mode="nearest")
+    noise, v = max(noise_of_series(v), 1.4826 * float(np.median(np.abs(v - smooth)))), smooth
     size = float(v.max())
-    allowed = max(_WRONG_WAY * size, _IN_NOISE * noise_of_series(v))
+    allowed = max(_WRONG_WAY * size, _IN_NOISE * noise)
     if kind == "creep":
         fallen = np.maximum.accumulate(v) - v
         if fallen.max() > allowed:
             last = t[int(np.argmax(v[: int(np.argmax(fallen > allowed)) + 1]))]
             raise InputError(
-                f"{path}: the compliance falls from {last:.3g} s on, as it does if the stress is taken away: give "
-                "strain and stress in two columns, or end the rows there"
+                f"{path}: the compliance falls from {last:.3g} s on. If the stress was taken away, give strain and "
+                "stress in two columns, or end the rows there; if it rings after the load, leave these rows out "
+                "(--min-time)"
             )
-        return
+        return []
     peak = int(np.argmax(v))
     if not ramp and v[peak] - v[: peak + 1].min() > allowed:
         raise InputError(
@@ -472,10 +491,11 @@ def _refuse_another_course(path: str, kind: str, time: np.ndarray, values: np.nd
             f"{t[peak]:.3g})"
         )
     if ramp and t[0] < 0.3 * ramp and v[0] > 0.7 * size:
-        raise InputError(
-            f"{path}: the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, and a ramp of "
-            f"{ramp:g} s would have {100 * t[0] / ramp:.0f} % of its strain then: correct --ramp"
-        )
+        return [
+            f"the modulus has {100 * v[0] / size:.0f} % of its largest value at {t[0]:.3g} s, and a ramp of {ramp:g} s "
+            f"has {100 * t[0] / ramp:.2g} % of its strain then: is --ramp right?"
+        ]
+    return []
 
 
 def _as_shear(path, form, columns, sample):

@@ -202,8 +202,10 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
     for part in _PARTS:
         for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
             name = ".".join([part, *(str(getattr(key, "name", getattr(key, "idx", key))) for key in path)])
-            if not name.endswith(_FREE):
-                found[name] = hashlib.sha256(np.asarray(leaf, float).tobytes()).hexdigest()[:8]
+            if name.rsplit(".", 1)[-1] not in _FREE:
+                # Equal numbers may differ in their last digits, and in the sign of 0.
+                rounded = np.asarray(leaf, np.float32) + np.float32(0)
+                found[name] = hashlib.sha256(rounded.tobytes()).hexdigest()[:8]
     return json.dumps(found)
 
 

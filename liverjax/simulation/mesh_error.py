@@ -115,7 +115,8 @@ def richer(scene: Scene) -> Scene:
     rich = enriched(scene)
     # Linear elements lock: their error is measured against elements that do not. Quadratic ones do not at a low bulk
     # modulus, and have no pressures, which would have to be continuous where the material changes.
-    volumetric = "auto" if scene.mesh.order == 1 and _may_lock(scene) else scene.solve.volumetric
+    of_linear = "auto" if _may_lock(scene) else "element"
+    volumetric = of_linear if scene.mesh.order == 1 else scene.solve.volumetric
     # Under an indenter the iterations of mixed cubic elements do not end: factorise if the user has chosen it.
     mixed = scene.mesh.order == 2 and scene.solve.volumetric == "mixed"
     linear = "direct" if mixed and scene.solve.linear_solver == "direct" else "cg"
@@ -141,7 +142,7 @@ def _may_lock(scene: Scene) -> bool:
         return True
     if any(isinstance(a, jax.core.Tracer) for pair in numbers for a in pair):
         return True
-    return any(bool(np.max(np.asarray(bulk) / np.asarray(shear)) > _LOCKS) for bulk, shear in numbers)
+    return any(bool(np.any(np.asarray(bulk) > _LOCKS * np.asarray(shear))) for bulk, shear in numbers)
 
 
 def refuse(scene: Scene) -> None:

@@ -42,12 +42,13 @@ _CAUSES = (
 )
 
 
-def structured_curves(curves: list[Curve], fit: LawFit) -> list[str]:
+def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> list[str]:
     """A sentence for the curves whose residuals keep their sign over many points, with the cause if one is found.
 
     Args:
         curves: the curves.
         fit: the best fit.
+        every: whether all laws were tried.
     """
     misfit = [(c, (_model(fit.law, c) - c.stress) / c.scale) for c in curves]
     runs = {c.label: runs_probability(np.sign(r)) for c, r in misfit}
@@ -61,7 +62,9 @@ def structured_curves(curves: list[Curve], fit: LawFit) -> list[str]:
         f"{len(curve.stress)} points (by chance: {chance:.1g})"
     )
     cause = _named_cause(curves, odd, fit)
-    return [f"{said}; {cause}" if cause else f"{said}; the law misses something: try others (LAW = all)"]
+    if cause:
+        return [f"{said}; {cause}"]
+    return [f"{said}; the law misses something" + ("" if every else ": try others (LAW = all)")]
 
 
 def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
@@ -96,12 +99,15 @@ class _Refit(NamedTuple):
 def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | None) -> _Refit:
     """Refit a law from its best numbers, with another meaning of the columns of the odd curves."""
     leaves, tree = jax.tree.flatten(law)
-    start = np.array([float(leaf) for leaf in leaves])
+    every = np.array([float(leaf) for leaf in leaves])
+    start = every[every != 0]
     free = cause is not None and cause.free
     labels = {c.label for c in odd}
 
     def law_of(x: np.ndarray) -> Law:
-        return jax.tree.unflatten(tree, list(x[: len(start)] * np.where(start == 0, 1.0, np.abs(start))))
+        values = every.copy()
+        values[every != 0] = x[: len(start)] * start
+        return jax.tree.unflatten(tree, list(values))
 
     def parts(x: np.ndarray) -> list[np.ndarray]:
         own, out = law_of(x), []
@@ -118,8 +124,9 @@ def _criterion(law: Law, curves: list[Curve], odd: list[Curve], cause: _Cause | 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.nan_to_num(np.concatenate(parts(x)), nan=1e3, posinf=1e3, neginf=-1e3)
 
-    begin = np.append(np.sign(start), np.zeros(int(free)))
-    found = scipy.optimize.least_squares(residuals, begin)
+    begin = np.append(np.ones(len(start)), np.zeros(int(free)))
+    least = np.append(np.full(len(start), 1e-6), np.full(int(free), -np.inf))  # parameters keep their signs
+    found = scipy.optimize.least_squares(residuals, begin, bounds=(least, np.inf))
     n, k = len(found.fun), len(begin) + 1
     value = n * np.log(max(2 * found.cost / n, 1e-300)) + 2 * k * n / max(n - k - 1, 1)
     own = [r for c, r in zip(curves, parts(found.x), strict=True) if c.label in labels]

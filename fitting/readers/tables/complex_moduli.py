@@ -36,7 +36,7 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
         known = OFFERED.get(quantity, "Pa, kPa or MPa")
         raise InputError(f"{path}: unit {unit!r} of column {column.name} is not known; use {known}")
     seen = written[np.isfinite(written)]
-    if quantity == "phase" and ANGLE_UNITS[unit] != 1 and seen.size and seen.max() <= 0.5 * np.pi:
+    if column.quantity == "phase" and unit.startswith(("deg", "°")) and seen.size and seen.max() <= 0.5 * np.pi:
         notes.append(
             f"column {column.name!r} has {seen.min():.3g} to {seen.max():.3g} degrees, less than "
             "tissues have: if these are radians, name it phase_rad"
