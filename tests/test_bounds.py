@@ -351,10 +351,19 @@ def test_numbers_to_differentiate_by_are_checked():
         lj.value_and_gradient(lambda result: result.reactions.sum(), PULLED, {"law.bulk": -500.0})
 
 
-@pytest.mark.parametrize(("by", "refused"), [((0.01, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False)])
+def _turned(about_end: bool) -> np.ndarray:
+    """A turn of the nodes of x_max about their edge at z = 0, or about that at z = 0.1: along x (n, 3)."""
+    z = np.asarray(MESH.points)[np.asarray(MESH.node_sets["x_max"]), 2]
+    return np.stack([0.1 * (z - (z.max() if about_end else 0.0)), 0 * z, 0 * z], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("by", "refused"),
+    [((0.01, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False), (_turned(False), False), (_turned(True), True)],
+)
 def test_nodes_that_are_fixed_are_not_moved_before_a_run(by, refused):
     """A motion of 0 contradicts nothing; another one would win without a word."""
-    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    mesh = MESH
     moved = lj.Displaced(nodes=mesh.node_sets["x_max"], by=jnp.array(by))
     held = lj.Fixed(nodes=mesh.node_sets["z_min"])
     scene = lj.Scene(mesh=mesh, law=lj.laws.NeoHookean(mu=800.0, bulk=4000.0), fixed=(held,), displaced=(moved,))

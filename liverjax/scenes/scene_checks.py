@@ -137,23 +137,31 @@ def histories(scene: Scene) -> dict[str, object]:
     return {name: part for name, part in parts.items() if getattr(part, "history", None) is not None}
 
 
+#: Part of the largest motion that counts as none: roundoff of a turn.
+_NO_MOTION = 1e-12
+
+
 def _moved_where_fixed(scene: Scene) -> None:
     """Refuse a motion of nodes that are fixed along its axis; traced arrays and motions of 0 pass."""
     for k, motion in enumerate(scene.displaced):
         by = motion.history if motion.by is None else motion.by
-        if isinstance(by, jax.core.Tracer) or isinstance(motion.nodes, jax.core.Tracer):
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((by, motion.nodes))):
             continue
-        moved = np.any(np.asarray(by, float).reshape(-1, 3) != 0, axis=0)
+        numbers, vectors = np.asarray(motion.nodes).ravel(), np.asarray(by, float)
+        if motion.by is None or vectors.ndim == 1:  # one motion of all its nodes
+            vectors = np.broadcast_to(np.abs(vectors.reshape(-1, 3)).max(axis=0), (len(numbers), 3))
+        nothing = _NO_MOTION * float(np.abs(vectors).max(initial=0.0))
         for n, hold in enumerate(scene.fixed):
-            axes = [a for a in motion.axes if a in hold.axes and moved[AXES.index(a)]]
-            if not axes or isinstance(hold.nodes, jax.core.Tracer):
+            if isinstance(hold.nodes, jax.core.Tracer):
                 continue
-            both = np.intersect1d(np.asarray(motion.nodes), np.asarray(hold.nodes))
-            if len(both):
-                raise InputError(
-                    f"fixed.{n} and displaced.{k} both prescribe node {both[0]} along {axes[0]}: make their places "
-                    "differ"
-                )
+            shared = np.isin(numbers, np.asarray(hold.nodes))
+            for axis in (a for a in motion.axes if a in hold.axes):
+                wrong = numbers[shared & (np.abs(vectors[:, AXES.index(axis)]) > nothing)]
+                if len(wrong):
+                    raise InputError(
+                        f"fixed.{n} and displaced.{k} both prescribe node {wrong[0]} along {axis}: make their places "
+                        "differ"
+                    )
 
 
 def _plates_alone(scene: Scene) -> None:
