@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
+from fitting.readers.scattering_load import without_scatter
 from fitting.readers.tables.text_tables import EMPTY, decimal_sign, means_nothing, split_line, text_of, to_number
 from fitting.readers.units import TIME_TEST_UNITS
 from liverjax.core.errors import InputError
@@ -52,8 +53,6 @@ OWN_TIME = "step time"
 #: A load at the first row below this part of the largest load counts as rest: its effect on answers is as small.
 AT_REST = 0.01
 
-#: Scatter of the load that is too small to matter, as a part of the largest one.
-QUIET = 1e-3
 #: Lower bound of the scales: noise over this relative error; in a cyclic test this part of the largest answer.
 RELATIVE, CYCLIC = 0.03, 0.1
 
@@ -191,7 +190,7 @@ def of_columns(
     Raises:
         InputError: the driven quantity is zero, there are too few answers, or their sign is opposite.
     """
-    driven, told = _held_by_its_mean(time, driven, "strain" if kind == "relaxation" else "stress")
+    driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
@@ -214,87 +213,6 @@ def from_rest(
             "ramp = 0)"
         )
     return np.append(0.0, time), np.append(first, driven), np.append(0.0, answer), notes
-
-
-def _held_by_its_mean(time: np.ndarray, driven: np.ndarray, word: str) -> tuple[np.ndarray, list[str]]:
-    """A driven quantity; if it scatters while it is constant, its mean replaces it there. Then notes.
-
-    The model treats each reading as a real step, so it would treat the scatter of a sensor as motion.
-    """
-    size, noise = float(np.max(np.abs(driven))), noise_of_series(driven)
-    if not noise > QUIET * size:
-        return driven, []
-    level = np.median(driven[np.abs(driven) > size / 2])
-    near = np.abs(driven - level) <= 5 * noise
-    first, told = int(np.argmax(near)), f"the {word} scatters by {100 * noise / size:.2g} % of its largest value"
-    share = np.mean(near[first:])
-    if share < 0.5:  # cycles: differences of a few rows do not distinguish them from noise
-        return driven, []
-    # Scatter may bring a row of the ramp near before it ends.
-    first = next((int(k) for k in np.flatnonzero(near) if np.mean(near[k:]) >= 0.99), len(near))
-    if np.sum(near[first:]) < 0.9 * np.sum(near):
-        return driven, [f"{told}, and each reading counts as a step: moduli come out too small; smooth it first"]
-    rest = int(np.argmax(np.abs(driven - np.median(driven[:3])) > 5 * noise))
-    rest = rest if rest <= first else 0
-    rest_level = float(np.mean(driven[:rest])) if rest else 0.0
-    if first - rest >= _ROWS_OF_RAMP:
-        straight = _straight_ramp(time, driven, (rest, first, rest_level), noise)
-        if straight is not None:
-            begin, end, held = straight
-            return held, [
-                f"{told}: a straight ramp from {begin:.3g} to {end:.3g} s and then a constant are taken; what the "
-                "scatter leaves in these times is not in the standard errors"
-            ]
-        told = f"{told}, and each reading of its ramp counts as a step, which makes G0 too small: smooth the ramp first"
-    held = driven.copy()
-    held[first:] = np.mean(driven[first:])
-    held[:rest] = rest_level
-    return held, [f"{told}: from {time[first]:.3g} s on, where it is constant, its mean is taken"]
-
-
-#: Fewest rows of a ramp that a straight line replaces, and the largest misfit of such a line over the noise.
-_ROWS_OF_RAMP, _STRAIGHT = 4, 1.5
-#: Most rows of rest and of hold that such a line is fitted to.
-_OF_HOLD = 500
-
-
-def _straight_ramp(
-    time: np.ndarray, driven: np.ndarray, places: tuple[int, int, float], noise: float
-) -> tuple[float, float, np.ndarray] | None:
-    """Beginning and end [s] of a ramp, and rest, ramp and hold without scatter (n,); None if it is not straight.
-
-    `places`: first row of the load, first row of the hold, level at rest.
-    """
-    import scipy.optimize
-
-    rest, first, low = places
-    whole, late = time, np.linspace(first, len(time) - 1, min(_OF_HOLD, len(time) - first)).astype(int)
-    rows = np.concatenate([np.arange(max(rest - _OF_HOLD, 0), first), late])
-    time, driven, rest, first = time[rows], driven[rows], rest - int(rows[0]), first - int(rows[0])
-
-    def rise(at: np.ndarray, begin: float, end: float) -> np.ndarray:
-        return np.clip((at - begin) / float(np.maximum(end - begin, 1e-12)), 0.0, 1.0)
-
-    def size(begin: float, end: float, low: float) -> float:
-        line = rise(time, begin, end)
-        return float(line @ (driven - low)) / float(np.maximum(line @ line, 1e-300))
-
-    def line_from(begin: float, end: float, low: float) -> np.ndarray:
-        return low + rise(time, begin, end) * size(begin, end, low)
-
-    def misfit(x: np.ndarray) -> float:
-        return float(np.sum((line_from(x[0], x[1], low) - driven) ** 2))
-
-    ends = np.linspace(time[rest], time[min(first + max(3, (first - rest) // 4), len(time) - 1)], 400)
-    near = ends[int(np.argmin([np.sum((line_from(time[0], end, 0.0) - driven) ** 2) for end in ends]))]
-    free = scipy.optimize.minimize(misfit, [time[max(rest - 1, 0)], time[first]], method="Nelder-Mead").x
-    # From 0 at the first row on; or else from the level at rest, from a time that is fitted too.
-    for begin, end, level in ((time[0], near, 0.0), (free[0], free[1], low)):
-        line = line_from(begin, end, level)
-        off = (line - driven) / noise
-        if max(np.sqrt(np.mean(part**2)) for part in (off, off[rest : first + 1])) < _STRAIGHT:
-            return float(begin), float(end), level + rise(whole, begin, end) * size(begin, end, level)
-    return None
 
 
 def kind_of(path: str | os.PathLike) -> str:

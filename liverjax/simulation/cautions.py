@@ -212,7 +212,7 @@ ALTERNATING = 3.0
 
 
 def _of_pressures(scene: Scene, result: Result) -> list[str]:
-    """A sentence if the pressure overshoots beside places where it is given, or the lagged one goes up and down."""
+    """A sentence if the pressure overshoots beside drained places, or the lagged one goes up and down."""
     if scene.porosity is None or result.pressure is None:
         return []
     P = np.asarray(result.pressure)
@@ -239,8 +239,8 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     """A sentence if pressures P (T, V) are higher beside the drained places than further inside.
 
     The volume that leaves an element within a step belongs to all of its nodes, so that the coupling of neighbours
-    exceeds the flow between them where dt < h^2/(4 kappa M) (Vermeer and Verruijt 1981, for rows of elements). Elements
-    of a body need half as long again.
+    exceeds the flow between them where dt < h^2/(4 kappa M), in rows of elements; elements of a body need half as long
+    again. Such bounds are known since Vermeer and Verruijt 1981 (Int. J. Numer. Anal. Methods Geomech. 5, 1).
     """
     sponge, tets, V = scene.porosity, np.asarray(scene.mesh.tetrahedra), scene.mesh.number_of_vertices
     assert sponge is not None
