@@ -22,6 +22,7 @@ from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.porosity import Inlet
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes import scene_checks
+from liverjax.scenes.checks.numbers import check_bounds
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -105,14 +106,14 @@ def test_a_sound_scene_passes_and_traced_numbers_are_left_alone(monkeypatch):
 
 def test_one_of_many_numbers_is_named_by_its_place():
     density = np.full(MESH.number_of_nodes, 1060.0)
-    bounds.check(lj.Body(density=density))
+    bounds.check_fields(lj.Body(density=density))
     mu = np.full(1000, 770.0)
     mu[416] = 0.0
     with pytest.raises(lj.InputError, match=r"^law\.mu, number 417 of 1000, = 0 must be above 0 Pa"):
-        bounds.check(lj.laws.NeoHookean(mu=mu, bulk=2200.0), "law")
+        bounds.check_fields(lj.laws.NeoHookean(mu=mu, bulk=2200.0), "law")
     mu[416], mu[5] = 770.0, np.nan
     with pytest.raises(lj.InputError, match=r"^law\.mu, number 6 of 1000, = nan is not finite"):
-        bounds.check(lj.laws.NeoHookean(mu=jnp.asarray(mu), bulk=2200.0), "law")
+        bounds.check_fields(lj.laws.NeoHookean(mu=jnp.asarray(mu), bulk=2200.0), "law")
 
 
 @lj.struct
@@ -125,30 +126,30 @@ class Mine:
 
 
 def test_structs_of_a_users_own_are_read_alike():
-    bounds.check(Mine(notes="anything"), "mine")
+    bounds.check_fields(Mine(notes="anything"), "mine")
     for of, sentence in (
         (Mine(count=1), "mine.count = 1 must be a whole number above 1: give 2 or more"),
         (Mine(share=(0.5, 1.5)), "mine.share = [0.5, 1.5] must be at most 1: give e.g. 0.5"),
     ):
         with pytest.raises(lj.InputError, match=re.escape(sentence)):
-            bounds.check(of, "mine")
+            bounds.check_fields(of, "mine")
 
 
 def test_parts_of_a_scene_checked_alone_use_the_same_place():
     prony = lj.Prony(ratios=(0.5,), relaxation_times=(np.nan,))
     with pytest.raises(lj.InputError, match=r"viscosity\.relaxation_times = \[nan\] is not finite"):
-        viscosity.check(prony, SOUND.law)
+        viscosity.check_viscosity(prony, SOUND.law)
     with pytest.raises(lj.InputError, match=r"porosity\.bulk = 0 must be above 0 Pa"):
-        porosity.check(replace(SOUND.porosity, bulk=0))
+        porosity.check_porosity(replace(SOUND.porosity, bulk=0))
     with pytest.raises(lj.InputError, match="2 mu and 1 alpha"):
         lj.check_scene(replace(SOUND, region=(), law=lj.laws.Ogden(mu=(1.0, 2.0), alpha=(2.0,), bulk=10.0)))
 
 
 def test_bounds_are_cheap():
     """Asked at every call of `simulate`: so few calls of functions take less than a millisecond."""
-    scene_checks.check_bounds(SOUND)
+    check_bounds(SOUND)
     counted = cProfile.Profile()
-    counted.runcall(scene_checks.check_bounds, SOUND)
+    counted.runcall(check_bounds, SOUND)
     calls = pstats.Stats(counted).total_calls
     assert calls < 2500
 

@@ -63,7 +63,9 @@ def test_steps_far_from_the_relaxation_time(ratio, scheme):
 @pytest.mark.parametrize("times", [[0.0], [np.inf], [-1.0], [np.nan]])
 def test_relaxation_times_of_nothing_and_forever_are_refused(times):
     with pytest.raises(lj.InputError, match="relaxation_times"):
-        viscosity.check(lj.Prony(ratios=jnp.array([0.2]), relaxation_times=jnp.array(times)), laws.typical("yeoh"))
+        viscosity.check_viscosity(
+            lj.Prony(ratios=jnp.array([0.2]), relaxation_times=jnp.array(times)), laws.typical("yeoh")
+        )
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.physics.porosity import Inlet
-from liverjax.scenes.region_checks import check_porosity
+from liverjax.scenes.checks.regions import check_region_porosity
 from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
@@ -150,7 +150,7 @@ def test_a_porosity_that_no_region_can_have_gets_a_sentence(porosity, words):
 def test_scenes_without_porosity_refuse_it():
     region = lj.Region(elements=jnp.array([0]), porosity={"permeability": 1e-9})
     with pytest.raises(lj.InputError, match=r"needs a \[porosity\] in the scene"):
-        check_porosity(None, region, "region.0")
+        check_region_porosity(None, region, "region.0")
     several = lj.Region(elements=jnp.array([0]), porosity={"permeability": jnp.array([1e-9, 1e-9])})
     with pytest.raises(lj.InputError, match="has 2 numbers: give one"):
         lj.simulate(column(region=(several,)))

@@ -120,7 +120,7 @@ REFUSED = {
 def test_what_no_plate_can_use_is_refused(rig, sentence):
     with pytest.raises(lj.InputError, match=sentence):
         plate = _plate(rig, **REFUSED[sentence])
-        bounds.check(plate, "plate.0")
+        bounds.check_fields(plate, "plate.0")
         plate.check(rig.mesh, "plate.0")
 
 

@@ -135,7 +135,7 @@ def test_history_has_only_what_the_scheme_needs(table_2):
 def test_bad_viscosity_is_refused(changes, sentence, table_2):
     prony = replace(table_2, **changes)
     with pytest.raises(lj.InputError, match=sentence):
-        viscosity.check(prony, lj.laws.typical("saint_venant_kirchhoff"))
+        viscosity.check_viscosity(prony, lj.laws.typical("saint_venant_kirchhoff"))
 
 
 def test_a_series_that_cannot_be_is_refused_in_python_before_anything_is_compiled():

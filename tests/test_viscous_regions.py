@@ -7,7 +7,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.scenes.region_checks import check_viscosity
+from liverjax.scenes.checks.regions import check_region_viscosity
 from liverjax.scenes.scene_file import scene_from
 from liverjax.waves.harmonic import element_operator
 
@@ -155,7 +155,7 @@ def test_a_viscosity_that_no_region_can_have_gets_a_sentence(viscosity, words):
 def test_scenes_without_viscosity_and_reduced_models_refuse_it():
     region = lj.Region(elements=jnp.array([0]), viscosity=LESION)
     with pytest.raises(lj.InputError, match=r"needs a \[viscosity\] in the scene"):
-        check_viscosity(None, region, "region.0")
+        check_region_viscosity(None, region, "region.0")
     short = lj.Region(elements=jnp.array([0]), viscosity={"ratios": jnp.array([0.2])})
     with pytest.raises(lj.InputError, match="1 numbers and the scene 2 modes"):  # from Python, before any compile
         lj.simulate(block(region=(short,)))

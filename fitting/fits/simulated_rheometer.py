@@ -182,11 +182,11 @@ def through_torsion(
         optimizer: one of `OPTIMIZERS`.
         progress: called after every evaluation.
     """
-    from liverjax.physics.viscosity import check
+    from liverjax.physics.viscosity import check_viscosity
 
     data = simulation_data(sweep, simulation)
     rig, law, *_, scales = data
-    check(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
+    check_viscosity(Prony(ratios=(0.1,), relaxation_times=(1.0,), scheme=simulation.scheme, part=simulation.part), law)
     u0, kind = jnp.asarray(start.solution.u), start.kind
     if optimizer == OPTIMIZERS[0]:
         begin = time.perf_counter()

@@ -20,7 +20,7 @@ _FEW = 8
 _LARGEST = 2**31 - 1
 
 
-def check(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
+def check_fields(thing: Any, name: str = "", leave: tuple[str, ...] = ()) -> None:
     """Refuse a struct with a value that is out of bounds, not finite or not a number; host side, compiles nothing.
 
     Args:

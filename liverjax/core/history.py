@@ -73,7 +73,7 @@ def _file(path: Path, name: str, forms: tuple[int, ...]) -> np.ndarray:
     return np.stack([data[column] for column in found], axis=1)
 
 
-def check(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
+def check_times(times: Any, history: Any, name: str, forms: tuple[int, ...] = (1, 3)) -> None:
     """Refuse a history made in Python that cannot be used; traced numbers pass.
 
     Raises:

@@ -52,7 +52,7 @@ def param(
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
         about: one line for ``python -m liverjax laws``.
         lower, upper: inclusive bounds; ``above``: strict lower bound.
-        nonzero: 0 is refused. `liverjax.core.bounds.check` reads all of these.
+        nonzero: 0 is refused. `liverjax.core.bounds.check_fields` reads all of these.
         each: a sequence with one number per term (or the components of a direction).
         unnamed: the field contains structs, and the dotted names of scene files leave out the field itself. A text
             names a method that returns the places in this field for a word: `support.0` is the first of

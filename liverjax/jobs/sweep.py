@@ -26,15 +26,12 @@ from liverjax.core.files import whole
 from liverjax.core.versions import versions
 from liverjax.jobs import resumable_parts
 from liverjax.mesh.files import meshio_cells
+from liverjax.scenes.checks.choices import check_choices
+from liverjax.scenes.checks.conflicts import check_motion_in_planes
+from liverjax.scenes.checks.numbers import check_numbers
+from liverjax.scenes.checks.rigid_motion import check_hold, holding
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
-from liverjax.scenes.scene_checks import (
-    check_choices,
-    check_hold,
-    check_motion_in_planes,
-    check_numbers,
-    check_physics,
-    holding,
-)
+from liverjax.scenes.scene_checks import check_physics
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation.batch import simulate_batch
 

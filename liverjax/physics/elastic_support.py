@@ -68,7 +68,7 @@ class ElasticSupport(Physics):
 
     def check(self, mesh: TetMesh, name: str) -> None:
         """Refuse wrong node numbers, a missing place, and a history that does not fit its times."""
-        history.check(self.times, self.history, name)
+        history.check_times(self.times, self.history, name)
         if (self.triangles is None) == (self.nodes is None):
             raise InputError(f"{name} needs either triangles or nodes: give one of them")
         if self.nodes is not None:

@@ -106,7 +106,7 @@ class Fluid(NamedTuple):
     J_before: jax.Array | None  # of the step before; the lagged scheme
 
 
-def check(porosity: Porosity) -> None:
+def check_porosity(porosity: Porosity) -> None:
     """Refuse values that no step can use; host side.
 
     Raises:
@@ -115,7 +115,7 @@ def check(porosity: Porosity) -> None:
     check_sponge(porosity)
     for k, inlet in enumerate(porosity.inlet):
         name = f"porosity.inlet.{k}"
-        history.check(inlet.times, inlet.history, name, (1,))
+        history.check_times(inlet.times, inlet.history, name, (1,))
         if (inlet.pressure is None) == (inlet.flux is None):
             raise InputError(f"{name} needs either pressure in Pa or flux in m/s: give one of them")
         if (inlet.nodes is None) != (inlet.pressure is None) or (inlet.triangles is None) != (inlet.flux is None):
@@ -128,7 +128,7 @@ def check_sponge(porosity: Porosity) -> None:
     Raises:
         InputError: values out of bounds, K_lim not above K0.
     """
-    bounds.check(porosity, "porosity")
+    bounds.check_fields(porosity, "porosity")
     check_limit(porosity)
 
 

@@ -75,7 +75,7 @@ class Recall(NamedTuple):
     now: jax.Array  # 1 - sum_k a_k, () or with the axes of the points
 
 
-def check(prony: Prony, law: Law) -> None:
+def check_viscosity(prony: Prony, law: Law) -> None:
     """Refuse a viscosity that no step can use; host side.
 
     Raises:
@@ -105,7 +105,7 @@ def check_series(prony: Prony) -> None:
     Raises:
         InputError: lengths that differ, values out of bounds, ratios adding up to 1 or more.
     """
-    bounds.check(prony, "viscosity")
+    bounds.check_fields(prony, "viscosity")
     both = (prony.ratios, prony.relaxation_times)
     for key, values in zip(("ratios", "relaxation_times"), both, strict=True):
         if not isinstance(values, (tuple, list)) and not np.ndim(values):

@@ -91,6 +91,22 @@ class Scene:
         return [k for k, physics in enumerate(self.physics) if physics.section == section]
 
 
+def named_physics(scene: Scene) -> list[tuple[str, Physics]]:
+    """Every further physics with the name that scene files give it: support.0."""
+    places = {k: f"{p.section}.{n}" for p in scene.physics for n, k in enumerate(scene.named(p.section))}
+    return [(places[k], physics) for k, physics in enumerate(scene.physics)]
+
+
+def histories(scene: Scene) -> dict[str, object]:
+    """Every load, motion, inlet and further physics that has a history, by its name."""
+    inlets = () if scene.porosity is None else scene.porosity.inlet
+    parts: dict[str, object] = {"body": scene.body}
+    for key, several in (("displaced", scene.displaced), ("traction", scene.traction), ("porosity.inlet", inlets)):
+        parts |= {f"{key}.{k}": part for k, part in enumerate(several)}
+    parts |= dict(named_physics(scene))
+    return {name: part for name, part in parts.items() if getattr(part, "history", None) is not None}
+
+
 def with_parameters(scene: Scene, values: Mapping[str, Any]) -> Scene:
     """The scene with numbers changed; values may be traced.
 

@@ -29,10 +29,11 @@ from liverjax.physics.prescribed import check_axes
 from liverjax.physics.registry import NAMED
 from liverjax.physics.viscosity import Prony
 from liverjax.scenes import regions
+from liverjax.scenes.checks.choices import CHOICES
 from liverjax.scenes.idle_settings import refuse_idle
 from liverjax.scenes.regions import Region
 from liverjax.scenes.scene import Body, Scene, Solve
-from liverjax.scenes.scene_checks import CHOICES, check_scene
+from liverjax.scenes.scene_checks import check_scene
 from liverjax.scenes.springpots import SpringpotSeries
 
 #: Keys of a cylinder: the required ones, then the optional ones.

@@ -42,7 +42,7 @@ def check_springpots(own: SpringpotSeries, law: Law, viscosity: Prony | None) ->
     """
     if viscosity is not None:
         raise InputError("the scene has [viscosity] and [springpots]: leave one of them out")
-    bounds.check(own, "springpots")
+    bounds.check_fields(own, "springpots")
     shapes = {np.shape(a) for a in (own.times, own.exponents, own.limits) if a is not None}
     if len(shapes) != 1 or len(np.shape(own.times)) != 1:
         raise InputError("springpots times, exponents and limits differ in length: give one each per springpot")

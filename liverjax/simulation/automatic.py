@@ -10,8 +10,8 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
+from liverjax.scenes.checks.choices import check_choices
 from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import check_choices
 
 LARGEST, STIFFEST, THINNEST = 10_000, 1e3, 1e-3
 

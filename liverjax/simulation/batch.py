@@ -13,8 +13,9 @@ from jax.sharding import Mesh, PartitionSpec
 
 from liverjax.core.errors import InputError
 from liverjax.core.struct import param, static, struct
+from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.scene import Scene, with_parameters
-from liverjax.scenes.scene_checks import check_before_run, check_bounds
+from liverjax.scenes.scene_checks import check_before_run
 from liverjax.simulation.run import Result, simulate, unloaded
 
 STRATEGIES = ("map", "vmap")

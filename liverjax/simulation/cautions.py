@@ -14,8 +14,7 @@ from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes import regions
-from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import histories, named_physics
+from liverjax.scenes.scene import Scene, histories, named_physics
 from liverjax.simulation.automatic import qualities
 from liverjax.simulation.run import Result
 

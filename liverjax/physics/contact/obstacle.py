@@ -111,7 +111,7 @@ class Obstacle(Physics):
             raise InputError(f"{name} half_angle = {self.half_angle} must be below 90 degrees: a plane has 90")
         if abs(np.linalg.norm(np.asarray(self.axis, float)) - 1) > 1e-6:
             raise InputError(f"{name} axis = {self.axis} must be of length 1: divide it by its length")
-        history.check(self.times, self.history, name)
+        history.check_times(self.times, self.history, name)
         if self.history is not None and np.ndim(self.history) == 2 and self.by is not None:
             raise InputError(f"{name} has by and a history of displacements: leave one of them out")
         if self.history is not None and np.ndim(self.history) == 1 and getattr(self, self.driven) is None:

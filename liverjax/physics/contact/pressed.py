@@ -56,7 +56,7 @@ class PressedObstacle(Obstacle):
     def check(self, mesh: TetMesh, name: str) -> None:
         """Refuse what `Obstacle` refuses, a missing force, a prescribed motion, and a history of displacements."""
         super().check(mesh, name)
-        history.check(self.times, self.history, name, (1,))
+        history.check_times(self.times, self.history, name, (1,))
         if self.history is not None and np.any(np.asarray(self.history) < 0):
             least = float(np.min(np.asarray(self.history)))
             raise InputError(f"{name} history has the factor {least:g}: a force presses, give factors of 0 or above")

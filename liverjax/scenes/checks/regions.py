@@ -24,8 +24,8 @@ def check_region_numbers(scene: Scene) -> None:
     """
     for k, region in enumerate(scene.region):
         _check_law(scene.law, region, f"region.{k}")
-        check_viscosity(scene.viscosity, region, f"region.{k}")
-        check_porosity(scene.porosity, region, f"region.{k}")
+        check_region_viscosity(scene.viscosity, region, f"region.{k}")
+        check_region_porosity(scene.porosity, region, f"region.{k}")
 
 
 def check_region_elements(scene: Scene) -> None:
@@ -51,7 +51,7 @@ def _check_law(law: Law, region: Region, name: str) -> None:
         laws.check_value(f"{name}: law.{number}", metadata, value)
 
 
-def check_viscosity(prony: Prony | None, region: Region, name: str) -> None:
+def check_region_viscosity(prony: Prony | None, region: Region, name: str) -> None:
     """Refuse viscous numbers of a region that no step can use; traced ones pass.
 
     Raises:
@@ -81,7 +81,7 @@ def check_viscosity(prony: Prony | None, region: Region, name: str) -> None:
         raise InputError(f"{name}: {error}") from None
 
 
-def check_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
+def check_region_porosity(porosity: Porosity | None, region: Region, name: str) -> None:
     """Refuse porous numbers of a region that no step can use; traced ones pass.
 
     Raises:

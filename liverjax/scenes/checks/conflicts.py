@@ -1,0 +1,110 @@
+"""Do two parts of the scene prescribe the motion of one node?"""
+
+import jax
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.selection import AXES
+from liverjax.physics.prescribed import free_places
+from liverjax.physics.sliding_support import SlidingSupport
+from liverjax.scenes.scene import Scene, named_physics
+
+#: Part of the largest motion that counts as none: roundoff of a turn.
+_NO_MOTION = 1e-12
+
+
+def check_moved_where_fixed(scene: Scene) -> None:
+    """Refuse a motion of nodes that are fixed along its axis; traced arrays and motions of 0 pass."""
+    for k, motion in enumerate(scene.displaced):
+        by = motion.history if motion.by is None else motion.by
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((by, motion.nodes))):
+            continue
+        numbers, vectors = np.asarray(motion.nodes).ravel(), np.asarray(by, float)
+        if motion.by is None or vectors.ndim == 1:  # one motion of all its nodes
+            vectors = np.broadcast_to(np.abs(vectors.reshape(-1, 3)).max(axis=0), (len(numbers), 3))
+        nothing = _NO_MOTION * float(np.abs(vectors).max(initial=0.0))
+        for n, hold in enumerate(scene.fixed):
+            if isinstance(hold.nodes, jax.core.Tracer):
+                continue
+            shared = np.isin(numbers, np.asarray(hold.nodes))
+            for axis in (a for a in motion.axes if a in hold.axes):
+                wrong = numbers[shared & (np.abs(vectors[:, AXES.index(axis)]) > nothing)]
+                if len(wrong):
+                    raise InputError(
+                        f"fixed.{n} and displaced.{k} both prescribe node {wrong[0]} along {axis}: make their places "
+                        "differ"
+                    )
+
+
+def check_plates_alone(scene: Scene) -> None:
+    """Refuse a plate's node that something else holds or moves, which would have no effect; traced arrays pass."""
+    named = [(f"{kind}.{k}", part) for kind in ("fixed", "displaced") for k, part in enumerate(getattr(scene, kind))]
+    every = named_physics(scene)
+    plates = [(name, physics) for name, physics in every if physics.ties]
+    named += [(name, physics) for name, physics in every if isinstance(physics, SlidingSupport)]
+    for k, (name, plate) in enumerate(plates):
+        for other, part in named + plates[:k]:
+            nodes = [getattr(own, "nodes", None) for own in (plate, part)]
+            if any(own is None or isinstance(own, jax.core.Tracer) for own in nodes):
+                continue
+            both = np.intersect1d(np.asarray(nodes[0]), np.asarray(nodes[1]))
+            if len(both):
+                raise InputError(
+                    f"{name} and {other} share node {both[0]}, whose motion the plate alone decides: make their places "
+                    "differ"
+                )
+
+
+def check_normals(scene: Scene) -> None:
+    """Refuse a node in two oblique planes, or held along some but not all axes of its plane's normal."""
+    taken: dict[int, str] = {}
+    mask = free_places(scene.mesh, scene.fixed, scene.displaced)
+    for physics in scene.physics:
+        if isinstance(physics, SlidingSupport) and physics.axis:
+            mask[np.asarray(physics.nodes), AXES.index(physics.axis)] = False
+    for name, physics in named_physics(scene):
+        if not isinstance(physics, SlidingSupport) or physics.axis:
+            continue
+        across = np.abs(np.asarray(physics.normal)) > 1e-12
+        for node in np.asarray(physics.nodes).tolist():
+            other = taken.setdefault(node, name)
+            if other != name or 0 < mask[node, across].sum() < across.sum():
+                held = f"{other} and {name} both hold" if other != name else f"{name} and a held axis both hold"
+                raise InputError(f"{held} node {node}, in directions that are not at right angles: make places differ")
+
+
+def check_prescribed_once(scene: Scene) -> None:
+    """Refuse a motion of a node along an axis along which it is fixed, or moved by another motion; host side."""
+    taken: dict[tuple[int, str], str] = {}
+    for kind in ("fixed", "displaced"):
+        for k, condition in enumerate(getattr(scene, kind)):
+            for axis in condition.axes:
+                for node in np.asarray(condition.nodes).tolist():
+                    other = taken.setdefault((node, axis), f"{kind}.{k}")
+                    if other != f"{kind}.{k}" and "displaced" in (kind, other.partition(".")[0]):
+                        raise InputError(
+                            f"{other} and {kind}.{k} both prescribe node {node} along {axis}: make their places differ"
+                        )
+
+
+def check_motion_in_planes(scene: Scene) -> None:
+    """Refuse a prescribed motion that leads nodes off the plane in which they slide; host side.
+
+    Raises:
+        InputError: one sentence that begins with the name of the motion.
+    """
+    for name, physics in named_physics(scene):
+        if not isinstance(physics, SlidingSupport):
+            continue
+        nodes, normals = physics.holds(scene.mesh)
+        for k, motion in enumerate(scene.displaced):
+            both = np.isin(np.asarray(motion.nodes), nodes)
+            vectors = np.array(motion.history if motion.by is None else motion.by, float)
+            vectors[..., [a for a in range(3) if AXES[a] not in motion.axes]] = 0.0
+            own = vectors[both] if motion.by is not None and vectors.ndim == 2 else vectors
+            if both.any() and np.any(np.abs(own @ normals[0]) > 1e-9 * np.abs(vectors).max()):
+                node = np.asarray(motion.nodes)[both][0]
+                raise InputError(
+                    f"displaced.{k} moves node {node} off the plane of {name}: make their places differ, or leave that "
+                    "direction out of axes"
+                )

@@ -1,0 +1,68 @@
+"""Is every load, weight, motion and support given once, in its shape? Numbers do not matter here."""
+
+from typing import Any
+
+import numpy as np
+
+from liverjax.core import history
+from liverjax.core.errors import InputError
+from liverjax.physics.loads import Traction
+from liverjax.physics.prescribed import Displaced, check_axes
+from liverjax.scenes.scene import Body, Scene
+
+#: Allowed values of [body] mass.
+MASSES = ("lumped", "consistent")
+
+
+def check_loads(scene: Scene) -> None:
+    """Refuse loads and motions that are given twice, not at all or in a wrong shape, and unknown axes.
+
+    Raises:
+        InputError: one sentence that begins with the name of the load, motion or support.
+    """
+    for k, load in enumerate(scene.traction):
+        _check_traction(load, f"traction.{k}")
+    if scene.body is not None:
+        _check_body(scene.body, scene.mesh.number_of_nodes)
+    for k, hold in enumerate(scene.fixed):
+        check_axes(hold.axes, f"fixed.{k}")
+    for k, motion in enumerate(scene.displaced):
+        _check_motion(motion, f"displaced.{k}")
+
+
+def _check_traction(load: Traction, name: str) -> None:
+    history.check_times(load.times, load.history, name)
+    if np.ndim(load.history) == 2:
+        if load.value is not None or load.pressure is not None:
+            raise InputError(f"{name} has a value and a history of values: leave one of them out")
+        return
+    if (load.value is None) == (load.pressure is None):
+        raise InputError(f"{name} needs either value (3,) or pressure, in Pa: give one of them")
+    key, shape = ("pressure", ()) if load.value is None else ("value", (3,))
+    if np.shape(getattr(load, key)) != shape:
+        raise InputError(f"{name} {key} has shape {np.shape(getattr(load, key))}: give shape {shape}")
+
+
+def _check_motion(motion: Displaced, name: str) -> None:
+    history.check_times(motion.times, motion.history, name, (3,) if motion.by is None else (1,))
+    check_axes(motion.axes, name)
+    # NumPy cannot tell the shape of a tuple of traced numbers.
+    by: Any = motion.by
+    shape = (3,) if isinstance(by, tuple | list) and len(by) == 3 and np.ndim(by[0]) == 0 else np.shape(by)
+    if by is not None and shape not in ((3,), (*np.shape(motion.nodes), 3)):
+        raise InputError(f"{name} by has shape {shape}: give three numbers in m, or three a node")
+    if motion.by is None and motion.history is None:
+        raise InputError(f"{name} needs either by (3,) or times and history: give one of them")
+
+
+def _check_body(body: Body, nodes: int) -> None:
+    if body.mass not in MASSES:
+        raise InputError(f"[body] mass = {body.mass!r} is not known: use {' or '.join(MASSES)}")
+    # NumPy cannot tell the shape of a tuple of traced numbers.
+    gravity = (len(body.gravity),) if isinstance(body.gravity, tuple) else np.shape(body.gravity)
+    density = np.shape(body.density)
+    if density not in ((), (nodes,)):
+        raise InputError(f"body density has shape {density}: give one number or one per node ({nodes},), in kg/m^3")
+    history.check_times(body.times, body.history, "body")
+    if gravity != (3,):
+        raise InputError(f"body gravity has shape {gravity}: give three numbers in m/s^2")

@@ -1,0 +1,41 @@
+"""Are the numbers of the scene within their bounds, alone and together? The mesh has checks of its own."""
+
+from liverjax.core import bounds
+from liverjax.physics import porosity, viscosity
+from liverjax.scenes.checks.regions import check_region_numbers
+from liverjax.scenes.regions import laws_of
+from liverjax.scenes.scene import Scene, named_physics
+from liverjax.scenes.springpots import check_springpots
+
+
+def check_bounds(scene: Scene) -> None:
+    """Refuse numbers out of bounds. Traced ones pass; `check_mesh` checks the mesh. Compiles nothing.
+
+    Raises:
+        InputError: one sentence with the number's dotted name, value, bound and remedy.
+    """
+    bounds.check_fields(scene, leave=("mesh", "physics"))
+    for name, physics in named_physics(scene):
+        bounds.check_fields(physics, name)
+    if scene.viscosity is not None:
+        viscosity.check_series(scene.viscosity)
+    if scene.porosity is not None:
+        porosity.check_limit(scene.porosity)
+    check_region_numbers(scene)
+
+
+def check_numbers(scene: Scene) -> None:
+    """Refuse numbers that cannot be used, alone or together. The mesh is not checked; host side.
+
+    Raises:
+        InputError: numbers out of bounds, or that contradict each other in law, viscosity or porosity.
+    """
+    check_bounds(scene)
+    for law in laws_of(scene.law, scene.region):
+        law.check()
+        if scene.viscosity is not None:
+            viscosity.check_viscosity(scene.viscosity, law)
+        if scene.springpots is not None:
+            check_springpots(scene.springpots, law, scene.viscosity)
+    if scene.porosity is not None:
+        porosity.check_porosity(scene.porosity)

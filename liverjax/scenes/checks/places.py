@@ -1,0 +1,77 @@
+"""Are the nodes and triangles of every part in the mesh, and can something act there?"""
+
+import jax
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.mesh.selection import check_nodes, check_triangles
+from liverjax.mesh.tetrahedra import TetMesh
+from liverjax.physics.porosity import Porosity
+from liverjax.scenes.scene import Scene
+
+
+def check_known_nodes(scene: Scene) -> None:
+    """Refuse node numbers that are not in the mesh, and inverted elements; traced arrays pass."""
+    mesh = scene.mesh
+    named: dict[str, object] = {f"fixed.{k}.nodes": hold.nodes for k, hold in enumerate(scene.fixed)}
+    named |= {f"displaced.{k}.nodes": motion.nodes for k, motion in enumerate(scene.displaced)}
+    named |= {f"traction.{k}.triangles": load.triangles for k, load in enumerate(scene.traction)}
+    if scene.porosity is not None:
+        named["porosity.drained"] = scene.porosity.drained
+        named |= {f"porosity.inlet.{k}.nodes": inlet.nodes for k, inlet in enumerate(scene.porosity.inlet)}
+    for name, nodes in named.items():
+        if nodes is not None and not isinstance(nodes, jax.core.Tracer):
+            numbers = np.asarray(nodes)
+            check_nodes(numbers.ravel() if name.endswith("triangles") else numbers, mesh.number_of_nodes, name, least=0)
+    if not isinstance(mesh.volumes, jax.core.Tracer):
+        wrong = int(np.sum(~(np.asarray(mesh.volumes) > 0)))
+        if wrong:
+            raise InputError(f"mesh has {wrong} elements that are inside out or without volume: correct their vertices")
+
+
+def check_places(scene: Scene) -> None:
+    """Refuse node numbers and triangles that are not in the mesh."""
+    mesh = scene.mesh
+    for kind in ("fixed", "displaced"):
+        for k, condition in enumerate(getattr(scene, kind)):
+            check_nodes(condition.nodes, mesh.number_of_nodes, f"{kind}.{k}.nodes", least=0)
+    for k, load in enumerate(scene.traction):
+        check_triangles(mesh, load.triangles, f"traction.{k}.triangles")
+    if scene.porosity is None:
+        return
+    if scene.porosity.drained is not None:
+        check_nodes(scene.porosity.drained, mesh.number_of_nodes, "porosity.drained")
+        _has_vertices(mesh, scene.porosity.drained, "porosity.drained")
+    for k, inlet in enumerate(scene.porosity.inlet):
+        if inlet.nodes is not None:
+            check_nodes(inlet.nodes, mesh.number_of_nodes, f"porosity.inlet.{k}.nodes")
+            _has_vertices(mesh, inlet.nodes, f"porosity.inlet.{k}")
+        else:
+            check_triangles(mesh, inlet.triangles, f"porosity.inlet.{k}.triangles")
+    _inlets_that_act(scene.porosity)
+
+
+def _has_vertices(mesh: TetMesh, nodes: object, name: str) -> None:
+    """Refuse a place of the fluid that holds only middles of edges: pressures belong to vertices."""
+    if not np.any(np.asarray(nodes, int) < mesh.number_of_vertices):
+        raise InputError(f"{name} meets only middles of edges, which have no pressure: make its place hold vertices")
+
+
+def _inlets_that_act(sponge: Porosity) -> None:
+    """Refuse inlets within a place whose pressure is given already; places may share an edge."""
+    given = [] if sponge.drained is None else [set(np.asarray(sponge.drained).tolist())]
+    pressures = [(k, inlet) for k, inlet in enumerate(sponge.inlet) if inlet.nodes is not None]
+    for k, inlet in pressures:
+        own = set(np.asarray(inlet.nodes).tolist())
+        if any(own <= place for place in given):
+            raise InputError(
+                f"porosity.inlet.{k} gives a pressure where it is drained or given already: make their places differ"
+            )
+        given.append(own)
+    for k, inlet in enumerate(sponge.inlet):
+        corners = set() if inlet.triangles is None else set(np.ravel(inlet.triangles).tolist())
+        if inlet.nodes is None and any(corners <= place for place in given):
+            raise InputError(
+                f"porosity.inlet.{k} is a flux through a surface whose pressures are given or drained, where nothing "
+                "enters: make their places differ"
+            )

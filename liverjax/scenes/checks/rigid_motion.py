@@ -1,0 +1,56 @@
+"""Is every piece of the body held against rigid motions?"""
+
+from collections.abc import Container
+
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.physics.prescribed import free_places
+from liverjax.scenes.scene import Scene, named_physics
+
+
+def holding(scene: Scene, only: Container[str] | None = None) -> dict[str, int]:
+    """Name of each further physics (as in `check_physics`) -> number of nodal directions that it holds at first."""
+    named = [(name, physics) for name, physics in named_physics(scene) if only is None or name in only]
+    return {name: len(physics.holds(scene.mesh)[0]) for name, physics in named}
+
+
+def check_hold(scene: Scene, before: dict[str, int]) -> None:
+    """Refuse numbers with which physics hold less than `before` (see `holding`), if a static body is then loose.
+
+    Raises:
+        InputError: nothing holds a connected piece any more.
+    """
+    still = scene.solve.kind == "static" or scene.points_are == "loaded"
+    if still and any(number < before[name] for name, number in holding(scene, before).items()):
+        check_held(scene)
+
+
+def check_held(scene: Scene) -> None:
+    """Refuse a connected piece that nothing holds: a static solution does not exist then."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    each, n = [np.asarray(a) for a in scene.mesh.element_nodes], scene.mesh.number_of_nodes
+    rows, columns = np.tile(each[0], len(each)), np.concatenate(each)
+    pieces, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
+    fixed = np.argwhere(~free_places(scene.mesh, scene.fixed, scene.displaced))
+    both = [(fixed[:, 0], np.eye(3)[fixed[:, 1]]), *(physics.holds(scene.mesh) for physics in scene.physics)]
+    numbers, directions = (np.concatenate(a) for a in zip(*both, strict=True))
+    for piece in range(pieces):
+        nodes = np.flatnonzero(label == piece)
+        inside = np.isin(numbers, nodes)
+        points = np.asarray(scene.mesh.points)
+        held = points[numbers[inside]] - points[nodes].mean(axis=0)
+        if _rigid_rank(held, directions[inside], np.ptp(points[nodes], axis=0).max()) < 6:
+            which = f"piece {piece} ({len(nodes)} nodes)" if pieces > 1 else "the body"
+            raise InputError(f"nothing holds {which} against every rigid motion: add [[fixed]] or kind = 'dynamic'")
+
+
+def _rigid_rank(points: np.ndarray, directions: np.ndarray, size: float) -> int:
+    """Rank of the six rigid motions as seen along held directions (n, 3) at points (n, 3) of a body of that size."""
+    if not len(points):
+        return 0
+    # A turn about e moves x by e x x, of which the part along d is (x x d) . e.
+    motions = np.concatenate([directions, np.cross(points / max(size, 1e-300), directions)], axis=1)
+    return int(np.linalg.matrix_rank(motions, tol=1e-6))
