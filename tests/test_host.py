@@ -10,7 +10,7 @@ from conftest import COMPILED, ROOT
 
 from fitting.__main__ import main
 from fitting.fits import time_tests
-from fitting.methods import generalised_maxwell, host, time_response, uncertainty
+from fitting.methods import generalised_maxwell, host, springpots, time_response, uncertainty
 from fitting.methods.least_squares import from_starts, levenberg_marquardt, with_jacobian
 from fitting.readers.rheometer import read_sweep
 
@@ -44,10 +44,30 @@ def test_the_fit_on_the_host_is_the_compiled_one():
     assert np.allclose(found.u, each.u[best], rtol=1e-7)
 
 
-def test_the_closed_form_compiles_nothing(tmp_path):
+@pytest.mark.parametrize("case", springpots.FRACTIONAL, ids=lambda case: case.name)
+def test_springpots_have_the_derivatives_of_jax(case):
+    """Moduli, residuals and reported numbers, by complex steps and forward mode, to roundoff; exponents near 0 too."""
+    rng, reference = np.random.default_rng(0), 3.0
+    omega, u = np.logspace(-3, 4, 9), rng.normal(0, 2, (3, len(case.free)))
+    u[0] = np.where(np.isin(case.free, (1, 3, 5)), -8.0, u[0])
+    data = (omega / reference, np.full(9, 300.0), np.full(9, 60.0), np.linspace(20, 90, 18))
+    functions = (
+        lambda v: springpots.springpot_residuals(springpots.full(case, v), case.switches, *data),
+        lambda v: case.values(springpots.full(case, v), reference),
+    )
+    for function in functions:
+        values, slope = host.with_jacobian(function, u)
+        for k in range(3):
+            expected, J = function(jnp.asarray(u[k])), jax.jacfwd(function)(jnp.asarray(u[k]))
+            assert np.allclose(values[k], expected, rtol=1e-12, atol=1e-13)
+            assert np.allclose(slope[k], J, rtol=1e-11, atol=1e-13 * np.abs(J).max())
+
+
+@pytest.mark.parametrize("model", ["prony", "auto"])
+def test_the_closed_form_compiles_nothing(tmp_path, model):
     """Compiling would take longer than all the rest; results and picture included."""
     file, before = ROOT / "data" / "porcine_liver_frequency_sweep.csv", len(COMPILED)
-    assert main([str(file), "--method", "closed-form", "--out", str(tmp_path)]) == 0
+    assert main([str(file), "--method", "closed-form", "--model", model, "--out", str(tmp_path)]) == 0
     assert len(COMPILED) == before
     jax.jit(lambda x: x + 1)(1.0)
     assert len(COMPILED) > before  # it does count

@@ -284,8 +284,9 @@ def by_the_program(truth: Truth) -> dict:
 def beyond(fit: Fit, omega: np.ndarray) -> np.ndarray:
     """G* (n,) [Pa] of a fit at frequencies outside its band, by its own model."""
     if fit.kind.moduli is not None:
-        return np.asarray(fit.kind.moduli(fit.solution.u, omega))
-    storage, loss = generalised_maxwell.moduli(fit.model, omega)
+        storage, loss = fit.kind.moduli(fit.solution.u, omega)
+    else:
+        storage, loss = generalised_maxwell.moduli(fit.model, omega)
     return storage + 1j * loss
 
 

@@ -9,7 +9,6 @@ prior around 0 with the standard deviation that the user gives.
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import simulated_rheometer, viscoelastic
@@ -255,10 +254,11 @@ def _kind_at_rest(kind: Kind, factors: compression.Shares) -> Kind:
     solid = kind.names[0] == "equilibrium_modulus"
 
     def at_rest(u, omega):
-        stands = shown(u)[0] if solid else 0.0
-        return (moduli(u, omega) - stands) / factors.relaxing + stands / factors.equilibrium
+        stands = shown(u)[..., :1] if solid else 0.0
+        storage, loss = moduli(u, omega)
+        return (storage - stands) / factors.relaxing + stands / factors.equilibrium, loss / factors.relaxing
 
-    return kind._replace(values=lambda u: jnp.asarray(each) * shown(u), moduli=at_rest)
+    return kind._replace(values=lambda u: np.asarray(each) * shown(u), moduli=at_rest)
 
 
 def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, object]]:
@@ -266,7 +266,7 @@ def _of_own_moduli(kind: Kind, fit: Fit, sweep: Sweep) -> tuple[Kind, dict[str, 
     own, omega = kind.moduli, sweep.angular_frequency
     assert own is not None
     solid = kind.names[0] == "equilibrium_modulus"
-    made = as_prony_modes.convert(lambda w: np.asarray(own(fit.solution.u, w)), omega[0], omega[-1], solid)
+    made = as_prony_modes.convert(lambda w: own(fit.solution.u, w), omega[0], omega[-1], solid)
     told = {"modes": len(made.times), "largest_relative_error": made.error}
     kind = kind._replace(maxwell=lambda u: as_prony_modes.modes(made, own(u, made.omega)))
     return kind, fit.details | {"conversion": told}

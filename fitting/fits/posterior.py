@@ -205,7 +205,7 @@ class Springpots(NamedTuple):
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
         """The model's own numbers (n, K) of u (n, P)."""
-        return np.asarray(jax.jit(jax.vmap(self.values))(u))
+        return self.values(u)
 
 
 class WithInstrument(NamedTuple):
@@ -287,12 +287,10 @@ def of_sweep(fit: Fit, sweep: Sweep, count: int, seed: int = 0) -> Posterior:
     (model,) = (m for m in FRACTIONAL if m.name == fit.kind.name)
     x = data[0] / springpots.reference_frequency(sweep)
 
-    @jax.jit
-    @jax.vmap
     def residuals(u):
         return springpots.springpot_residuals(springpots.full(model, u), model.switches, x, *data[1:])
 
-    own = _sweep_target(fit.kind, sweep, lambda u: np.asarray(residuals(u)))
+    own = _sweep_target(fit.kind, sweep, residuals)
     return _with_gap(sample(own, len(fit.solution.u), count, seed), fit, seed)
 
 

@@ -187,8 +187,7 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
             strengths[place] = mean.get(name, middle[name]) if middle[name] > 0 else 0.0
 
         def smooth(omega):
-            storage, loss = np.split(generalised_maxwell.mode_columns(omega, grid) @ strengths, 2)
-            return storage + 1j * loss
+            return np.split(generalised_maxwell.mode_columns(omega, grid) @ strengths, 2)
 
         made = as_prony_modes.convert(smooth, low, high, bool(strengths[0] > 0))
         return as_prony_modes.modes(made, smooth(made.omega))
@@ -196,7 +195,8 @@ def _typical_sample(sweeps: list[Sweep], fits: list[Fit], populations: dict[str,
     values = [mean.get(name, middle[name]) for name in model.names]
 
     def formula(omega):
-        return model.formula(1j * omega, *values)
+        G = model.formula(1j * omega, *values)
+        return G.real, G.imag
 
     made = as_prony_modes.convert(formula, low, high, model.solid)
     return as_prony_modes.modes(made, formula(made.omega))

@@ -13,7 +13,7 @@ from fitting.methods import generalised_maxwell, host, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
-from fitting.methods.least_squares import Solution, bfgs, from_starts
+from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
 from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
@@ -29,10 +29,10 @@ class Kind(NamedTuple):
     maxwell: Callable[[Array], Maxwell] = generalised_maxwell.natural  # Prony modes of u, for the simulation
     names: tuple[str, ...] = ()  # of its own parameters; empty: these are the modes
     units: tuple[str, ...] = ()
-    values: Callable[[jax.Array], jax.Array] | None = None  # u -> its own parameters (P,)
-    prior: Callable[[jax.Array], jax.Array] | None = None  # u -> rows that follow the residuals of the data
+    values: Callable[[Array], Array] | None = None  # u -> its own parameters (P,)
+    prior: Callable[[Array], Array] | None = None  # u -> rows that follow the residuals of the data
     effective: float | None = None  # number of parameters that the data determine; None: the length of u
-    moduli: Callable[[Array, Array], Array] | None = None  # (u, omega) -> its own G* (n,) [Pa] at any frequency
+    moduli: Callable[[Array, Array], tuple[Array, Array]] | None = None  # (u, omega) -> its own G', G'' (n,) [Pa]
 
 
 class Fit(NamedTuple):
@@ -211,9 +211,9 @@ def number_of_parameters(fit: Fit) -> float:
 
 
 def mean_square(fit: Fit) -> float:
-    """Mean square of the residuals of the data."""
+    """Mean square of the residuals of the data; not below roundoff, where exact fits differ by chance."""
     m = 2 * len(fit.storage)
-    return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, 1e-300)
+    return max(float(np.sum(np.asarray(fit.solution.residuals)[:m] ** 2)) / m, ZERO)
 
 
 def information_criterion(fit: Fit) -> float:

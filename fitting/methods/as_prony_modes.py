@@ -8,11 +8,10 @@ moduli of the model. So the conversion can be differentiated.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods.generalised_maxwell import Maxwell, non_negative
+from fitting.methods.host import Array, arrays_of
 
 #: Largest relative error of G' and of G'' over the band that a conversion may have.
 ALLOWED = 0.01
@@ -37,18 +36,19 @@ def _columns_of_modes(omega: np.ndarray, times: np.ndarray, solid: bool) -> np.n
     return np.column_stack([rest, A]) if solid else A
 
 
-def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float, solid: bool) -> Conversion:
+def convert(
+    moduli: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: float, high: float, solid: bool
+) -> Conversion:
     """Find the fewest modes with an error below `ALLOWED`, or the best fit of at most `MOST` modes.
 
     Args:
-        moduli: complex modulus (n,) [Pa] of angular frequencies (n,).
+        moduli: G' and G'' (n,) [Pa] at angular frequencies (n,).
         low, high: ends of the band [rad/s].
         solid: whether the model has an equilibrium modulus.
     """
     decades = np.log10(high / low)
     omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))
-    G = np.asarray(moduli(omega))
-    target = np.concatenate([G.real, G.imag])
+    target = np.concatenate(moduli(omega))
     best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
     for modes in range(1, MOST + 1):
         for margin in MARGINS:
@@ -74,8 +74,10 @@ def convert(moduli: Callable[[np.ndarray], np.ndarray], low: float, high: float,
     return Conversion(omega, times[kept], solid, np.linalg.pinv(weighed) / target, error)
 
 
-def modes(conversion: Conversion, modulus: jax.Array) -> Maxwell:
-    """Prony modes of the complex modulus (n,) at `conversion.omega`."""
-    strengths = jnp.asarray(conversion.strengths_of) @ jnp.concatenate([modulus.real, modulus.imag])
-    total = jnp.sum(strengths)
-    return Maxwell(total, strengths[int(conversion.solid) :] / total, jnp.asarray(conversion.times))
+def modes(conversion: Conversion, moduli: tuple[Array, Array]) -> Maxwell:
+    """Prony modes of G' and G'' (…, n) at `conversion.omega`, in NumPy or JAX."""
+    xp = arrays_of(*moduli)
+    strengths = xp.concatenate(moduli, axis=-1) @ conversion.strengths_of.T
+    total = xp.sum(strengths, axis=-1)
+    ratios = strengths[..., int(conversion.solid) :] / total[..., None]
+    return Maxwell(total, ratios, xp.broadcast_to(xp.asarray(conversion.times), ratios.shape))

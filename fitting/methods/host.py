@@ -16,6 +16,11 @@ def arrays_of(*values: Any) -> Any:
     return np if all(isinstance(v, (np.ndarray, np.generic, float, int)) for v in values) else jnp
 
 
+def exponential(u: Array) -> Array:
+    """Numbers whose logarithms are u."""
+    return arrays_of(u).exp(u)
+
+
 def with_jacobian(function: Callable[..., Any], u: np.ndarray, *data: Any) -> tuple[np.ndarray, np.ndarray]:
     """Values (…, m) and derivative (…, m, P) of a function of u (…, P), in NumPy, to roundoff.
 

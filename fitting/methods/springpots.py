@@ -6,18 +6,23 @@ one:
 
     G* = E (i omega)^gamma + 1 / (1 / (V (i omega)^alpha) + 1 / (W (i omega)^beta))     gamma, beta < alpha
 
-with some of its six numbers absent, so that one compiled program fits them all. The code divides frequencies by the
-middle of the band, x = omega / reference, so that starts and scales of all fits are alike.
+with some of its six numbers absent. The code divides frequencies by the middle of the band, x = omega / reference, so
+that starts and scales of all fits are alike. Real and imaginary parts are computed apart, in NumPy or JAX; u may have
+more axes in front (see `fitting.methods.host`).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.methods import host
 from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.host import Array, arrays_of
+from fitting.methods.least_squares import Solution, from_starts
 from fitting.readers.rheometer import Sweep
 
 #: Places in u: log E, logit gamma / alpha, log V, logit alpha, log W, logit beta / alpha.
@@ -31,7 +36,7 @@ class Fractional(NamedTuple):
     free: tuple[int, ...]  # places in u
     names: tuple[str, ...]
     units: tuple[str, ...]
-    values: Callable[[jax.Array, float], jax.Array]  # full u, reference [rad/s] -> (P,)
+    values: Callable[[Array, float], Array]  # full u, reference [rad/s] -> (P,)
     formula: Callable[..., np.ndarray]  # i omega and the values -> G* [Pa], as the literature writes it
 
     @property
@@ -45,22 +50,30 @@ class Fractional(NamedTuple):
         return np.array([float(k in self.free) for k in (0, 1, 4, 5)])
 
 
-def _orders(u: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _orders(u: Array) -> tuple[Array, Array, Array]:
     """alpha, beta, gamma."""
-    alpha = jax.nn.sigmoid(u[3])
-    return alpha, alpha * jax.nn.sigmoid(u[5]), alpha * jax.nn.sigmoid(u[1])
+    xp = arrays_of(u)
+    alpha, beta, gamma = (0.5 * (1 + xp.tanh(0.5 * u[..., k])) for k in (3, 5, 1))
+    return alpha, alpha * beta, alpha * gamma
 
 
-def modulus(u: jax.Array, switches: jax.Array, x: jax.Array, angle: float = 0.5 * np.pi) -> jax.Array:
-    """G* (n,) [Pa] of all six numbers u at s = x e^(i angle), x = |s| / reference (n,); by default at i omega."""
+def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> tuple[Array, Array]:
+    """Real and imaginary part (n,) [Pa] of G* of all six numbers u at s = x e^(i angle), x = |s| / reference (n,).
 
-    def power(exponent):  # s^exponent
-        return x**exponent * jnp.exp(1j * angle * exponent)
+    By default at s = i omega: G' and G''.
+    """
+    xp = arrays_of(u, x)
+
+    def power(log_size, exponent):  # size s^exponent
+        size, turn = xp.exp(log_size[..., None] + exponent[..., None] * xp.log(x)), angle * exponent[..., None]
+        return size * xp.cos(turn), size * xp.sin(turn)
 
     alpha, beta, gamma = _orders(u)
-    beside = switches[0] * jnp.exp(u[0]) * power(switches[1] * gamma)
-    compliance = power(-alpha) * jnp.exp(-u[2]) + switches[2] * power(-switches[3] * beta) * jnp.exp(-u[4])
-    return beside + 1 / compliance
+    beside, own = power(u[..., 0], switches[1] * gamma), power(-u[..., 2], -alpha)
+    in_row = power(-u[..., 4], -switches[3] * beta)
+    real, imaginary = (a + switches[2] * b for a, b in zip(own, in_row, strict=True))
+    square = real * real + imaginary * imaginary
+    return switches[0] * beside[0] + real / square, switches[0] * beside[1] - imaginary / square
 
 
 #: Relaxation times per decade in `as_modes`, and decades by which they exceed the shortest and the longest time.
@@ -81,12 +94,12 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
     one fast real s.
 
     Args:
-        u, switches: as in `modulus`.
+        u, switches: as in `moduli`.
         times: (K,) [s], descending, with a constant ratio, as in `times_of_modes`.
         reference: frequency [rad/s] that is the unit of frequency in u.
     """
     step = jnp.log(times[0] / times[1])
-    H = step * modulus(u, switches, 1 / (times * reference), np.pi).imag / np.pi
+    H = step * moduli(u, switches, 1 / (times * reference), np.pi)[1] / np.pi
     ends = jnp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: each term is whole there
     fast = times[-1] / 3
 
@@ -94,7 +107,7 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
         x = jnp.outer(s, times)
         return (x / (1 + x)) @ H
 
-    left = modulus(u, switches, ends / reference, 0.0).real - of_modes(ends)
+    left = moduli(u, switches, ends / reference, 0.0)[0] - of_modes(ends)
     share = ends * fast / (1 + ends * fast)
     lump = (left[1] - left[0]) / (share[1] - share[0])
     rest = jnp.maximum(left[0] - lump * share[0], 0.0)
@@ -104,35 +117,44 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
 
 
 def springpot_residuals(
-    u: jax.Array, switches: jax.Array, x: jax.Array, storage: jax.Array, loss: jax.Array, scales: jax.Array
-) -> jax.Array:
+    u: Array, switches: Array, x: Array, storage: np.ndarray, loss: np.ndarray, scales: np.ndarray
+) -> Array:
     """(model - data) / scale of G' then G'', (2n,); `scales` (2n,) [Pa]."""
-    G = modulus(u, switches, x)
-    return (jnp.concatenate([G.real, G.imag]) - jnp.concatenate([storage, loss])) / scales
+    found = arrays_of(u).concatenate(moduli(u, switches, x), axis=-1)
+    return (found - np.concatenate([storage, loss])) / scales
 
 
-def _springpot(u, reference):
+def _strength(log_size: Array, exponent: Array, reference: float) -> Array:
+    """Strength [Pa s^exponent] of a springpot; `log_size`: of its modulus [Pa] at the reference."""
+    return arrays_of(log_size).exp(log_size - exponent * np.log(reference))
+
+
+def _springpot(u: Array, reference: float) -> Array:
     alpha, _, _ = _orders(u)
-    return jnp.stack([jnp.exp(u[2]) * reference**-alpha, alpha])
+    return arrays_of(u).stack([_strength(u[..., 2], alpha, reference), alpha], axis=-1)
 
 
-def _kelvin_voigt(u, reference):
-    return jnp.concatenate([jnp.exp(u[:1]), _springpot(u, reference)])
+def _kelvin_voigt(u: Array, reference: float) -> Array:
+    xp = arrays_of(u)
+    return xp.concatenate([xp.exp(u[..., :1]), _springpot(u, reference)], axis=-1)
 
 
-def _zener(u, reference):
-    alpha, _, _ = _orders(u)
-    return jnp.stack([jnp.exp(u[0]), jnp.exp(u[4]), jnp.exp((u[2] - u[4]) / alpha) / reference, alpha])
+def _zener(u: Array, reference: float) -> Array:
+    xp, (alpha, _, _) = arrays_of(u), _orders(u)
+    time = xp.exp((u[..., 2] - u[..., 4]) / alpha) / reference
+    return xp.stack([xp.exp(u[..., 0]), xp.exp(u[..., 4]), time, alpha], axis=-1)
 
 
-def _maxwell(u, reference):
-    _, beta, _ = _orders(u)
-    return jnp.concatenate([_springpot(u, reference), jnp.stack([jnp.exp(u[4]) * reference**-beta, beta])])
+def _maxwell(u: Array, reference: float) -> Array:
+    xp, (_, beta, _) = arrays_of(u), _orders(u)
+    fast = xp.stack([_strength(u[..., 4], beta, reference), beta], axis=-1)
+    return xp.concatenate([_springpot(u, reference), fast], axis=-1)
 
 
-def _parallel(u, reference):
-    _, _, gamma = _orders(u)
-    return jnp.concatenate([jnp.stack([jnp.exp(u[0]) * reference**-gamma, gamma]), _springpot(u, reference)])
+def _parallel(u: Array, reference: float) -> Array:
+    xp, (_, _, gamma) = arrays_of(u), _orders(u)
+    slow = xp.stack([_strength(u[..., 0], gamma, reference), gamma], axis=-1)
+    return xp.concatenate([slow, _springpot(u, reference)], axis=-1)
 
 
 _POT, _SLOW, _FAST = (
@@ -175,9 +197,29 @@ FRACTIONAL = (
 )
 
 
-def full(model: Fractional, u: jax.Array) -> jax.Array:
-    """All six numbers; those that the model does not have are 0."""
-    return jnp.zeros(SIZE).at[jnp.array(model.free)].set(u)
+def full(model: Fractional, u: Array) -> Array:
+    """All six numbers (…, 6) of the free ones (…, P); those that the model does not have are 0."""
+    xp = arrays_of(u)
+    nothing = xp.zeros_like(u[..., 0])
+    return xp.stack([u[..., model.free.index(k)] if k in model.free else nothing for k in range(SIZE)], axis=-1)
+
+
+def best_minimum(model: Fractional, sweep: Sweep, starts: np.ndarray, scales: np.ndarray | None = None) -> Solution:
+    """The best minimum over the free numbers of a model from starts (S, P).
+
+    Args:
+        model: the case.
+        sweep: data.
+        starts: where to begin.
+        scales: of the residuals (2n,) [Pa]; by default the deviations of the sweep.
+    """
+    x = sweep.angular_frequency / reference_frequency(sweep)
+    scales = np.concatenate(sweep.deviations) if scales is None else scales
+
+    def residuals(u):
+        return springpot_residuals(full(model, u), model.switches, x, sweep.storage, sweep.loss, scales)
+
+    return from_starts(partial(host.with_jacobian, residuals), starts)
 
 
 def reference_frequency(sweep: Sweep) -> float:

@@ -311,8 +311,8 @@ def _moduli_as_measured(closed: Fit, omega: np.ndarray) -> tuple[np.ndarray, np.
         return np.asarray(storage), np.asarray(loss)
     solid = closed.kind.names[0] == "equilibrium_modulus"
     stands = closed.parameters.values[0] if solid else 0.0
-    G = (np.asarray(closed.kind.moduli(closed.solution.u, omega)) - stands) * factors[0] + stands * factors[1]
-    return G.real, G.imag
+    storage, loss = closed.kind.moduli(closed.solution.u, omega)
+    return (storage - stands) * factors[0] + stands * factors[1], loss * factors[0]
 
 
 def _legend_above(axes: Any, columns: int) -> None:

@@ -4,20 +4,21 @@ All are compared by the information criterion that also chooses the number of mo
 for the simulation; the fit states the error of this conversion over the band.
 """
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.families import limits
 from fitting.fits.families.choice import contains, label_of, preferred
 from fitting.fits.viscoelastic import Fit, Kind, information_criterion, number_of_parameters
-from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, springpots, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, host, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Spectrum
-from fitting.methods.least_squares import Solution, levenberg_marquardt, with_jacobian
+from fitting.methods.host import arrays_of
+from fitting.methods.least_squares import Solution
 from fitting.readers.rheometer import Sweep
 from liverjax.core.struct import Content
 
@@ -31,29 +32,25 @@ BOUND = 1e-3
 
 
 def fractional(sweep: Sweep) -> list[Fit]:
-    """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts; one program fits them all."""
-    reference, starts = springpots.reference_frequency(sweep), springpots.starting_points(sweep)
-    scaled = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, np.concatenate(sweep.deviations))
-    best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
+    """Every model of `springpots.FRACTIONAL`, each at the best minimum of 24 starts."""
+    starts = springpots.starting_points(sweep)
     # A model with as many numbers as data fits anything without a residual, so its fit proves nothing.
     most = 2 * len(np.unique(sweep.angular_frequency))
     out = []
     for model in springpots.FRACTIONAL:
         if len(model.free) >= most:
             continue
-        switches = np.tile(model.switches, (len(starts), 1))
-        found, compiling, running = viscoelastic.timed(best, starts, switches, *scaled)
-        free = jnp.array(model.free)
-        own = found._replace(u=found.u[free], jacobian=found.jacobian[:, free])
-        out.append(_fractional_fit(sweep, model, own, (running, compiling)))
+        begin = time.perf_counter()
+        found = springpots.best_minimum(model, sweep, starts[:, list(model.free)])
+        out.append(_fractional_fit(sweep, model, found, time.perf_counter() - begin))
     return out
 
 
-def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution, seconds: tuple[float, float]) -> Fit:
+def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution, seconds: float) -> Fit:
     reference = springpots.reference_frequency(sweep)
 
     def at(u, omega):
-        return springpots.modulus(springpots.full(model, u), model.switches, omega / reference)
+        return springpots.moduli(springpots.full(model, u), model.switches, omega / reference)
 
     def values(u):
         return model.values(springpots.full(model, u), reference)
@@ -67,7 +64,7 @@ def _fractional_fit(sweep: Sweep, model: springpots.Fractional, found: Solution,
         values=values,
         moduli=at,
     )
-    return _finished(viscoelastic.fitted(sweep, found, kind, *seconds, {}), made)
+    return _finished(viscoelastic.fitted(sweep, found, kind, seconds, 0.0, {}), made)
 
 
 def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = None) -> Fit:
@@ -77,37 +74,34 @@ def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = 
     strengths = np.concatenate([[found.equilibrium], found.strengths])[1 - solid :]
     prior = found.prior[:, 1 - solid :]
 
-    def columns(omega):
-        return jnp.asarray(generalised_maxwell.mode_columns(np.asarray(omega), found.times)[:, 1 - solid :])
+    def moduli(u, omega):
+        columns = generalised_maxwell.mode_columns(np.asarray(omega), found.times)[:, 1 - solid :]
+        return arrays_of(u).split(host.exponential(u) @ columns.T, 2, axis=-1)
 
     def held(u):
-        return jnp.asarray(prior) @ jnp.exp(u)
+        return host.exponential(u) @ prior.T
 
     def residuals(u):
         data, scales = np.concatenate([sweep.storage, sweep.loss]), np.concatenate(sweep.deviations)
-        return jnp.concatenate([(columns(sweep.angular_frequency) @ jnp.exp(u) - data) / scales, held(u)])
+        misfit = (np.concatenate(moduli(u, sweep.angular_frequency), axis=-1) - data) / scales
+        return np.concatenate([misfit, held(u)], axis=-1)
 
-    def complex_moduli(columns, u):
-        storage, loss = jnp.split(columns @ jnp.exp(u), 2)
-        return storage + 1j * loss
-
-    u = jnp.log(jnp.asarray(strengths))
-    made = _conversion(sweep, lambda omega: complex_moduli(columns(omega), u), bool(solid))
-    matched = columns(made.omega)
+    u = np.log(strengths)
+    made = _conversion(sweep, lambda omega: moduli(u, omega), bool(solid))
     names = ("equilibrium_modulus",) * solid + tuple(f"strengths[{k}]" for k in found.places)
     kind = Kind(
         name="spectrum",
-        maxwell=lambda u: as_prony_modes.modes(made, complex_moduli(matched, u)),
+        maxwell=lambda u: as_prony_modes.modes(made, moduli(u, made.omega)),
         names=names,
         units=("Pa",) * len(names),
-        values=jnp.exp,
+        values=host.exponential,
         prior=held,
         effective=found.effective,
-        moduli=lambda u, omega: complex_moduli(columns(omega), u),
+        moduli=moduli,
     )
-    r, J = with_jacobian(residuals)(u)
-    cosine = jnp.max(jnp.abs(J.T @ r) / jnp.maximum(jnp.linalg.norm(J, axis=0) * jnp.linalg.norm(r), 1e-300))
-    solution = Solution(u, r, J, 0.5 * r @ r, jnp.array(1), cosine, jnp.array(True))
+    r, J = host.with_jacobian(residuals, u)
+    cosine = np.max(np.abs(J.T @ r) / np.maximum(np.linalg.norm(J, axis=0) * np.linalg.norm(r), 1e-300))
+    solution = Solution(u, r, J, 0.5 * r @ r, np.array(1), cosine, np.array(True))
     details = {
         "relaxation_times": found.times.tolist(),
         "times_per_decade": found.per_decade,

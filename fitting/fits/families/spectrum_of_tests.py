@@ -17,7 +17,7 @@ from fitting.fits.families import limits
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Together
 from fitting.fits.viscoelastic import Kind
-from fitting.methods import as_prony_modes, generalised_maxwell, relaxation_spectrum, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, host, relaxation_spectrum, uncertainty
 from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell, non_negative
 from fitting.methods.least_squares import Solution
@@ -145,28 +145,26 @@ def _as_a_fit(
     prior = told.prior[:, 1 - int(solid) :] * strengths
 
     def moduli(omega, u):
-        storage, loss = jnp.split(
-            jnp.asarray(generalised_maxwell.mode_columns(omega, told.times)[:, 1 - int(solid) :]) @ jnp.exp(u), 2
-        )
-        return storage + 1j * loss
+        columns = generalised_maxwell.mode_columns(omega, told.times)[:, 1 - int(solid) :]
+        return host.arrays_of(u).split(host.exponential(u) @ columns.T, 2, axis=-1)
 
-    u = jnp.log(jnp.asarray(strengths))
-    made = as_prony_modes.convert(lambda omega: np.asarray(moduli(omega, u)), 1 / high, 1 / low, bool(solid))
+    u = np.log(strengths)
+    made = as_prony_modes.convert(lambda omega: moduli(omega, u), 1 / high, 1 / low, bool(solid))
     names = ("equilibrium_modulus",) * int(solid) + tuple(f"strengths[{k}]" for k in told.places)
     kind = Kind(
         name="spectrum",
         maxwell=lambda u: as_prony_modes.modes(made, moduli(made.omega, u)),
         names=names,
         units=("Pa",) * len(names),
-        values=jnp.exp,
+        values=host.exponential,
         effective=told.effective,
     )
     r = np.concatenate([found.r, prior @ np.ones(len(strengths))])
     J = np.concatenate([slopes, prior])
-    solution = Solution(u, r, J, 0.5 * found.r @ found.r, jnp.array(1), jnp.array(0.0), jnp.array(found.converged))
+    solution = Solution(u, r, J, 0.5 * found.r @ found.r, np.array(1), np.array(0.0), np.array(found.converged))
     solution = over(solution) if over else solution
     spread = uncertainty.estimate(solution, over is not None, kind.maxwell, (len(found.r), told.effective))
-    own = estimated(names, jnp.exp, solution, len(found.r), over is not None, told.effective)
+    own = estimated(names, host.exponential, solution, len(found.r), over is not None, told.effective)
     sentences = []
     if made.error > as_prony_modes.ALLOWED:
         sentences.append(f"{len(made.times)} Prony modes follow the spectrum to {100 * made.error:.2g} % only")

@@ -130,14 +130,14 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
     solution = whole._replace(u=whole.u[free], jacobian=whole.jacobian[:, free])
 
     def at(u, omega):
-        return springpots.modulus(springpots.full(case, u), case.switches, omega / spans.reference)
+        return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)
 
     def values(u):
         return case.values(springpots.full(case, u), spans.reference)
 
     def moduli(omega):
-        G = np.asarray(at(solution.u, jnp.asarray(omega)))
-        return G.real + 1j * np.maximum(G.imag, 1e-12 * np.abs(G))  # a model whose fit diverged may have no loss left
+        storage, loss = (np.asarray(part) for part in at(solution.u, jnp.asarray(omega)))
+        return storage, np.maximum(loss, 1e-12 * np.hypot(storage, loss))  # after a fit that diverged: no loss left
 
     made = as_prony_modes.convert(moduli, 1 / spans.high, 1 / spans.low, case.solid)
     kind = Kind(case.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), case.names, case.units, values)
@@ -145,7 +145,8 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
     numbers, times = springpots.full(case, solution.u), jnp.asarray(spans.times)
     dense = springpots.as_modes(numbers, jnp.asarray(case.switches), times, spans.reference)
     storage, loss = generalised_maxwell.moduli(Maxwell(*(np.asarray(v) for v in dense)), made.omega)
-    apart = float(np.max(np.abs((storage + 1j * loss) / moduli(made.omega) - 1)))
+    real, imaginary = moduli(made.omega)
+    apart = float(np.max(np.abs((storage + 1j * loss) / (real + 1j * imaginary) - 1)))
     for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes used in the fit")):
         if error > as_prony_modes.ALLOWED:
             sentences.append(f"{what} follow the model {case.name} to {100 * error:.2g} % only: take another --model")

@@ -8,7 +8,7 @@ from fitting.fits import viscoelastic
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
 from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
-from fitting.methods.least_squares import from_starts, levenberg_marquardt
+from fitting.methods.least_squares import from_starts
 from fitting.readers.rheometer import Sweep, some
 from liverjax.core.struct import Content
 
@@ -103,16 +103,13 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
         return {name: factor[name] * grid.equilibrium - value for name, value in old.items()}
     if fit.parameters is not None:
         (model,) = (m for m in springpots.FRACTIONAL if m.name == fit.kind.name)
-        reference = springpots.reference_frequency(sweep)
-        starts = springpots.starting_points(part)
-        starts[-1, list(model.free)] = np.asarray(fit.solution.u)
-        best = viscoelastic.best_of(levenberg_marquardt, springpots.springpot_residuals, 1)
-        # The program compiled for all points serves again: points that are left out have no weight.
+        starts = springpots.starting_points(part)[:, list(model.free)]
+        starts[-1] = np.asarray(fit.solution.u)
+        # The numbers u have the middle of the whole band as their unit of frequency: points left out have no weight.
         scales = np.where(np.tile(kept, 2), np.concatenate(sweep.deviations), np.inf)
-        data = (sweep.angular_frequency / reference, sweep.storage, sweep.loss, scales)
-        u = viscoelastic.timed(best, starts, np.tile(model.switches, (len(starts), 1)), *data)[0].u
+        found = springpots.best_minimum(model, sweep, starts, scales)
         assert fit.kind.values is not None
-        again = fit.kind.values(u[np.array(model.free)])
+        again = fit.kind.values(found.u)
         return {n: float(v) - old[n] for n, v in zip(model.names, again, strict=True)}
     starts = generalised_maxwell.starts(part, fit.modes, generalised_maxwell.spectrum(part))
     fluid = fit.kind.name == FLUID.name

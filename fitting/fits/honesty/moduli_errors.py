@@ -5,14 +5,13 @@ between the models are part of the error (Buckland, Burnham and Augustin 1997, B
 and Tsai 1989, Biometrika 76, 297).
 """
 
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits.viscoelastic import Fit, mean_square, number_of_parameters
 from fitting.methods import generalised_maxwell, host
 from fitting.methods.estimate import Estimate, errors_and_correlation, estimated, wider
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.host import Array
+from fitting.methods.host import Array, arrays_of
 
 #: Weight below which a model is left out.
 NEGLIGIBLE = 1e-4
@@ -79,11 +78,9 @@ def _shared_errors(fit: Fit, omega: np.ndarray) -> np.ndarray:
 
 def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
     def of(u: Array) -> Array:
-        if fit.kind.moduli is not None:
-            G = fit.kind.moduli(u, omega)
-            return jnp.concatenate([jnp.real(G), jnp.imag(G)])
-        halves = generalised_maxwell.moduli(fit.kind.maxwell(u), omega)
-        return (np if isinstance(u, np.ndarray) else jnp).concatenate(halves, axis=-1)
+        own = fit.kind.moduli
+        halves = generalised_maxwell.moduli(fit.kind.maxwell(u), omega) if own is None else own(u, omega)
+        return arrays_of(u).concatenate(halves, axis=-1)
 
     names = [f"{part} at {at:.3g} rad/s" for part in ("storage", "loss") for at in omega]
     return estimated(names, of, fit.solution, 2 * len(fit.storage), noise_given, fit.kind.effective)
