@@ -74,6 +74,17 @@ def test_the_closed_form_compiles_nothing(tmp_path, model):
 
 
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_every_model_of_a_test_in_time_compiles_nothing(tmp_path, kind):
+    """Springpots and spectra too: for each of them a program took ten seconds."""
+    time, file, before = np.geomspace(0.1, 100, 12), tmp_path / "test.csv", len(COMPILED)
+    G = 300 + 200 * np.exp(-time / 0.5) + 150 * np.exp(-time / 20)
+    name, answer = ("relaxation_modulus_Pa", G) if kind == "relaxation" else ("creep_compliance_1/Pa", 1 / G)
+    np.savetxt(file, np.column_stack([time, answer]), delimiter=",", header=f"time_s,{name}", comments="")
+    assert main([kind, str(file), "--model", "auto", "--out", str(tmp_path / "out")]) == 0
+    assert len(COMPILED) == before
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
 @pytest.mark.parametrize("name", ["prony", "prony_fluid"])
 def test_the_answers_of_a_test_in_time_have_the_derivatives_of_jax(kind, name):
     """By hand against forward mode, to roundoff; steps of 1e-7 to 1e4 relaxation times, so that all branches run."""

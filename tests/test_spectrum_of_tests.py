@@ -1,6 +1,7 @@
 """A smooth spectrum of tests in time, of several tests and of several samples, against models in closed form."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from fitting.__main__ import main
 from fitting.fits import samples, time_tests, together
 from fitting.fits.families import choice, spectrum_of_tests
 from fitting.fits.families.choice import Label
-from fitting.methods import generalised_maxwell, relaxation_spectrum
+from fitting.methods import generalised_maxwell, relaxation_spectrum, time_response
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers import time_tests as reader
 from fitting.readers.frequency_sweep import Sweep
@@ -55,13 +56,14 @@ def test_no_start_of_scipy_is_below_the_spectrum_of_creep():
     test = in_time("creep", "fractional_kelvin_voigt")
     told, grid, found = spectrum_of_tests.spectrum_of([test], NEAR, np.ones(1))
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
-    function, data = spectrum_of_tests._rows_and_slopes(("creep",)), spectrum_of_tests._weighed_parts([test], [1.0])
+    at, measured, scales = together.reported_numbers(test)
+    function = partial(time_response.residuals_with_jacobian, "creep", spectrum_of_tests._modes_on_grid(grid))
 
     def rows(x):
-        return np.concatenate([np.asarray(function(x, grid.times, grid.unit, data)[0]), L @ x])
+        return np.concatenate([function(x, *at, measured, scales)[0], L @ x])
 
     def slopes(x):
-        return np.vstack([np.asarray(function(x, grid.times, grid.unit, data)[1]), L])
+        return np.vstack([function(x, *at, measured, scales)[1], L])
 
     own, rng = np.sum(rows(found.x) ** 2), np.random.default_rng(0)
     for _ in range(8):

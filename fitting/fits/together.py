@@ -101,7 +101,7 @@ def least_noise(test: Measured) -> float:
     return 1.0 if isinstance(test, Sweep) and test.noise_given else QUIETEST
 
 
-def _tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
+def tests_evaluated(kinds: list[str], kind: Kind, u: np.ndarray, data: list) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (…, m) of all tests, one after the other, and their Jacobian (…, m, P) at u (…, P), in NumPy."""
 
     def one(name: str, at: tuple, measured: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +189,7 @@ def criterion_of_all(fit: Together) -> float:
 def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> Together:
     """Fit one number of modes to all tests; the fit and the weights are found in turn."""
     parts = [reported_numbers(t) for t in tests]
-    begin, evaluate = time.perf_counter(), partial(_tests_evaluated, list(map(name_of, tests)), kind)
+    begin, evaluate = time.perf_counter(), partial(tests_evaluated, list(map(name_of, tests)), kind)
     starts, noise = _starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
     for _ in range(ROUNDS):
         used = noise
@@ -361,7 +361,7 @@ def _shares(fit: Together) -> list[Share]:
     Infinite deviations exclude a test.
     """
     parts = [reported_numbers(t) for t in fit.tests]
-    evaluate = partial(_tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
+    evaluate = partial(tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
     u = np.asarray(fit.solution.u)
     band = ResolvedBand(resolved_by(fit.tests))
     starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])

@@ -15,8 +15,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import host
@@ -86,7 +84,7 @@ def times_of_modes(low: float, high: float) -> np.ndarray:
     return np.logspace(np.log10(high) + BEYOND[1], np.log10(low) - BEYOND[0], int(np.ceil(decades * DENSE)) + 1)
 
 
-def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: float) -> Maxwell:
+def as_modes(u: Array, switches: Array, times: Array, reference: float) -> Maxwell:
     """Prony modes of the model's own relaxation spectrum, for responses in time.
 
     The spectrum is H(tau) = Im G*(s) / pi at s = e^(i pi) / tau (Gross 1953). The trapezium rule in ln tau converges
@@ -98,22 +96,21 @@ def as_modes(u: jax.Array, switches: jax.Array, times: jax.Array, reference: flo
         times: (K,) [s], descending, with a constant ratio, as in `times_of_modes`.
         reference: frequency [rad/s] that is the unit of frequency in u.
     """
-    step = jnp.log(times[0] / times[1])
+    xp = arrays_of(u, times)
+    step = xp.log(times[0] / times[1])
     H = step * moduli(u, switches, 1 / (times * reference), np.pi)[1] / np.pi
-    ends = jnp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: each term is whole there
+    ends = xp.stack([1e3 / times[0], 1e-2 / times[-1]])  # well inside of the times: each term is whole there
     fast = times[-1] / 3
 
-    def of_modes(s):
-        x = jnp.outer(s, times)
-        return (x / (1 + x)) @ H
-
-    left = moduli(u, switches, ends / reference, 0.0)[0] - of_modes(ends)
+    x = xp.outer(ends, times)
+    left = moduli(u, switches, ends / reference, 0.0)[0] - H @ (x / (1 + x)).T
     share = ends * fast / (1 + ends * fast)
-    lump = (left[1] - left[0]) / (share[1] - share[0])
-    rest = jnp.maximum(left[0] - lump * share[0], 0.0)
-    strengths = jnp.concatenate([H, jnp.maximum(lump, 1e-12 * jnp.sum(H))[None]])
-    total = rest + jnp.sum(strengths)
-    return Maxwell(total, strengths / total, jnp.concatenate([times, jnp.atleast_1d(fast)]))
+    lump = (left[..., 1] - left[..., 0]) / (share[1] - share[0])
+    rest = xp.maximum(left[..., 0] - lump * share[0], 0.0)
+    strengths = xp.concatenate([H, xp.maximum(lump, 1e-12 * xp.sum(H, axis=-1))[..., None]], axis=-1)
+    total = rest + xp.sum(strengths, axis=-1)
+    every = xp.concatenate([times, xp.atleast_1d(fast)])
+    return Maxwell(total, strengths / total[..., None], xp.broadcast_to(every, strengths.shape))
 
 
 def springpot_residuals(

@@ -16,6 +16,7 @@ and eigenvectors of S. The eigenvalues of S differ from each other if the relaxa
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -109,40 +110,43 @@ def residuals_with_jacobian(
     modes, slope = host.with_jacobian(partial(parameter_vector, maxwell=maxwell), u)
     n = modes.shape[-1] // 2
     model = Maxwell(modes[..., 0], modes[..., 1 : n + 1], modes[..., n + 1 :])
-    values, by_modes = (_driven_stress if kind == "relaxation" else _driven_strain)(model, time, driven, rows)
-    values, by_modes = np.moveaxis(values, 0, -1), np.moveaxis(by_modes, 0, -2)
-    return (values - answer) / scales, by_modes @ slope / scales[:, None]
+    driven_by = _driven_stress if kind == "relaxation" else _driven_strain
+    values, by_u = driven_by(Slopes(model, slope), time, driven, rows)
+    values, by_u = np.moveaxis(values, 0, -1), np.moveaxis(by_u, 0, -2)
+    return (values - answer) / scales, by_u / scales[:, None]
 
 
-def _driven_stress(
-    model: Maxwell, time: np.ndarray, strain: np.ndarray, rows: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stress (m, …) [Pa] of a driven strain, and its derivative by G0, ratios and times (m, …, 2N + 1)."""
+class Slopes(NamedTuple):
+    """Prony modes, and the derivative of G0, ratios and times by u (…, 2N + 1, P)."""
+
+    model: Maxwell
+    by_u: np.ndarray
+
+
+def _driven_stress(at: Slopes, time: np.ndarray, strain: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stress (m, …) [Pa] of a driven strain, and its derivative by u (m, …, P)."""
+    model = at.model
     G0, g, tau = model.shear_modulus[..., None], model.ratios, model.relaxation_times
     rise = np.diff(strain)
     h, by_rate = _memory_of_modes(1 / tau, np.diff(time), strain[0], rise, np.zeros(len(rise)))
     h, by_rate = h[rows], by_rate[rows]
     driven = strain[rows].reshape(-1, *(1,) * g.ndim)
     relaxed = (1 - g.sum(axis=-1, keepdims=True)) * driven + np.sum(g * h, axis=-1, keepdims=True)
-    slopes = [relaxed, G0 * (h - driven), -G0 * g / tau**2 * by_rate]
-    return (G0 * relaxed)[..., 0], np.concatenate(slopes, axis=-1)
+    by_modes = np.concatenate([relaxed, G0 * (h - driven), -G0 * g / tau**2 * by_rate], axis=-1)
+    return (G0 * relaxed)[..., 0], (by_modes[..., None, :] @ at.by_u)[..., 0, :]
 
 
-def _driven_strain(
-    model: Maxwell, time: np.ndarray, stress: np.ndarray, rows: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Strain (m, …) of a driven stress [Pa], and its derivative by G0, ratios and times (m, …, 2N + 1)."""
-    G0 = model.shear_modulus[..., None]
-    rates, weights, of_rates, of_weights = _retardation(model)
+def _driven_strain(at: Slopes, time: np.ndarray, stress: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Strain (m, …) of a driven stress [Pa], and its derivative by u (m, …, P)."""
+    G0 = at.model.shear_modulus[..., None]
+    rates, weights, of_rates, of_weights = _retardation(at)
     dt = np.diff(time)
     y, by_rate = _memory_of_modes(rates, dt, 0.0, dt * stress[:-1], dt * np.diff(stress))
     y, by_rate = y[rows], by_rate[rows]
     driven = stress[rows].reshape(-1, *(1,) * weights.ndim)
     strain = (driven + np.sum(weights * y, axis=-1, keepdims=True)) / G0
-    by_modes = np.einsum("m...k,...kp->m...p", y, of_weights) + np.einsum(
-        "m...k,...kp->m...p", weights * by_rate, of_rates
-    )
-    return strain[..., 0], np.concatenate([-strain / G0, by_modes / G0], axis=-1)
+    by_modes = y[..., None, :] @ of_weights + (weights * by_rate)[..., None, :] @ of_rates
+    return strain[..., 0], (by_modes[..., 0, :] - strain * at.by_u[..., 0, :]) / G0
 
 
 def _memory_of_modes(
@@ -178,9 +182,10 @@ _SLOPES = (
 )
 
 
-def _retardation(model: Maxwell) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rates and weights (…, N) [1/s], and the derivative of both by ratios and relaxation times (…, N, 2N)."""
-    g, tau = model.ratios, model.relaxation_times
+def _retardation(at: Slopes) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rates and weights (…, N) [1/s], and the derivative of both by u (…, N, P)."""
+    g, tau = at.model.ratios, at.model.relaxation_times
+    of_g, of_tau = np.split(at.by_u[..., 1:, :], 2, axis=-2)
     b = np.sqrt(g / tau)
     n = np.arange(g.shape[-1])
     S = b[..., :, None] * b[..., None, :]
@@ -189,14 +194,15 @@ def _retardation(model: Maxwell) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     eigenvalues, Q = np.linalg.eigh(np.where(known, S, 0.0))
     Q = np.where(known, Q, np.nan)
     c = np.einsum("...ik,...i->...k", Q, b)
-    # For every number p of mode i: db_i/dp, and the derivative of the diagonal of -1/tau by p.
-    of_b = np.concatenate([b / (2 * g), -b / (2 * tau)], axis=-1)
-    of_diagonal = np.concatenate([np.zeros_like(tau), 1 / tau**2], axis=-1)
-    at = np.swapaxes(np.concatenate([Q, Q], axis=-2), -1, -2)  # (…, k, p): Q_ik of the mode of p
-    # q_l . (dS/dp) q_k, (…, l, k, p).
-    outer = at[..., :, None, :] * c[..., None, :, None] + c[..., :, None, None] * at[..., None, :, :]
-    M = of_b[..., None, None, :] * outer + of_diagonal[..., None, None, :] * at[..., :, None, :] * at[..., None, :, :]
+    # By every u_p: b, its components along the eigenvectors, and the diagonal of -1/tau.
+    of_b = b[..., None] * (of_g / (2 * g[..., None]) - of_tau / (2 * tau[..., None]))
+    along, of_diagonal = np.swapaxes(Q, -1, -2) @ of_b, np.swapaxes(of_tau / tau[..., None] ** 2, -1, -2)
+    # q_l . (dS/du_p) q_k, (…, p, l, k).
+    a = np.swapaxes(along, -1, -2)
+    M = np.swapaxes(Q, -1, -2)[..., None, :, :] @ (of_diagonal[..., None] * Q[..., None, :, :])
+    M += a[..., :, None] * c[..., None, None, :] + c[..., None, :, None] * a[..., None, :]
     apart = eigenvalues[..., None, :] - eigenvalues[..., :, None]  # (…, l, k)
     apart[..., n, n] = np.inf
-    of_c = of_b[..., None, :] * at + np.einsum("...lkp,...lk,...l->...kp", M, 1 / apart, c)
-    return np.maximum(-eigenvalues, 0.0), c**2, -M[..., n, n, :], 2 * c[..., None] * of_c
+    of_c = a + (c[..., None, None, :] @ (M / apart[..., None, :, :]))[..., 0, :]
+    of_rates = -np.swapaxes(M[..., n, n], -1, -2)
+    return np.maximum(-eigenvalues, 0.0), c**2, of_rates, 2 * c[..., None] * np.swapaxes(of_c, -1, -2)

@@ -5,11 +5,8 @@ waves are not linear in the strengths: for them the linearised problem is solved
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import time_tests, together
@@ -24,6 +21,7 @@ from fitting.methods.least_squares import Solution
 from fitting.methods.relaxation_spectrum import GridOfTimes, GridSpectrum
 from fitting.readers.time_tests import TimeTest
 from liverjax.core.struct import Content
+from liverjax.solvers.blas import one_blas_thread
 
 #: Weights of the second differences that are tried, largest first, and most iterations for each weight.
 WEIGHTS, MOST_TANGENTS = np.logspace(4, -6, 21), 30
@@ -43,25 +41,15 @@ class SpectrumFit(NamedTuple):
     sentences: tuple[str, ...]
 
 
-@lru_cache(maxsize=8)
-def _rows_and_slopes(kinds: tuple[str, ...]) -> Callable:
-    """A compiled function: (x, times, unit, data of every test) -> residuals (m,) and their derivative by x."""
+def _modes_on_grid(grid: GridOfTimes) -> Callable[[np.ndarray], Maxwell]:
+    """A function: equilibrium modulus and strengths (…, 1 + K) in units of the grid -> Prony modes, in NumPy."""
 
-    def residuals(x, times, unit, data):
-        strengths = unit * (x + NONE)
-        total = jnp.sum(strengths)
-        model, rows = Maxwell(total, strengths[1:] / total, times), []
-        for kind, (at, measured, scales) in zip(kinds, data, strict=True):
-            rows.append((time_tests.response_in_time(kind, model, *at) - measured) / scales)
-        out = jnp.concatenate(rows)
-        return out, out
+    def maxwell(x):
+        strengths = grid.unit * (x + NONE)
+        total, times = strengths.sum(axis=-1), np.broadcast_to(grid.times, strengths[..., 1:].shape)
+        return Maxwell(total, strengths[..., 1:] / total[..., None], times)
 
-    @jax.jit
-    def both(x, times, unit, data):
-        J, r = jax.jacfwd(residuals, has_aux=True)(x, times, unit, data)
-        return r, J
-
-    return both
+    return maxwell
 
 
 class _Minimum(NamedTuple):
@@ -71,12 +59,13 @@ class _Minimum(NamedTuple):
     converged: bool
 
 
-def _minimum(function: Callable, data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
+def _minimum(kinds: list[str], data: list, grid: GridOfTimes, x: np.ndarray) -> _Minimum:
     """Least squares with x >= 0 and the grid's smoothness: Gauss-Newton from x, steps halved until the cost falls."""
     L = relaxation_spectrum.second_differences(len(grid.times), grid.smoothing)
+    kind = Kind("spectrum", _modes_on_grid(grid))
 
     def at(x):
-        r, J = (np.asarray(v) for v in function(x, grid.times, grid.unit, data))
+        r, J = together.tests_evaluated(kinds, kind, x, data)
         cost = r @ r + np.sum((L @ x) ** 2)
         return r, J, cost if np.isfinite(cost) and np.all(np.isfinite(J)) else np.inf
 
@@ -110,7 +99,7 @@ def spectrum_of(
         noise: relative noise of each test.
     """
     low, high = together.resolved_by(tests)
-    function, data = _rows_and_slopes(tuple(map(together.name_of, tests))), _weighed_parts(tests, noise)
+    kinds, data = list(map(together.name_of, tests)), _weighed_parts(tests, noise)
     best = None
     for per_decade in relaxation_spectrum.GRIDS:
         times = relaxation_spectrum.grid_of_times(low, high, per_decade)
@@ -119,7 +108,8 @@ def spectrum_of(
         x = np.concatenate([[0.5], np.full(len(times), 1 / per_decade)])
         for weight in WEIGHTS / np.exp(np.mean(np.log(noise))) ** 2:
             grid = GridOfTimes(times, unit, per_decade, float(weight))
-            found = _minimum(function, data, grid, x)
+            with one_blas_thread():  # the matrices are small
+                found = _minimum(kinds, data, grid, x)
             x, told = found.x, relaxation_spectrum.described(found.x, found.J, found.r, grid)
             if best is None or told.evidence < best[0].evidence:
                 best = told, grid, found
@@ -204,12 +194,12 @@ def spectrum_together(tests: list[Measured], near: Maxwell, noise: np.ndarray) -
     fit = _as_a_fit(tests, grid, found, told, lambda whole: together.over_own_noise(whole, shares, used / noise))
     own = (tests, fit.kind, fit.model, fit.solution, fit.spread, found.converged)
     first = Together(*own, shares, fitted, [], fit.sentences, 0.0, 0.0, fit.own, fit.details)
-    function = _rows_and_slopes(tuple(map(together.name_of, tests)))
+    kinds = list(map(together.name_of, tests))
 
     def alone(k: int) -> np.ndarray:
         without = [(at, y, s if j == k else np.full(len(y), np.inf)) for j, (at, y, s) in enumerate(parts)]
         quiet = [(at, y, s * noise[k]) for at, y, s in without]
-        return noise[k] * _minimum(function, quiet, grid, found.x).r
+        return noise[k] * _minimum(kinds, quiet, grid, found.x).r
 
     slope = np.diag(fit.own.values)
     return first._replace(

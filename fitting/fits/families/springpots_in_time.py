@@ -5,22 +5,23 @@ creep are computed as for Prony modes. Its own few numbers are what is fitted an
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import partial
+from time import perf_counter
 from typing import NamedTuple, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from fitting.fits import time_tests, together, viscoelastic
+from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
-from fitting.methods import as_prony_modes, generalised_maxwell, springpots, uncertainty
+from fitting.methods import as_prony_modes, generalised_maxwell, host, springpots, uncertainty
 from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.methods.host import Array
+from fitting.methods.least_squares import Solution, from_starts
 from fitting.methods.springpots import FRACTIONAL, Fractional
 from fitting.readers.frequency_sweep import Sweep
 from fitting.readers.time_tests import TimeTest
@@ -48,67 +49,48 @@ def spans_of(tests: Sequence[Measured]) -> Spans:
     return Spans(low, high, springpots.times_of_modes(low, high), float(1 / np.sqrt(low * high)))
 
 
-@lru_cache(maxsize=16)
-def _residuals_of_tests(kinds: tuple[str, ...]) -> Callable[..., jax.Array]:
-    """A function: (all six numbers, switches, times, reference, data of every test) -> residuals, test after test."""
+def _dense_modes(case: Fractional, spans: Spans) -> Callable[[Array], Maxwell]:
+    """A function: the model's own numbers u -> the Prony modes of its relaxation spectrum, in NumPy or JAX."""
 
-    def residuals(u, switches, times, reference, data):
-        model, rows = springpots.as_modes(u, switches, times, reference), []
-        for kind, (at, measured, scales) in zip(kinds, data, strict=True):
-            rows.append((time_tests.response_in_time(kind, model, *at) - measured) / scales)
-        return jnp.concatenate(rows)
+    def maxwell(u):
+        return springpots.as_modes(springpots.full(case, u), case.switches, spans.times, spans.reference)
 
-    return residuals
+    return maxwell
 
 
 def residuals_of_springpot(name: str, test: TimeTest) -> Callable[[jax.Array], jax.Array]:
-    """A function: the model's own numbers u -> residuals (m,) of a relaxation or creep test."""
+    """A function: the model's own numbers u -> residuals (m,) of a relaxation or creep test; in JAX."""
     (case,) = (c for c in FRACTIONAL if c.name == name)
-    spans, residuals = spans_of([test]), _residuals_of_tests((test.kind,))
-    data = [together.reported_numbers(test)]
+    maxwell, (at, measured, scales) = _dense_modes(case, spans_of([test])), together.reported_numbers(test)
 
     def of(u):
-        return residuals(springpots.full(case, u), case.switches, spans.times, spans.reference, data)
+        return (time_tests.response_in_time(test.kind, maxwell(u), *at) - measured) / scales
 
     return of
 
 
-@lru_cache(maxsize=16)
-def _each_model(kinds: tuple[str, ...]) -> Callable[..., Solution]:
-    """A function that finds the best minimum of each model from its starts (M, S, 6)."""
-    residuals = _residuals_of_tests(kinds)
+def _minimum_of_case(case: Fractional, tests: Sequence[Measured], starts: np.ndarray, data: list) -> Solution:
+    """The best minimum of a model for tests from starts (S, P).
 
-    def minima(starts, switches, *data):
-        def of_model(starts, switches):
-            def minimum(u):
-                return levenberg_marquardt(residuals, u, switches, *data, max_iterations=MOST_STEPS)
-
-            found = jax.vmap(minimum)(starts)
-            k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
-            return jax.tree.map(lambda leaf: leaf[k], found)
-
-        return jax.vmap(of_model)(starts, switches)
-
-    return minima
+    `data`: for each test the arrays that predict it, its measured numbers, and the divisors of its residuals.
+    """
+    kind = Kind(case.name, _dense_modes(case, spans_of(tests)))
+    evaluate = partial(together.tests_evaluated, list(map(together.name_of, tests)), kind)
+    return from_starts(evaluate, starts, data, max_iterations=MOST_STEPS)
 
 
-def _starts_near(model: Maxwell, spans: Spans) -> np.ndarray:
-    """Starts (M, STARTS, 6): each model fitted to the moduli of Prony modes, and points around it."""
+def _starts_near(model: Maxwell, spans: Spans) -> list[np.ndarray]:
+    """Starts (STARTS, P) of each model: the model fitted to the moduli of Prony modes, and points around it."""
     omega = np.geomspace(1 / spans.high, 1 / spans.low, 24)
-    storage, loss = generalised_maxwell.moduli(model, omega)
-    like = Sweep(omega, np.asarray(storage), np.asarray(loss))
-    rng, out = np.random.default_rng(0), []
-    for case, fit in zip(FRACTIONAL, models.fractional(like), strict=True):
-        first = np.asarray(springpots.full(case, jnp.asarray(fit.solution.u)))
-        out.append(np.vstack([first, _around(first, case, rng)]))
-    return np.stack(out)
+    like, rng = Sweep(omega, *generalised_maxwell.moduli(model, omega)), np.random.default_rng(0)
+    first = [np.asarray(fit.solution.u) for fit in models.fractional(like)]
+    return [np.vstack([u, _around(u, case, rng)]) for case, u in zip(FRACTIONAL, first, strict=True)]
 
 
 def _around(u: np.ndarray, case: Fractional, rng: np.random.Generator) -> np.ndarray:
-    """Random starts (STARTS - 1, 6) about numbers u (6,) of a model, exponents not near 0 or 1."""
-    place = np.arange(springpots.SIZE)
-    near = np.where(place % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
-    return near + AROUND * np.isin(place, case.free) * rng.standard_normal((STARTS - 1, len(u)))
+    """Random starts (STARTS - 1, P) about numbers u (P,) of a model, exponents not near 0 or 1."""
+    near = np.where(np.array(case.free) % 2 == 1, np.clip(u, -MOST_LOGIT, MOST_LOGIT), u)
+    return near + AROUND * rng.standard_normal((STARTS - 1, len(u)))
 
 
 class _Springpot(NamedTuple):
@@ -124,10 +106,8 @@ class _Springpot(NamedTuple):
     error: float  # largest relative error of these modes over the band
 
 
-def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: bool) -> _Springpot:
+def _springpot_at(case: Fractional, solution: Solution, spans: Spans, over_noise: bool) -> _Springpot:
     """A model at its minimum; `over_noise`: residuals are divided by a known noise, so none is estimated."""
-    free = jnp.array(case.free)
-    solution = whole._replace(u=whole.u[free], jacobian=whole.jacobian[:, free])
 
     def at(u, omega):
         return springpots.moduli(springpots.full(case, u), case.switches, omega / spans.reference)
@@ -136,15 +116,13 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
         return case.values(springpots.full(case, u), spans.reference)
 
     def moduli(omega):
-        storage, loss = (np.asarray(part) for part in at(solution.u, jnp.asarray(omega)))
+        storage, loss = at(solution.u, omega)
         return storage, np.maximum(loss, 1e-12 * np.hypot(storage, loss))  # after a fit that diverged: no loss left
 
     made = as_prony_modes.convert(moduli, 1 / spans.high, 1 / spans.low, case.solid)
     kind = Kind(case.name, lambda u: as_prony_modes.modes(made, at(u, made.omega)), case.names, case.units, values)
     sentences = []
-    numbers, times = springpots.full(case, solution.u), jnp.asarray(spans.times)
-    dense = springpots.as_modes(numbers, jnp.asarray(case.switches), times, spans.reference)
-    storage, loss = generalised_maxwell.moduli(Maxwell(*(np.asarray(v) for v in dense)), made.omega)
+    storage, loss = generalised_maxwell.moduli(_dense_modes(case, spans)(solution.u), made.omega)
     real, imaginary = moduli(made.omega)
     apart = float(np.max(np.abs((storage + 1j * loss) / (real + 1j * imaginary) - 1)))
     for error, what in ((made.error, f"{len(made.times)} Prony modes"), (apart, "the modes used in the fit")):
@@ -152,7 +130,7 @@ def _springpot_at(case: Fractional, whole: Solution, spans: Spans, over_noise: b
             sentences.append(f"{what} follow the model {case.name} to {100 * error:.2g} % only: take another --model")
     own = estimated(case.names, values, solution, len(solution.residuals), over_noise)
     spread = uncertainty.estimate(solution, over_noise, kind.maxwell)
-    model = Maxwell(*(np.asarray(v) for v in kind.maxwell(solution.u)))
+    model = kind.maxwell(solution.u)
     sentences += limits.limit_sentences(case.name, spread, model, own)
     return _Springpot(case, kind, model, solution, spread, own, tuple(sentences), made.error)
 
@@ -166,21 +144,17 @@ def able(fit: TimeFit | Together, data: uncertainty.Band) -> bool:
 
 def fractional_in_time(test: TimeTest, near: Maxwell) -> list[TimeFit]:
     """Every springpot model of a relaxation or creep test; `near`: Prony modes to begin from."""
-    spans = spans_of([test])
-    _, (at, driven, rows, answer, scales) = time_tests.residuals_in_time(test, Kind())
-    data = [((at, driven, rows), answer, scales)]
-    switches = np.stack([case.switches for case in FRACTIONAL])
-    given = (_starts_near(near, spans), switches, spans.times, spans.reference, data)
-    whole, compiling, running = viscoelastic.timed(_each_model((test.kind,)), *given)
+    spans, data = spans_of([test]), [together.reported_numbers(test)]
+    _, answer, scales = data[0]
     out = []
-    for k, case in enumerate(FRACTIONAL):
-        found = _springpot_at(case, jax.tree.map(lambda leaf, k=k: leaf[k], whole), spans, over_noise=False)
+    for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
+        begin = perf_counter()
+        found = _springpot_at(case, _minimum_of_case(case, [test], starts, data), spans, over_noise=False)
         fitted = np.asarray(found.solution.residuals) * scales + answer
         where = (test.time[time_tests.thinned(test)], answer, fitted, scales)
-        seconds = (running * (k == 0), compiling * (k == 0))
         details = {"conversion": {"modes": len(found.model.ratios), "largest_relative_error": found.error}}
         own = (found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
-        out.append(TimeFit(*own, *where, found.sentences, *seconds, details, found.own))
+        out.append(TimeFit(*own, *where, found.sentences, perf_counter() - begin, 0.0, details, found.own))
     return out
 
 
@@ -245,23 +219,19 @@ def _cautions_in_time(fit: TimeFit) -> list[str]:
 
 def fractional_together(tests: list[Measured], near: Maxwell) -> list[Together]:
     """Every springpot model of several tests, each test with noise of its own; `near`: Prony modes to begin from."""
-    spans, kinds = spans_of(tests), tuple(map(together.name_of, tests))
-    parts = [together.reported_numbers(t) for t in tests]
-    starts, minima = _starts_near(near, spans), _each_model(kinds)
+    spans, parts = spans_of(tests), [together.reported_numbers(t) for t in tests]
     out = []
-    for k, case in enumerate(FRACTIONAL):
-        first, noise, seconds = starts[k : k + 1], np.full(len(tests), 0.03), np.zeros(2)
+    for case, starts in zip(FRACTIONAL, _starts_near(near, spans), strict=True):
+        begin, noise = perf_counter(), np.full(len(tests), 0.03)
         for _ in range(together.ROUNDS):
             used, data = noise, [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
-            given = (first, case.switches[None], spans.times, spans.reference, data)
-            whole, *took = viscoelastic.timed(minima, *given)
-            whole, seconds = jax.tree.map(lambda leaf: leaf[0], whole), seconds + took
-            noise = together.noises(tests, parts, np.asarray(whole.residuals), noise, len(case.free))
-            first = np.tile(np.asarray(whole.u), (1, STARTS, 1))
-        shares, fitted = together.misfits(tests, data, np.asarray(whole.residuals), noise, len(case.free))
-        found = _springpot_at(case, together.over_own_noise(whole, shares, used / noise), spans, over_noise=True)
+            minimum = _minimum_of_case(case, tests, starts, data)
+            noise = together.noises(tests, parts, np.asarray(minimum.residuals), noise, len(case.free))
+            starts = np.asarray(minimum.u)[None]  # near the minimum already
+        shares, fitted = together.misfits(tests, data, np.asarray(minimum.residuals), noise, len(case.free))
+        found = _springpot_at(case, together.over_own_noise(minimum, shares, used / noise), spans, over_noise=True)
         own = (tests, found.kind, found.model, found.solution, found.spread, bool(found.solution.converged))
-        out.append(Together(*own, shares, fitted, [], found.sentences, seconds[1], seconds[0], found.own))
+        out.append(Together(*own, shares, fitted, [], found.sentences, perf_counter() - begin, 0.0, found.own))
     return out
 
 
@@ -303,17 +273,14 @@ def choose_together(
 def _shares_of_springpots(fit: Together) -> list[Share]:
     """Errors of the model's own numbers without each test, and the misfit of a fit to each test alone."""
     (case,) = (c for c in FRACTIONAL if c.name == fit.kind.name)
-    spans, parts = spans_of(fit.tests), [together.reported_numbers(t) for t in fit.tests]
+    parts = [together.reported_numbers(t) for t in fit.tests]
     assert fit.kind.values is not None and fit.parameters is not None
-    u, jacobian = jnp.asarray(fit.solution.u), np.asarray(fit.solution.jacobian)
-    slope = np.asarray(jax.jacfwd(fit.kind.values)(u))
-    whole = np.asarray(springpots.full(case, u))
-    starts = np.vstack([whole, _around(whole, case, np.random.default_rng(1))])[None]
-    minima = _each_model(tuple(map(together.name_of, fit.tests)))
+    u = np.asarray(fit.solution.u)
+    _, slope = host.with_jacobian(fit.kind.values, u)
+    starts = np.vstack([u, _around(u, case, np.random.default_rng(1))])
 
     def alone(k: int) -> np.ndarray:
         data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
-        given = (starts, case.switches[None], spans.times, spans.reference, data)
-        return np.asarray(viscoelastic.timed(minima, *given)[0].residuals[0])
+        return np.asarray(_minimum_of_case(case, fit.tests, starts, data).residuals)
 
-    return together.shares_by_rows(fit, jacobian, slope, fit.parameters.values, alone)
+    return together.shares_by_rows(fit, np.asarray(fit.solution.jacobian), slope, fit.parameters.values, alone)
