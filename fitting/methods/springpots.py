@@ -61,17 +61,15 @@ def moduli(u: Array, switches: Array, x: Array, angle: float = 0.5 * np.pi) -> t
     By default at s = i omega: G' and G''.
     """
     xp = arrays_of(u, x)
-
-    def power(log_size, exponent):  # size s^exponent
-        size, turn = xp.exp(log_size[..., None] + exponent[..., None] * xp.log(x)), angle * exponent[..., None]
-        return size * xp.cos(turn), size * xp.sin(turn)
-
-    alpha, beta, gamma = _orders(u)
-    beside, own = power(u[..., 0], switches[1] * gamma), power(-u[..., 2], -alpha)
-    in_row = power(-u[..., 4], -switches[3] * beta)
-    real, imaginary = (a + switches[2] * b for a, b in zip(own, in_row, strict=True))
-    square = real * real + imaginary * imaginary
-    return switches[0] * beside[0] + real / square, switches[0] * beside[1] - imaginary / square
+    alpha, beta, gamma = (exponent[..., None] for exponent in _orders(u))
+    gamma, beta = switches[1] * gamma, switches[3] * beta
+    E, V, W = (u[..., k, None] + n * xp.log(x) for k, n in ((0, gamma), (2, alpha), (4, beta)))  # logarithms of sizes
+    least = xp.where(switches[2] > 0, xp.minimum(V.real, W.real), V.real)  # unit of the row, so that nothing overflows
+    own, in_row = xp.exp(least - V), switches[2] * xp.exp(least - W)
+    real = own * xp.cos(angle * alpha) + in_row * xp.cos(angle * beta)
+    imaginary = own * xp.sin(angle * alpha) + in_row * xp.sin(angle * beta)
+    row, beside = xp.exp(least) / (real * real + imaginary * imaginary), switches[0] * xp.exp(E)
+    return beside * xp.cos(angle * gamma) + row * real, beside * xp.sin(angle * gamma) + row * imaginary
 
 
 #: Relaxation times per decade in `as_modes`, and decades by which they exceed the shortest and the longest time.
