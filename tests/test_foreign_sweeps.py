@@ -5,8 +5,10 @@ import re
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from test_rheometer import _workbook
 
+from fitting.__main__ import main
 from fitting.readers.rheometer import read_sweep
 from fitting.readers.tables.sweep_tables import tables_of
 from liverjax import InputError
@@ -298,3 +300,20 @@ def test_holes_are_named(tmp_path):
     (note,) = read_sweep(written(tmp_path, "plain, holes")).notes
     assert "2 of 8 points are left out as unusable: line 2: storage_modulus_Pa is empty; line 3: " in note
     assert any("from |G*| and the phase" in n for n in read_sweep(written(tmp_path, "clipboard")).notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        ("time_s,relaxation_modulus_Pa\n0.1,900\n0.3,800\n1,700\n3,600\n10,500\n30,450\n", "relaxation"),
+        ("time_s,strain,stress_Pa\n0,0,2\n1,0.1,2\n2,0.15,2\n3,0.17,2\n", "creep"),
+        ("depth_um,force_mN\n" + "\n".join(f"{d},{0.01 * d**1.5:.4f}" for d in range(0, 200, 10)), "indentation"),
+        ((ROOT / "data" / "rubber_curves.csv").read_text(), "curves"),
+    ],
+)
+def test_a_file_of_another_test_names_its_command(tmp_path, capsys, text, command):
+    file = tmp_path / "test.csv"
+    file.write_text(text)
+    assert main([str(file), "--method", "closed-form", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"holds no frequency sweep: give it to `python -m fitting {command}`" in said

@@ -1,6 +1,7 @@
 """Options that several commands share: number of modes, draws of the posterior, material cards, band of the sweep."""
 
 import argparse
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,6 +55,28 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
     from fitting.methods import kramers_kronig
     from fitting.readers import rheometer
 
-    sweep = rheometer.within(rheometer.read_sweep(path, options.table), options.min_frequency, options.max_frequency)
+    try:
+        sweep = rheometer.read_sweep(path, options.table)
+    except InputError as no_sweep:
+        other = _other_command(path) if "no header names" in str(no_sweep) else None
+        if other is None:
+            raise
+        raise InputError(f"{path} holds no frequency sweep: give it to `python -m fitting {other}`") from None
+    sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
     sweep = rheometer.without_inertia(sweep, options.radius, options.height)
     return sweep if options.max_frequency else kramers_kronig.without_instrument(sweep)
+
+
+def _other_command(path: Path) -> str | None:
+    """The command for the test in this file; None if no reader knows it."""
+    from fitting.readers import curves, indentation_curves, time_tests
+
+    readers = (
+        time_tests.kind_of,
+        lambda path: indentation_curves.read_indentation(path) and "indentation",
+        lambda path: curves.read_curves([path]) and "curves",
+    )
+    for command_of in readers:
+        with contextlib.suppress(InputError):
+            return command_of(path)
+    return None
