@@ -33,7 +33,7 @@ from liverjax.core.plotting import BLUE, GREY, ORANGE
 
 SWEEPS, STARTS, NOISE = either(1000, 40), 6, 0.02
 #: Sweeps whose first decade is left out (of all the last one is), and those of each truth that the program itself fits.
-FIRST, OWN = either(300, 40), either(60, 2)
+FIRST, OWN = either(300, 40), either(200, 2)
 OMEGA = np.geomspace(0.1, 100, 31)
 #: Frequencies [rad/s] at which intervals of the fitted moduli are looked at, and the ones that are left out at the end.
 LOOKED_AT, LAST_DECADE = np.geomspace(0.1, 100, 7), OMEGA > 10 * (1 + 1e-9)
