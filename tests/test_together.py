@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import liverjax as lj
 from fitting.__main__ import main
 from fitting.commands import together as command
 from fitting.fits import joint, together, viscoelastic
+from fitting.fits.families import springpots_in_time
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -35,7 +37,7 @@ def sweep(noise: float) -> Sweep:
     return Sweep(OMEGA, G[0] * factor[0], G[1] * factor[1], source="sweep.csv")
 
 
-def relaxation(noise: float, scale: float = 1.0) -> TimeTest:
+def relaxation(noise: float, scale: np.ndarray | float = 1.0) -> TimeTest:
     at = np.append(0.0, TIME)
     answer = scale * modulus(at) * (1 + noise * np.random.default_rng(2).standard_normal(len(at)))
     return TimeTest("relaxation", at, np.ones(len(at)), answer, at > 0, source="relaxation.csv")
@@ -60,6 +62,31 @@ def test_each_test_has_the_weight_of_its_own_noise(found):
     # Root mean squares of 30 and of 25 numbers, 5 parameters: 15 %.
     assert [s.noise for s in found.shares] == [pytest.approx(0.02, rel=0.4), pytest.approx(0.005, rel=0.4)]
     assert not any("do not agree" in w for w in found.warnings)
+
+
+def of_the_same_times(scale: np.ndarray | float) -> list[Sweep | TimeTest]:
+    """A sweep that sees the times of the relaxation, and the relaxation with its moduli multiplied."""
+    omega, rng = OMEGA / 50, np.random.default_rng(1)
+    storage, loss = (G * (1 + 0.02 * rng.standard_normal(len(omega))) for G in generalised_maxwell.moduli(TRUTH, omega))
+    return [Sweep(omega, storage, loss, source="sweep.csv"), relaxation(0.005, scale)]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.2, 0.8])
+def test_a_factor_between_the_tests_is_named(scale):
+    """Every modulus of one test is off alike, by another temperature or a wrong size: which test, and by how much."""
+    fit = springpots_in_time.choose_together(of_the_same_times(scale), "prony", 2)
+    told = [w for w in fit.warnings if "the tests agree if" in w]
+    if scale == 1:
+        assert not told and not any("do not agree" in w for w in fit.warnings)
+        return
+    found, error = map(float, re.search(r"relaxation.csv are ([\d.]+) ± ([\d.e-]+) times", told[0]).groups())
+    assert abs(found - scale) < 4 * error + 0.005 * scale and error < 0.02  # printed with three digits
+
+
+def test_tests_that_differ_by_more_than_a_factor_are_only_told_apart():
+    fit = springpots_in_time.choose_together(of_the_same_times(np.append(1.0, (TIME / 10) ** 0.1)), "prony", 2)
+    assert any("do not agree" in w for w in fit.warnings)
+    assert not any("the tests agree if" in w for w in fit.warnings)
 
 
 def test_the_errors_are_those_of_the_stacked_rows(found):

@@ -14,6 +14,7 @@ import numpy as np
 
 from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
+from fitting.fits.honesty import common_factor
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
@@ -243,8 +244,12 @@ def choose_together(
 ) -> Together:
     """The model of the lowest criterion for several tests; arguments as in `choose_in_time` and `together.fit`."""
     prony = together.fit(tests, modes, progress)
-    if model == "prony":
-        return prony
+    fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
+    return fit._replace(warnings=(*fit.warnings, *common_factor.told(fit)))
+
+
+def _best_of_models(tests: list[Measured], model: str, prony: Together, progress: Callable[[str], None]) -> Together:
+    """The model of the lowest criterion: `prony` and the others that `model` names."""
     band = together.ResolvedBand(spans_of(tests)[:2])
     tried = [prony] if model == "auto" else []
     if model in ("fractional", "auto"):

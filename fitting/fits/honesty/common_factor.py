@@ -1,0 +1,78 @@
+"""Tests that contradict each other: would they agree if all moduli of one of them had a common factor?
+
+Another temperature, a sample of another size than stated, or a wrong calibration change all moduli of a test alike. A
+common fit lies between such tests and follows none of them. Here the factor is one more number of the fit.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from fitting.fits import together
+from fitting.fits.together import Together
+from fitting.fits.viscoelastic import Kind
+from fitting.methods.estimate import spread
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.least_squares import from_starts
+
+#: A factor is named if it differs from 1 by so many standard errors.
+CERTAIN = 4.0
+
+
+def told(fit: Together) -> list[str]:
+    """A sentence on the test whose factor makes all tests agree; none if the tests agree, or if no factor helps."""
+    if not together.disagreements(fit.shares) or fit.kind.effective is not None:
+        return []
+    found = {k: factor_of(fit, k) for k in range(1 if len(fit.tests) == 2 else 0, len(fit.tests))}
+    known = {k: own for k, own in found.items() if own is not None}
+    if not known:
+        return []
+    k = min(known, key=lambda k: known[k][2])
+    factor, error, _ = known[k]
+    return [
+        f"the tests agree if all moduli of {fit.shares[k].source or fit.shares[k].name} are {factor:.3g} ± {error:.1g} "
+        "times those of the others: look for another temperature, another sample, or a wrong size of it, and fit the "
+        "tests one by one until then"
+    ]
+
+
+def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
+    """Factor of all moduli of test k [1], its standard error, and the largest misfit left over that of a test alone.
+
+    None if the factor is 1 within its error, or if a test is still missed.
+    """
+    names = list(map(together.name_of, fit.tests))
+    parts = [together.reported_numbers(t) for t in fit.tests]
+    data = [(at, y, scales * s.alone) for (at, y, scales), s in zip(parts, fit.shares, strict=True)]
+    each = [_as_the_others(fit.kind.maxwell), _with_factor(fit.kind.maxwell)]
+
+    def evaluate(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows = [
+            together.tests_evaluated([name], Kind(maxwell=each[j == k]), u, [own])
+            for j, (name, own) in enumerate(zip(names, data, strict=True))
+        ]
+        r, J = zip(*rows, strict=True)
+        return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
+
+    found = from_starts(evaluate, np.append(np.asarray(fit.solution.u), 0.0)[None])
+    counts = [len(y) for _, y, _ in data]
+    left = np.split(np.asarray(found.residuals), np.cumsum(counts)[:-1])
+    worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
+    last = np.eye(len(found.u))[-1:]
+    error = float(np.linalg.norm(spread(np.asarray(found.jacobian), max(1.0, worst), last)[0]))
+    if worst > together.APART or not abs(found.u[-1]) > CERTAIN * error:
+        return None
+    factor = float(np.exp(found.u[-1]))
+    return factor, factor * error, worst
+
+
+def _as_the_others(maxwell: Callable[[np.ndarray], Maxwell]) -> Callable[[np.ndarray], Maxwell]:
+    return lambda u: maxwell(u[..., :-1])
+
+
+def _with_factor(maxwell: Callable[[np.ndarray], Maxwell]) -> Callable[[np.ndarray], Maxwell]:
+    def multiplied(u):
+        model = maxwell(u[..., :-1])
+        return model._replace(shear_modulus=model.shear_modulus * np.exp(u[..., -1]))
+
+    return multiplied
