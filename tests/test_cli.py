@@ -12,6 +12,7 @@ import pytest
 from conftest import ROOT
 
 from fitting.__main__ import main
+from fitting.fits import sample_inertia
 from liverjax.__main__ import main as liverjax_main
 
 PORCINE = ROOT / "data" / "porcine_liver_frequency_sweep.csv"
@@ -118,14 +119,32 @@ BAD = {
     "radius": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "-1"], "--radius -1.0 cannot be"),
     "height in mm": (HEADER + "1,300,30\n2,310,40\n", ["--height", "nan"], "--height nan cannot be"),
     "density": (HEADER + "1,300,30\n2,310,40\n", ["--density", "1.06"], "give e.g. --density 1060"),
-    "density unused": (
+    "density without height": (
         HEADER + "1,300,30\n2,310,40\n",
         ["--density", "1060", "--method", "closed-form"],
-        "--density 1060 is for the simulation only",
+        "--density 1060 needs --height too",
     ),
     "table": (HEADER + "1,300,30\n2,310,40\n", ["--table", "liver"], "--table liver is no table of the file"),
     "steps": (HEADER + "1,300,30\n2,310,40\n", ["--steps", "1"], "--steps 1 is out of range"),
 }
+
+
+def test_the_closed_form_takes_the_inertia_of_the_sample_off(tmp_path, capsys):
+    """A mode of 100 Pa beside a spring of 900 Pa, 10 mm high: at 100 rad/s inertia takes a third of what is seen."""
+    omega = np.geomspace(1.0, 100.0, 12)
+    G = 900.0 + 100.0 * 1j * omega * 0.05 / (1 + 1j * omega * 0.05)
+    seen = sample_inertia.shown(G, omega, 1060.0, 0.01)
+    rows = np.column_stack([omega, seen.real, seen.imag])
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", rows, "%.12g", ",", header=head, comments="")
+    more = ["--density", "1060", "--height", "0.01", "--method", "closed-form", "--out", str(tmp_path)]
+    assert main([str(tmp_path / "s.csv"), *more]) == 0
+    assert "the inertia of the sample, 10 mm high, is taken off" in capsys.readouterr().err
+    found = json.loads((tmp_path / "fit.json").read_text())
+    assert seen.real[-1] < 0.8 * G.real[-1]
+    assert np.isclose(found["equilibrium_modulus"], 900, rtol=1e-6) and np.isclose(
+        found["shear_modulus"], 1000, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", BAD)

@@ -142,6 +142,31 @@ def test_an_offset_of_the_sensor_is_taken_off_and_decimals_follow_the_table(tmp_
     assert np.allclose(read_indentation(tmp_path / "c.csv").force, force[40:], rtol=1e-7)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.1, -0.1])
+def test_a_base_line_that_tilts_is_told_and_taken_off(tmp_path, capsys, tilt):
+    """A sensor that drifts moved the contact point by 13 of its standard errors, and the modulus by three."""
+    depth = np.linspace(-4e-4, 7e-4, 120)
+    force = hertz(depth - START)
+    force += 0.005 * force.max() * np.random.default_rng(3).standard_normal(len(depth))
+    force += tilt * force.max() * np.linspace(0, 1, len(depth))
+    np.savetxt(tmp_path / "c.csv", np.column_stack([depth, force]), "%.9g", ",", header="depth_m,force_N", comments="")
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "1", "--out", str(tmp_path)]
+    assert main(command) == 0
+    content, said = json.loads((tmp_path / "fit.json").read_text()), capsys.readouterr().err
+    assert ("the sensor drifts" in said) == bool(tilt) == (content["without_tilt"] is not None)
+    found = content["without_tilt"] or content
+    for name, true in (("young_modulus", E), ("contact_point", START)):
+        assert abs(found[name] - true) < 4 * found["standard_errors"][name]
+    if tilt:
+        assert abs(content["contact_point"] - START) > 8 * content["standard_errors"]["contact_point"]
+
+
+def test_a_radius_in_millimetres_is_refused(tmp_path, capsys):
+    (tmp_path / "c.csv").write_text("depth_um,force_mN\n0,0\n1,1\n")
+    assert main(["indentation", str(tmp_path / "c.csv"), "--radius", "5", "--thickness", "0.01"]) == 2
+    assert "--radius 5 is in metres: give e.g. --radius 0.005" in capsys.readouterr().err
+
+
 def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):
     """The noise of the approach hid the misfit: a punch on data of a sphere had a third of the modulus, unsaid."""
     depth = np.linspace(-1e-3, 1e-3, 101)

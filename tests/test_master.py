@@ -75,6 +75,15 @@ def test_vertical_factors_are_found_where_the_curve_has_a_shape():
     assert without.apart > 2 * found.apart
 
 
+@pytest.mark.parametrize("vertical", [True, False])
+def test_factors_of_the_moduli_are_told_where_only_frequencies_are_shifted(vertical):
+    """They moved log a by seven of its standard errors while the curves lay 2.4 % apart."""
+    data = temperature_sweeps.AtTemperatures(sweeps(0.01, 2, vertical), TEMPERATURES, None)
+    notes = master_curve.master_curve(data, None).sweep.notes
+    assert any("the moduli have factors too" in n and "give --vertical" in n for n in notes) == vertical
+    assert not any("factors too" in n for n in master_curve.master_curve(data, None, vertical=True).sweep.notes)
+
+
 def test_laws_have_their_numbers_and_errors():
     found = shifts.found(sweeps(0.01, 3), TEMPERATURES, REFERENCE)
     wlf, arrhenius = temperature_laws.temperature_laws_of(found)

@@ -435,6 +435,14 @@ def test_a_temperature_that_drifts_along_the_frequencies_is_told(tmp_path):
         assert any("the temperature changes by 17 K" in n for n in read_sweep(tmp_path / "s.csv").notes) == told
 
 
+def test_a_strain_that_rises_with_the_frequency_is_told(tmp_path):
+    head = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,strain_%\n"
+    for last, told in ((20, True), (1.2, False)):
+        rows = [f"{f},{1000 + f},100,{e}" for f, e in zip((0.1, 1.0, 10.0), np.linspace(1, last, 3), strict=True)]
+        (tmp_path / "s.csv").write_text(head + "\n".join(rows) + "\n")
+        assert any("the strain goes from 0.01 to 0.2" in n for n in read_sweep(tmp_path / "s.csv").notes) == told
+
+
 def test_one_modulus_of_tension_makes_the_other_one_too(tmp_path):
     """Only the one that said so was divided by 3: the loss was three times too large, without a word."""
     rows = "".join(f"{f},{3000 + f},300\n" for f in (0.1, 1.0, 10.0))
@@ -477,17 +485,21 @@ def test_lines_at_other_temperatures_or_strains_are_told(tmp_path):
 @pytest.mark.parametrize(
     ("heading", "values"),
     [
-        ("tan_delta", lambda S, L: L / S),
-        ("phase_deg", lambda S, L: np.degrees(np.arctan(L / S))),
-        ("complex_modulus_kPa", lambda S, L: 1e-3 * np.hypot(S, L)),
+        ("tan_delta", lambda w, S, L: L / S),
+        ("phase_deg", lambda w, S, L: np.degrees(np.arctan(L / S))),
+        ("complex_modulus_kPa", lambda w, S, L: 1e-3 * np.hypot(S, L)),
+        ("Complex viscosity [mPa·s]", lambda w, S, L: 1e3 * np.hypot(S, L) / w),
+        ("|η*| (Pa s)", lambda w, S, L: np.hypot(S, L) / w),
     ],
-    ids=["tangent", "phase", "complex"],
+    ids=["tangent", "phase", "complex", "viscosity", "eta"],
 )
 def test_a_column_that_contradicts_the_moduli_is_told(tmp_path, heading, values, wrong):
     """Rounded to two digits a column contradicts nothing; one that is a tenth off does."""
     omega = np.geomspace(0.1, 100.0, 13)
     S, L = 1000 * omega**0.1, 200 * omega**0.15
-    lines = [f"{w:.6g},{s:.6g},{k:.6g},{x:.2g}" for w, s, k, x in zip(omega, S, L, wrong * values(S, L), strict=True)]
+    lines = [
+        f"{w:.6g},{s:.6g},{k:.6g},{x:.2g}" for w, s, k, x in zip(omega, S, L, wrong * values(omega, S, L), strict=True)
+    ]
     file = tmp_path / "sweep.csv"
     file.write_text("\n".join([f"angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,{heading}", *lines]))
     told = [note for note in read_sweep(file).notes if "contradicts G' and G''" in note]

@@ -27,6 +27,21 @@ def test_exact_samples_have_the_interval_of_student():
     assert np.allclose(p.pooled, values, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("count", "spread", "error"), [(3, 0.2, 1e-3), (6, 0.2, 1e-3), (8, 0.2, 0.2), (8, 0.1, 0.2)])
+def test_a_new_sample_lies_in_its_interval(count, spread, error):
+    """400 populations: 95 % or more, also where the errors hide the spread; exact ones as Student's t says."""
+    rng, inside, lengths = np.random.default_rng(7), [], []
+    for _ in range(400):
+        true, new = spread * rng.standard_normal(count), spread * rng.standard_normal()
+        found = np.log(population(*(np.exp(true + error * rng.standard_normal(count)) * [[1.0], [error]])).new_interval)
+        inside.append(found[0] < new < found[1])
+        lengths.append(found[1] - found[0])
+    assert np.mean(inside) > 0.95 - 3 * np.sqrt(0.95 * 0.05 / 400)
+    if error < 0.01:
+        expected = 2 * scipy.stats.t.ppf(0.975, count - 1) * spread * np.sqrt(1 + 1 / count)
+        assert 0.7 < np.median(lengths) / expected < 1.1  # the median of a chi of 2 is 0.83 of its mean square
+
+
 def test_equal_errors_are_subtracted_from_the_spread():
     """The balanced case has a closed form: s^2 = variance - e^2; a sample keeps s^2 / (s^2 + e^2) of its place."""
     y, e = np.array([0.0, 0.4, 0.8, -0.3, 0.1, 0.6]), 0.2

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from fitting.commands.exit_codes import EXIT_CODES
+from liverjax.core.errors import InputError
 
 COLUMNS = """The file has columns of depth (or displacement, indentation) and force (or load) with their units, e.g.
 depth_um,force_mN. Points after the deepest one are left out. """
@@ -30,6 +31,8 @@ def parser(prog: str) -> argparse.ArgumentParser:
     return command
 
 
+#: Largest radius [m] that is believed, and thickness [m] of a layer that is hardly meant.
+LARGEST, THICK = 0.2, 1.0
 #: Angle [degrees] of a cone whose angle is not given.
 HALF_ANGLE = 45.0
 
@@ -43,17 +46,21 @@ def _notes_on_shape(options: argparse.Namespace) -> list[str]:
         told.append(f"--half-angle is for a cone: it changes nothing for a {options.shape}")
     if cone and options.radius:
         told.append("--radius is for a sphere or a punch: it changes nothing for a cone")
+    if options.thickness > THICK:
+        told.append(f"--thickness is in metres: {options.thickness:g} m act as a half-space")
     return told
 
 
 def run(options: argparse.Namespace) -> int:
     """Fit the curve; exit code 1 if the modulus is not positive."""
-    from fitting.methods.contact_point import fit_contact
+    from fitting.methods.contact_point import fit_contact, fit_without_tilt
     from fitting.readers.indentation_curves import read_indentation
     from fitting.reports import indentation_report
     from fitting.rigs.thin_layer import Indenter, Layer
     from liverjax.core.files import writable
 
+    if options.radius > LARGEST:
+        raise InputError(f"--radius {options.radius:g} is in metres: give e.g. --radius {options.radius / 1000:g}")
     angle = HALF_ANGLE if options.half_angle is None else options.half_angle
     rig = Indenter(options.shape, options.thickness, options.poisson, options.radius, angle)
     layer, curve = Layer(rig), read_indentation(options.file)
@@ -61,7 +68,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
     found = fit_contact(curve.depth, curve.force, layer.force)
-    content = indentation_report.write(options.out, curve, rig, found)
+    level = fit_without_tilt(curve.depth, curve.force, layer.force, found)
+    content = indentation_report.write(options.out, curve, rig, found, level)
     print(indentation_report.table(rig, found, content))
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)

@@ -243,10 +243,8 @@ def _check(options: argparse.Namespace) -> None:
     _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
-    if options.density is not None and options.method == "closed-form":
-        raise InputError(
-            f"--density {options.density:g} is for the simulation only: leave it out or give --method torsion"
-        )
+    if options.density is not None and options.method == "closed-form" and options.height is None:
+        raise InputError(f"--density {options.density:g} needs --height too: the inertia of the sample goes with both")
     _check_precompression(options)
     _check_master(options)
     if len(options.sweep) > 1 and options.master is None:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy.special
 
 from fitting.master import shifts, temperature_laws
 from fitting.master.shifts import Shifts
@@ -15,6 +16,8 @@ from liverjax.core.struct import Content
 
 #: Distance of a sweep from the common curve, and error [decades] of a factor, above which there is a sentence.
 FAR_OFF, LOOSE = 0.05, 0.3
+#: Probability of a better match by chance below which factors of the moduli are named.
+CHANCE = 1e-3
 
 
 class MasterCurve(NamedTuple):
@@ -41,6 +44,7 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
             f"--master {celsius(reference):.4g}: the sweeps are from {celsius(T[0]):.4g} to {celsius(T[-1]):.4g} °C; "
             "give a temperature among them"
         )
+    untold: list[str] = []
     if data.shift_factors is not None:
         log_a, none = np.log10(data.shift_factors), np.zeros(len(T))
         if reference is None:  # the reference temperature of the given factors
@@ -59,10 +63,11 @@ def master_curve(data: AtTemperatures, reference: float | None, vertical: bool =
         )
     else:
         found = shifts.found(data.sweeps, T, place, vertical)
+        untold = [] if vertical else _factors_of_moduli(data.sweeps, found)
     parts = [_shifted_sweep(s, a, b) for s, a, b in zip(data.sweeps, found.log_a, found.log_b, strict=True)]
     laws = temperature_laws.temperature_laws_of(found)
     whole = joined(parts)
-    notes = [*whole.notes, *_sentences(found)]
+    notes = [*whole.notes, *_sentences(found), *untold]
     if vertical and found.given:
         notes.append(
             "--vertical finds no factors of the moduli here, since the file has those of the frequencies: leave out "
@@ -98,6 +103,28 @@ def _sentences(found: Shifts) -> list[str]:
         listed = ", ".join(f"{T[k]:.4g} °C (a factor of {10 ** found.log_a_errors[k]:.2g})" for k in loose[:4])
         out.append(f"the data hardly determine the shift at {listed}: the curves are too flat to lie over each other")
     return out
+
+
+def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
+    """A sentence if the sweeps lie over each other much better once their moduli have factors too (F-test)."""
+    try:
+        other = shifts.found(sweeps, found.temperatures, found.reference, vertical=True)
+    except InputError:
+        return []
+    counts, more = np.array([2 * len(s.storage) for s in sweeps]), len(sweeps) - 1
+    alone, both = (float(counts @ s.misfit**2) for s in (found, other))
+    freedom = counts.sum() - 2 * more - 2 * shifts.size_of_curve(sweeps, other.log_a)
+    if freedom < 1 or scipy.special.fdtrc(more, freedom, (alone / both - 1) * freedom / more) > CHANCE:
+        return []
+    b, T = 10.0**other.log_b, celsius(found.temperatures)
+    moved = np.abs(other.log_a - found.log_a) / np.maximum(found.log_a_errors, 1e-12)
+    k = int(np.argmax(moved))
+    return [
+        f"the moduli have factors too ({b.min():.3g} to {b.max():.3g}): with --vertical the sweeps lie "
+        f"{100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at {T[k]:.4g} °C "
+        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}: give --vertical, or "
+        "the errors of the shifts do not contain this"
+    ]
 
 
 def shift_numbers(found: MasterCurve) -> Content:

@@ -109,6 +109,12 @@ def distances_from_curve(sweeps: Sequence[Sweep], log_a: np.ndarray, log_b: np.n
     return np.sqrt(np.bincount(place, square) / np.bincount(place)) * np.log(10)
 
 
+def size_of_curve(sweeps: Sequence[Sweep], log_a: np.ndarray) -> int:
+    """Number of coefficients of the curve of G' (and of that of G'') for shifted sweeps."""
+    x = np.concatenate([np.log10(s.angular_frequency) + a for s, a in zip(sweeps, log_a, strict=True)])
+    return _basis(x, x)[0].shape[1]
+
+
 def _basis(x: np.ndarray, over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values and slopes (n, C) of the cubic splines over the range of `over`, at x."""
     low, high = over.min() - 1e-6, over.max() + 1e-6

@@ -1,7 +1,8 @@
 """Modulus and contact point of a force-depth curve whose force is linear in the modulus.
 
-F = E f(d - d0), 0 before contact. For a given contact point d0 the best modulus is a quotient of sums, so the search is
-for d0 alone: on a grid, then between grid points (variable projection; Golub and Pereyra 1973).
+F = E f(d - d0), 0 before contact; a straight base line may be added. For a given contact point d0 the force is linear
+in all other numbers, so the search is for d0 alone: on a grid, then between grid points (variable projection; Golub and
+Pereyra 1973).
 """
 
 from collections.abc import Callable
@@ -24,6 +25,8 @@ class ContactFit(NamedTuple):
     noise: float  # standard deviation of the force [N]
     residuals: np.ndarray  # (n,) [N]
     before: int  # points before contact
+    tilt: float = 0.0  # rise of the base line over all depths [N]
+    tilt_error: float = 0.0
 
     @property
     def quantile(self) -> float:
@@ -31,23 +34,31 @@ class ContactFit(NamedTuple):
         return float(scipy.special.stdtrit(len(self.residuals) - 2, 0.975))
 
 
-def fit_contact(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
+def fit_contact(
+    depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], tilted: bool = False
+) -> ContactFit:
     """Fit modulus and contact point by least squares of the force.
 
     Args:
         depth: (n,) [m].
         force: (n,) [N].
         unit_force: depths after contact (n,) [m], negative before -> force per unit modulus (n,) [N/Pa].
+        tilted: a straight line is added to the force: the base line of a sensor that drifts.
     """
     span = float(np.ptp(depth))
+    line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : 2 * tilted]
 
-    def modulus(start: float) -> tuple[float, np.ndarray]:
+    def linear(start: float) -> tuple[np.ndarray, np.ndarray]:
         f = unit_force(depth - start)
-        return float(f @ force / max(float(f @ f), 1e-300)), f
+        size = max(float(np.linalg.norm(f)), 1e-300)
+        A = np.column_stack([f / size, line])
+        numbers = np.linalg.lstsq(A, force, rcond=None)[0]
+        numbers[0] /= size
+        return numbers, np.column_stack([f, line])
 
     def misfit(start: float) -> float:
-        E, f = modulus(start)
-        return float(np.sum((force - E * f) ** 2))
+        numbers, A = linear(start)
+        return float(np.sum((force - A @ numbers) ** 2))
 
     # The contact may lie before the first point, but not after the last.
     grid = np.linspace(depth.min() - 0.5 * span, depth.max() - 1e-3 * span, _GRID)
@@ -56,13 +67,43 @@ def fit_contact(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.n
     start = float(
         scipy.optimize.minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 1e-9 * span}).x
     )
-    E, f = modulus(start)
+    numbers, A = linear(start)
+    E = float(numbers[0])
     h = 1e-5 * span
     slope = (unit_force(depth - start - h) - unit_force(depth - start + h)) / (2 * h)
-    J = np.stack([f * E, E * slope * span], axis=1)  # by ln E and by d0 over the span
-    residuals = force - E * f
-    noise = float(np.sqrt(residuals @ residuals / (len(force) - 2)))
+    # By ln E, by d0 over the span, and by the line in units of the largest force.
+    J = np.column_stack([A[:, 0] * E, E * slope * span, line * np.abs(force).max()])
+    residuals = force - A @ numbers
+    noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
     covariance = noise**2 * np.linalg.pinv(J.T @ J)
     sizes = np.sqrt(np.diag(covariance))
     correlation = float(covariance[0, 1] / max(sizes[0] * sizes[1], 1e-300))
-    return ContactFit(E, start, sizes * np.array([E, span]), correlation, noise, residuals, int(np.sum(depth <= start)))
+    tilt = (float(numbers[2]), float(sizes[3] * np.abs(force).max())) if tilted else (0.0, 0.0)
+    before = int(np.sum(depth <= start))
+    return ContactFit(E, start, sizes[:2] * np.array([E, span]), correlation, noise, residuals, before, *tilt)
+
+
+#: Part of the approach in which contact has not begun in spite of a tilt, and fewest points there.
+_FREE, _FEWEST = 0.7, 8
+#: Size over its error above which a tilt counts: that of the approach alone, and that of the whole fit.
+_SEEN, _CLEAR = 2.0, 4.0
+
+
+def fit_without_tilt(
+    depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], plain: ContactFit
+) -> ContactFit | None:
+    """The fit with a straight base line, if the approach rises or falls and the whole curve confirms it; else None.
+
+    Args:
+        depth, force, unit_force: as in `fit_contact`.
+        plain: fit without this line.
+    """
+    free = depth < depth.min() + _FREE * (plain.contact_point - depth.min())
+    if free.sum() < _FEWEST or not np.ptp(depth[free]) > 0:
+        return None
+    x, y = depth[free] - depth[free].mean(), force[free] - force[free].mean()
+    slope = float(x @ y / (x @ x))
+    noise = float(np.sqrt(np.sum((y - slope * x) ** 2) / (len(x) - 2)))
+    level = fit_contact(depth, force, unit_force, tilted=True)
+    seen = abs(slope) * np.sqrt(x @ x) > _SEEN * noise and slope * level.tilt > 0
+    return level if seen and abs(level.tilt) > _CLEAR * level.tilt_error else None

@@ -2,7 +2,9 @@
 
 The logarithm y_i of sample i has the mean mu, a spread s between samples and an error e_i: y_i ~ N(mu, s^2 + e_i^2).
 s is estimated by restricted maximum likelihood, the interval of mu after Hartung and Knapp (2001), Statistics in
-Medicine 20, the one of a new sample after Higgins, Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172.
+Medicine 20. The interval of a new sample is that of Student's t with n - 1 degrees of freedom, exact where the errors
+are small (Higgins, Thompson and Spiegelhalter (2009), J. R. Stat. Soc. A 172, take n - 2). Where the errors may hide s,
+the interval over all s is used, if it is wider.
 
 Few samples say little about s. The values of the samples moved towards the mean are therefore means over all s, weighed
 by the restricted likelihood and by a half-Cauchy prior of scale 1 (Gelman 2006, Bayesian Analysis 1, 515), and their
@@ -20,6 +22,8 @@ from liverjax.core.errors import InputError
 
 #: Effective over real number of samples below which Hartung and Knapp's interval is too narrow.
 EVEN = 0.8
+#: Mean variance of the errors over that between samples above which the latter is not known from its best value.
+UNSURE = 0.25
 #: A number below this part of the mean, with a larger error, is not that of a sample of the population.
 BELOW = 1e-3
 
@@ -48,14 +52,14 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
     mean, sd = _weighted_mean(y, v, variance)
     n = len(y)
     half = float(scipy.stats.t.ppf(0.975, n - 1)) * sd
-    half_new = float(scipy.stats.t.ppf(0.975, max(1, n - 2))) * float(np.hypot(np.sqrt(variance), sd))
+    half_new = float(scipy.stats.t.ppf(0.975, n - 1)) * float(np.hypot(np.sqrt(variance), sd))
     intervals = (mean - half, mean + half), (mean - half_new, mean + half_new)
     over = _over_spreads(y, v)
     w = 1 / (v + variance)
     if np.sum(w) ** 2 / np.sum(w**2) < EVEN * n:
-        whole = over.interval(0.0), over.interval(1.0)
-        first, second = ((min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(intervals, whole, strict=True))
-        intervals = first, second
+        intervals = _hull(intervals[0], over.interval(0.0)), _hull(intervals[1], over.interval(1.0))
+    elif np.mean(v) > UNSURE * variance:
+        intervals = intervals[0], _hull(intervals[1], over.interval(1.0))
     pooled, pooled_errors = np.full((2, len(values)), np.nan)
     # Samples that determine nothing are like a new one; a value far below the others is another material.
     silent = ~known & (values > BELOW * np.exp(mean))
@@ -70,6 +74,10 @@ def population(values: np.ndarray, errors: np.ndarray) -> Population | None:
         pooled=np.exp(pooled),
         pooled_errors=pooled_errors,
     )
+
+
+def _hull(a: tuple[float, float], b: tuple[float, float]) -> tuple[float, float]:
+    return min(a[0], b[0]), max(a[1], b[1])
 
 
 class _Spreads(NamedTuple):

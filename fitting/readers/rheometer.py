@@ -103,7 +103,8 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     if len(np.unique(omega)) < 2:
         raise InputError(f"{path}: it has {len(np.unique(omega))} frequency; give at least two different ones")
     values = storage_and_loss(values, notes)
-    notes += _contradictions(path, [(c, written[good]) for c, written in table.beside], values)
+    beside = [(c, written[good]) for c, written in table.beside]
+    notes += _contradictions(path, beside, values | {"frequency": omega})
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
             f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is there; give both or none"
@@ -133,6 +134,11 @@ def _what_differs(sweep: Sweep) -> list[str]:
                 f"the temperature changes by {np.ptp(heat):.2g} K in the sweep: what it does to the moduli is taken "
                 "for an effect of the frequency"
             )
+        if strain.size and strain.min() > 0 and strain.max() > STRAINED * strain.min():
+            out.append(
+                f"the strain goes from {strain.min():.2g} to {strain.max():.2g} in the sweep: if it is not small, what "
+                "it does to the moduli is taken for an effect of the frequency"
+            )
         return out
     if heat.size and np.ptp(heat) > WARMER:
         low, high = celsius(np.array([heat.min(), heat.max()]))
@@ -153,9 +159,10 @@ CONTRADICTS = 0.03
 
 
 def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: Content) -> list[str]:
-    """Notes on columns of |G*|, phase or tan(delta) that differ from what G' and G'' say of them."""
+    """Notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from what G' and G'' say of them."""
     G = values["storage"] + 1j * values["loss"]
     expected = {"complex": np.abs(G), "phase": np.angle(G), "tangent": values["loss"] / values["storage"]}
+    expected["viscosity"] = np.abs(G) / values["frequency"]
     out = []
     for column, written in beside:
         if not np.isfinite(written).any() or (column.quantity == "phase" and column.unit is None):

@@ -194,6 +194,14 @@ def of_columns(
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
+#: A note on rows that begin at 0 s with the load there.
+BEGINS_LOADED = (
+    "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the load rose before it, or "
+    "the sample was loaded before, give those rows too: what relaxed until then is missing from G0 otherwise. --ramp 0 "
+    "(in a description: ramp = 0) says that it was a step"
+)
+
+
 def from_rest(
     time: np.ndarray, driven: np.ndarray, answer: np.ndarray, at_once: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
@@ -204,7 +212,8 @@ def from_rest(
         at_once: whether the first load acted from 0 s on; else it was raised from 0 s until the first row.
     """
     if not time[0] > 0:
-        return time, driven, answer, []
+        loaded = abs(driven[0]) > AT_REST * np.max(np.abs(driven)) and not at_once
+        return time, driven, answer, [BEGINS_LOADED] if loaded else []
     first, notes = driven[0] if at_once else 0.0, []
     if not at_once and abs(driven[0]) > AT_REST * np.max(np.abs(driven)):
         notes.append(

@@ -12,6 +12,9 @@ FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad/sec", "rad_s"
 FREQUENCY_UNITS |= dict.fromkeys(("rad s-1", "rad_s-1", "rad s^-1", "rad·s-1", "rad.s-1", "rad*s-1"), 1.0)
 ANGLE_UNITS = dict.fromkeys(("°", "º", "deg", "degree", "degrees", "grad"), np.pi / 180) | {"rad": 1.0, "mrad": 1e-3}
 TANGENT_UNITS = dict.fromkeys(("", "-", "1", "none"), 1.0)
+VISCOSITY_UNITS = {
+    f"{unit}{sign}s": factor for unit, factor in (("Pa", 1.0), ("mPa", 1e-3), ("kPa", 1e3)) for sign in " .·*_-"
+}
 #: Units of the stress in curves.
 STRESS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6}
 _TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6, "nN.m": 1e-9, "nNm": 1e-9}

@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 _WIDE, _DEEP = 0.4, 0.2
 
 
-def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> Content:
-    """Write both files; returns the JSON."""
+def write(
+    out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
+) -> Content:
+    """Write both files; returns the JSON. `level`: fit without a tilt of the base line, if there is one."""
     out.mkdir(parents=True, exist_ok=True)
     G, errors = fit.modulus / (2 * (1 + rig.poisson)), fit.standard_errors
     alone = half_space(rig, curve.depth - fit.contact_point)
@@ -49,7 +51,8 @@ def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) ->
             "poisson": rig.poisson,
             "thickness": rig.thickness,
             "points_before_contact": fit.before,
-            "warnings": indentation_warnings(curve, rig, fit),
+            "without_tilt": None if level is None else _of_level(level),
+            "warnings": indentation_warnings(curve, rig, fit, level),
             "data": curve.source,
             "notes": list(curve.notes),
             "versions": versions(),
@@ -60,11 +63,25 @@ def write(out: Path, curve: IndentationCurve, rig: Indenter, fit: ContactFit) ->
     return content
 
 
-def indentation_warnings(curve: IndentationCurve, rig: Indenter, fit: ContactFit) -> list[str]:
+def _of_level(level: ContactFit) -> Content:
+    E, d0 = level.standard_errors
+    errors = {"young_modulus": E, "contact_point": d0}
+    return {"young_modulus": level.modulus, "contact_point": level.contact_point, "standard_errors": errors}
+
+
+def indentation_warnings(
+    curve: IndentationCurve, rig: Indenter, fit: ContactFit, level: ContactFit | None = None
+) -> list[str]:
     """Warnings about the modulus for its reader."""
     told, deepest = [], float(curve.depth.max() - fit.contact_point)
     if fit.before < 3:
         told.append(f"{fit.before} points are before contact: measure the approach too, it fixes the contact point")
+    if level is not None:
+        told.append(
+            "the force rises or falls steadily before contact: the sensor drifts, and modulus and contact point follow "
+            f"it. Without a straight line through these points E = {level.modulus:.5g} ± "
+            f"{level.standard_errors[0]:.2g} Pa and d0 = {level.contact_point:.5g} ± {level.standard_errors[1]:.2g} m"
+        )
     width = np.sqrt(deepest / rig.radius) if rig.shape == "sphere" else 0.0
     if width > _WIDE or deepest > _DEEP * rig.thickness:
         far = (

@@ -5,8 +5,8 @@ import re
 import numpy as np
 
 from fitting.readers.tables.sweep_columns import Column, is_angular, is_tensile, pair_of
-from fitting.readers.tables.sweep_headings import known_unit
-from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, PER_SECOND, TANGENT_UNITS
+from fitting.readers.tables.sweep_headings import UNITS, known_unit
+from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS, PER_SECOND
 from liverjax.core.errors import InputError
 
 #: Units that a column may name, for a sentence.
@@ -24,7 +24,8 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
     if quantity == "tangent":
         unit = unit or "1"
     if unit is None:
-        unit = "Pa" if quantity not in ("frequency", "phase") else "rad/s" if is_angular(column) else "Hz"
+        default = {"frequency": "rad/s" if is_angular(column) else "Hz", "viscosity": "Pa s"}
+        unit = default.get(quantity, "Pa")
         if quantity == "phase":
             if np.nanmax(written) <= 0.5 * np.pi:
                 raise InputError(
@@ -43,7 +44,7 @@ def column_in_si(path: str, column: Column, written: np.ndarray, notes: list[str
         )
     if quantity == "frequency":
         return written * _of_frequency(path, column, unit)
-    return written * {"phase": ANGLE_UNITS, "tangent": TANGENT_UNITS}.get(quantity, MODULUS_UNITS)[unit]
+    return written * UNITS.get(quantity, MODULUS_UNITS)[unit]
 
 
 def _of_frequency(path: str, column: Column, unit: str) -> float:

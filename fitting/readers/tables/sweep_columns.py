@@ -28,7 +28,7 @@ class Column(NamedTuple):
 
     place: int  # index in the line, from 0
     name: str
-    quantity: str  # frequency, storage, loss, complex, phase, tangent; the moduli and angles also with "_sd"
+    quantity: str  # frequency, storage, loss, complex, phase, tangent, viscosity; some of them also with "_sd"
     unit: str | None
 
 
@@ -73,7 +73,7 @@ def header_columns(cells: list[str]) -> list[Column]:
 
 
 def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> list[Column]:
-    """Columns of |G*|, phase and tan(delta) that a sweep does not need, with known units; the first of each.
+    """Columns of |G*|, phase, tan(delta) and |eta*| that a sweep does not need, with known units; the first of each.
 
     Args:
         cells: headings.
@@ -84,7 +84,7 @@ def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> li
     found: dict[str, Column] = {}
     for k, cell in enumerate(cells):
         quantity, unit = quantity_of(cell) or ("", None)
-        if quantity not in ("complex", "phase", "tangent") or quantity in needed or quantity in found:
+        if quantity not in ("complex", "phase", "tangent", "viscosity") or quantity in needed or quantity in found:
             continue
         if quantity == "tangent":
             unit = unit or "1"

@@ -2,7 +2,7 @@
 
 import re
 
-from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, TANGENT_UNITS
+from fitting.readers.units import ANGLE_UNITS, FREQUENCY_UNITS, MODULUS_UNITS, TANGENT_UNITS, VISCOSITY_UNITS
 
 DEVIATION_WORDS = {"sd", "std", "stdev", "stddev", "se", "sem", "error", "err", "uncertainty", "deviation"}
 #: Words that add nothing: kinds of the same quantity, and symbols after a name.
@@ -35,6 +35,7 @@ WORDS = {
         *("tan delta", "tandelta", "tan d", "tand", "loss factor", "loss tangent", "damping factor"),
         *("verlustfaktor", "facteur de perte"),
     ),
+    "viscosity": ("complex viscosity", "eta*", "komplexe viskosität", "viscosité complexe"),
 }
 UNCERTAIN = {"storage", "loss", "f", "w", "phase", "delta", "angular"}
 _LONGEST_FIRST = sorted(
@@ -43,6 +44,15 @@ _LONGEST_FIRST = sorted(
 )
 #: Typographic characters, and the plain ones that replace them.
 _PLAIN = {"′": "'", "’": "'", "`": "'", "´": "'", "″": "''", "”": "''", '"': "''", "δ": "delta", "ω": "omega"}
+_PLAIN["η"] = "eta"
+
+
+#: Units of what is no modulus and no frequency.
+UNITS: dict[str, dict[str, float]] = {
+    "phase": ANGLE_UNITS,
+    "tangent": TANGENT_UNITS,
+    "viscosity": VISCOSITY_UNITS,
+}
 
 
 def known_unit(quantity: str, unit: str | None) -> bool:
@@ -51,7 +61,7 @@ def known_unit(quantity: str, unit: str | None) -> bool:
         return True
     if quantity == "frequency":
         return unit.lower() in FREQUENCY_UNITS
-    return unit in {"phase": ANGLE_UNITS, "tangent": TANGENT_UNITS}.get(quantity, MODULUS_UNITS)
+    return unit in UNITS.get(quantity, MODULUS_UNITS)
 
 
 def quantity_of(cell: str) -> tuple[str, str | None] | None:
@@ -60,7 +70,7 @@ def quantity_of(cell: str) -> tuple[str, str | None] | None:
     for sign, plain in _PLAIN.items():
         name = name.replace(sign, plain)
     name = re.sub(r"\btan[\s_]*[(\[]\s*(delta|d)\s*[)\]]", "tan delta", name, flags=re.IGNORECASE)
-    name, unit = _name_and_unit(re.sub(r"\|\s*([ge])\s*\*?\s*\|", r"\1*", name, flags=re.IGNORECASE))
+    name, unit = _name_and_unit(re.sub(r"\|\s*(g|eta|e)\s*\*?\s*\|", r"\1*", name, flags=re.IGNORECASE))
     words = [w for w in re.split(r"[\s_.,:()\[\]]+", name) if w]
     spread = any(w.lower() in DEVIATION_WORDS for w in words)
     words = [w for w in words if w.lower() not in DEVIATION_WORDS | {"standard", "mean"}]
