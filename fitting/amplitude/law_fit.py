@@ -125,6 +125,12 @@ def said_of(sweep: StrainSweep, best: StrainFit) -> list[str]:
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
     change = tangents[-1] / tangents[0] - 1
+    shape = [n for n, unit in zip(best.law.names, best.law.units, strict=True) if unit == "1" and n != "loss_tangent"]
+    if "loss_tangent" in best.law.names and shape:
+        told.append(
+            f"without --model the stress at rest has the modulus of this frequency too: {' and '.join(shape)} may be "
+            "off by several per cent, which no standard error contains; give the fit.json of a frequency sweep"
+        )
     if abs(change) > CHANGED:
         told.append(
             f"the loss tangent changes by {100 * change:+.0f} % over the sweep: no law whose memory is the same at all "
