@@ -191,6 +191,7 @@ def test_the_commands_take_a_description(tmp_path):
         ({"height": None}, "tension needs height: give it in metres"),
         ({"radius": "wide"}, "radius = 'wide' is not a number"),
         ({"radius": 10.0}, "radius = 10 cannot be that of a sample"),
+        ({"radius": 0.001, "height": 0.02}, "height = 0.02 m is 20 radii, and glued samples are computed up to 10"),
         ({"radus": 0.01}, "did you mean radius"),
         ({"poisson": 0.5}, "must be from 0 to 0.4995"),
         ({"drive": "torque"}, "use displacement or force"),

@@ -199,6 +199,11 @@ BAD = {
     "unit": ("time_s,relaxation_modulus [psi]\n" + ROWS, [], "unit 'psi' of modulus is not known"),
     "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is no number"),
     "order": ("time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n0.5,6\n2,5\n3,5\n", [], "follows"),
+    "backwards": (
+        "time_s,relaxation_modulus_Pa\n3,5\n2,6\n1,7\n0.5,8\n",
+        [],
+        "the rows run backwards, from 3 s to 0.5 s",
+    ),
     "negative": ("time_s,strain,stress_Pa\n0,1,900\n1,1,-700\n2,1,-6\n3,1,-5\n4,1,-5\n", [], "correct the signs"),
     "no size": ("time_s,angle_rad,torque_N.m\n0,1,9\n1,1,7\n2,1,6\n3,1,6\n", [], "give --radius and --height"),
     "no strain": ("time_s,strain,stress_Pa\n0,0,9\n1,0,7\n2,0,6\n3,0,5\n", [], "the strain is zero throughout"),

@@ -163,6 +163,10 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
     """
     columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     time = columns["time"]
+    if len(time) > 2 and np.all(np.diff(time) < 0):
+        raise InputError(
+            f"{path}: the rows run backwards, from {time[0]:g} s to {time[-1]:g} s; turn their order round"
+        )
     if np.any(np.diff(time) <= 0) or time[0] < 0:
         k = int(np.argmax(np.diff(time) <= 0)) + 1
         order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"

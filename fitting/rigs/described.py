@@ -42,6 +42,8 @@ _GLUED, _LAYER = 0.4995, 0.5
 _GRID = (0.05, 0.5, 1.0)
 #: Most rows of an indenter's test, with the rows that are added between the measured ones.
 _MOST_ROWS = 2000
+#: Height of a glued sample over its radius up to which it is computed. Beyond it meshes are large, and minutes go by.
+_SLENDER = 10.0
 #: Deviation from a straight line above which there is a note.
 _CURVED = 0.02
 
@@ -189,6 +191,12 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
         raise InputError(
             f"{path}: the displacement reaches {largest:g} m, more than half of the height {height:g} m: change height "
             "or the displacement's unit"
+        )
+    if height > _SLENDER * radius:
+        raise InputError(
+            f"{path}: height = {height:g} m is {height / radius:.3g} radii, and glued samples are computed up to "
+            f"{_SLENDER:g}: the ends of so slender a sample hardly matter, so give its shear stress, a third of the "
+            "tensile stress, and strain as a table of its own"
         )
     at = largest * np.array(_GRID)
     with warnings.catch_warnings(record=True) as said:
