@@ -1,8 +1,10 @@
 """Waves on voxels from files: formats, units, wrapped phases, and files that cannot be used."""
 
+import re
 import sys
 
 import h5py
+import nibabel
 import numpy as np
 import pytest
 import scipy.io
@@ -221,3 +223,52 @@ def test_a_column_with_another_name_is_told(tmp_path):
     path.write_text(path.read_text().replace("frequency", "freq_Hz"))
     with pytest.raises(InputError, match=r"name the column of the frequencies frequency \(not freq_hz\)"):
         wave_field.read_waves(path)
+
+
+def _nifti_of_waves(path, affine, pixdim=None):
+    field = plane_waves((7, 7, 7))
+    image = nibabel.Nifti1Image(np.moveaxis(field.displacement, 0, 3).astype(np.complex64), affine)
+    if pixdim is not None:
+        image.header["pixdim"][1:4] = pixdim
+    nibabel.save(image, path)
+    return field
+
+
+SHEARED = np.array([[2.0, 1.0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("affine", "pixdim", "words"),
+    [
+        (np.diag([2.0, 2, 2, 1]), [1.0, 1, 1], "its header has voxels of [1.0, 1.0, 1.0] and its affine of"),
+        (SHEARED, None, "the axes of its voxels are not at right angles"),
+    ],
+)
+def test_a_nifti_file_whose_voxels_are_not_known_is_refused(tmp_path, affine, pixdim, words):
+    """The spacing came from the header: 754 Pa for 3000 where the affine said another one."""
+    path = tmp_path / "w.nii"
+    _nifti_of_waves(path, affine)
+    if pixdim is not None:  # nibabel writes both alike
+        raw = bytearray(path.read_bytes())
+        raw[80:92] = np.array(pixdim, "<f4").tobytes()
+        path.write_bytes(raw)
+    with pytest.raises(InputError, match=re.escape(words)):
+        wave_field.read_waves(path, frequencies=list(HERTZ))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_labels_that_lie_elsewhere_than_the_waves_are_refused(tmp_path, turned):
+    """Stored with x backwards, the soft region took the stiff one's place."""
+    field = _nifti_of_waves(tmp_path / "w.nii", np.diag([2.0, 2, 2, 1]))
+    labels = np.ones(field.mask.shape, np.int16)
+    labels[4:] = 2
+    affine = np.diag([2.0, 2, 2, 1])
+    if turned:
+        affine[0, 0], affine[0, 3], labels = -2.0, 12.0, labels[::-1].copy()
+    nibabel.save(nibabel.Nifti1Image(labels, affine), tmp_path / "l.nii")
+    if turned:
+        with pytest.raises(InputError, match="its voxels lie elsewhere than those of the waves"):
+            wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
+        return
+    read = wave_field.read_waves(tmp_path / "w.nii", labels=tmp_path / "l.nii", frequencies=list(HERTZ))
+    assert np.array_equal(read.labels, labels)

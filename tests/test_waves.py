@@ -374,6 +374,22 @@ def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
     assert np.all(np.abs(found.mesh_bias - error) < 0.25 * np.abs(error))
 
 
+def test_each_region_has_the_error_of_waves_of_its_own_length():
+    """A soft region beside a stiff one: that of the whole organ's modulus was a sixth of it."""
+    field = plane_waves((9, 9, 9), noise=4e-7)
+    organ, G = elastography.organ_of(field, elastography.body_of(field), DENSITY), modulus(HERTZ)[0]
+    bias, left = elastography._biases(organ, np.array([[G, 4 * G, 1.1 * G, 2 * G]] * len(HERTZ)))
+    weights = elastography.directions_of_waves(field)
+    for r, factor in ((0, 1), (1, 4), (2, 1.1), (3, 2)):
+        own = elastography.plane_wave_biases(factor * G, 2 * np.pi * HERTZ[0], organ, weights[0])
+        exact = own @ weights[0]
+        # A modulus near another one takes its waves, as the error goes with the square of the wave number: to a
+        # quarter, which is how well this estimate is known.
+        assert abs(bias[0, r] - exact) < (1e-12 if r != 2 else 0.25) * abs(exact)
+        assert left[0, r].shape == (len(elastography.DIRECTIONS),)
+    assert abs(bias[0, 0] - bias[0, 1]) > 0.1 * abs(bias[0, 0])
+
+
 def _waves_of_many_directions(shape, seed):
     """Eight plane waves at 75 Hz in 3000 + 900i Pa (1, nx, ny, nz, 3), whose root mean square is 1e-5 m."""
     rng, k = np.random.default_rng(seed), 2 * np.pi * 75.0 * np.sqrt(DENSITY / (3000 + 900j))

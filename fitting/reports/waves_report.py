@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: chi^2 per equation above which there is a warning that the model misses something.
 TOO_FAR = 1.5
+#: Standard deviations of the chi^2 of a map above which it is told.
+BY_CHANCE = 5.0
 #: The same, above which the moduli themselves may be wrong.
 WRONG = 10.0
 #: Fewest frequencies of a sweep.
@@ -52,7 +54,7 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
         "spacing_m": organ.field.spacing.tolist(),
         "voxels": int(organ.body.mesh.number_of_nodes),
         "elements": int(organ.body.mesh.number_of_elements),
-        "whole": _of_regions(organ, found.whole, found)[0],
+        "whole": _of_regions(organ, found.whole, found.mesh_bias[:, None], found.bias_left[:, None])[0],
         "regions": _by_label(organ, found),
         "direct_inversion": _direct(organ, found, usual),
         "map": None if drawn is None else _of_map(drawn),
@@ -70,15 +72,16 @@ def write(out: Path, organ: Organ, found: Found, drawn: WaveMap | None, usual: n
     return content
 
 
-def _of_regions(organ: Organ, own: Regions, found: Found) -> list[Content]:
+def _of_regions(organ: Organ, own: Regions, bias: np.ndarray, left: np.ndarray) -> list[Content]:
     """One dictionary per region, with lists over the frequencies. Errors contain noise, the uncertainty of the edges'
-    places, and the error of the elements: its mean over the directions of waves, and how far these are apart.
+    places, and the error of the elements: its mean `bias` (F, R) over the directions of waves, and what is `left` of
+    it (F, R, D) for each direction.
     """
     omega, rows = organ.waves.omega, []
     for r in range(own.modulus.shape[1]):
         G, e = own.modulus[:, r], own.standard_errors[:, r]
         c, alpha = velocity_and_attenuation(G.real, G.imag, omega, organ.density)
-        missed, along = G * found.mesh_bias, G[:, None] * found.bias_left
+        missed, along = G * bias[:, r], G[:, None] * left[:, r]
         rows.append(
             {
                 "storage_Pa": G.real.tolist(),
@@ -155,9 +158,9 @@ def _sweeps(out: Path, organ: Organ, content: Content) -> dict[str, Path]:
 
 
 def _by_label(organ: Organ, found: Found) -> Content | None:
-    if found.parts is None or found.labels is None:
+    if found.parts is None or found.labels is None or found.parts_bias is None or found.parts_bias_left is None:
         return None
-    rows = _of_regions(organ, found.parts, found)
+    rows = _of_regions(organ, found.parts, found.parts_bias, found.parts_bias_left)
     return {str(label): row for label, row in zip(found.labels, rows, strict=True)}
 
 
@@ -200,12 +203,7 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
         if not np.isfinite(organ.field.noise[f]):
             continue
         told += _of_residuals(hertz, each, f, "regions" if found.parts else "moduli")
-        bias, error = np.abs(found.mesh_bias[f]), each.standard_errors[f].real / np.abs(each.modulus[f])
-        if bias > error.min():
-            told.append(
-                f"{hertz:g} Hz: the size of the voxels changes the moduli by {100 * bias:.2g} % "
-                f"(standard error {100 * error.min():.2g} %): subtract mesh_bias, or measure smaller voxels"
-            )
+        told += _of_voxel_size(hertz, found, f)
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
         for label in found.labels[few]:
@@ -217,12 +215,32 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
                 f"regions {names}: the waves place their edges more than a voxel away from the edges of the labels "
                 "(edges_farther_out_voxels): look at the labels"
             )
-    if drawn is not None and not drawn.reached and drawn.chi2 > TOO_FAR * drawn.components:
+    # The mean of n squares scatters by the root of 2/n.
+    if drawn is not None and drawn.chi2 / drawn.components > 1 + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
-            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, or "
-            "a body that does not move like a viscous solid"
+            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, a ratio "
+            "of the moduli at several frequencies that is not the same everywhere, or a body that does not move like a "
+            "viscous solid; its deviations are too small then, so compare it with regions and with one frequency alone"
         )
     return told
+
+
+def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
+    """A sentence if the size of the voxels changes a modulus by more than its standard error."""
+    each, biases = found.whole, found.mesh_bias[:, None]
+    if found.parts is not None and found.parts_bias is not None:
+        each, biases = found.parts, found.parts_bias
+    bias, error = np.abs(biases[f]), each.standard_errors[f].real / np.abs(each.modulus[f])
+    r = int(np.argmax(bias / np.maximum(error, 1e-12)))
+    if not bias[r] > error[r]:
+        return []
+    which = "the modulus"
+    if found.parts is not None and found.labels is not None:
+        which += f" of region {found.labels[r]}"
+    return [
+        f"{hertz:g} Hz: the size of the voxels changes {which} by {100 * bias[r]:.2g} % (standard error "
+        f"{100 * error[r]:.2g} %): subtract mesh_bias, or measure smaller voxels"
+    ]
 
 
 def _of_residuals(hertz: float, each: Regions, f: int, uniform: str) -> list[str]:

@@ -39,6 +39,8 @@ class Found(NamedTuple):
     parts: Regions | None
     mesh_bias: np.ndarray  # (F,) complex, relative: from plane waves with the modulus of the whole
     bias_left: np.ndarray  # (F, D) how each direction of these waves adds to the uncertainty of this mean
+    parts_bias: np.ndarray | None = None  # (F, R) the same with the moduli of the regions
+    parts_bias_left: np.ndarray | None = None  # (F, R, D)
 
 
 def body_of(field: WaveField) -> VoxelBody:
@@ -68,11 +70,7 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     m, waves, body = organ.matrices, organ.waves, organ.body
     start = regions.first_modulus(m, waves)
     whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress, body.voxel)
-    given = zip(whole.modulus[:, 0], waves.omega, directions_of_waves(organ.field), strict=True)
-    rows = [(plane_wave_biases(G, w, organ, weights), weights) for G, w, weights in given]
-    bias = np.array([each @ weights for each, weights in rows])
-    # As many waves as directions that count: their mean is known to the root of the sum of the squares of these.
-    left = np.array([weights * (each - each @ weights) for each, weights in rows])
+    bias, left = (each[:, 0] for each in _biases(organ, whole.modulus))
     labels = organ.field.labels
     if labels is None:
         return Found(whole, None, None, bias, left)
@@ -80,7 +78,26 @@ def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, 
     each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
     matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
     parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress, body.voxel)
-    return Found(whole, known, parts, bias, left)
+    return Found(whole, known, parts, bias, left, *_biases(organ, parts.modulus))
+
+
+#: Moduli within this factor of each other share the waves of their bias, which goes with the square of the wave number.
+ALIKE = 1.15
+
+
+def _biases(organ: Organ, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Relative error (F, R) of moduli (F, R) by the elements: a mean over waves, and what is left of it (F, R, D)."""
+    bias, left = np.zeros(moduli.shape, complex), np.zeros((*moduli.shape, len(DIRECTIONS)), complex)
+    for f, weights in enumerate(directions_of_waves(organ.field)):
+        known = 0.0
+        for r in np.argsort(np.abs(moduli[f])):
+            G = moduli[f, r]
+            if not abs(G) < ALIKE * known:
+                each, known = plane_wave_biases(G, organ.waves.omega[f], organ, weights), abs(G)
+            bias[f, r] = each @ weights * known / abs(G)
+            # As many waves as directions that count: their mean is known to the root of the sum of these squares.
+            left[f, r] = weights * (each - each @ weights) * known / abs(G)
+    return bias, left
 
 
 def _uniform(m: Matrices, body: VoxelBody, density: float) -> edges.RegionMatrices:

@@ -52,7 +52,8 @@ def read_waves(
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
     step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
-    found |= {key: _on_the_same_voxels(Path(file), key, step) for key, file in more.items() if file is not None}
+    place = found.get("affine")
+    found |= {key: _on_the_same_voxels(Path(file), key, step, place) for key, file in more.items() if file is not None}
     jumps: list[str] = []
     if found.get("wrapped") is not None:
         found["phases"], jumps = unwrapped(name, _instants(name, "wrapped", found["wrapped"]))
@@ -82,9 +83,18 @@ def read_waves(
     return field._replace(noise=noise_of(field))
 
 
-def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray) -> np.ndarray:
-    """The mask or labels from a separate file, whose voxels must be those of the waves."""
-    values, own = formats.single(file, key)
+def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object) -> np.ndarray:
+    """The mask or labels from a separate file, whose voxels must be those of the waves; `place`: affine of the waves,
+    in the unit of their file, or None.
+    """
+    values, own, affine = formats.single(file, key)
+    if affine is not None and place is not None:
+        apart = np.abs(np.asarray(affine) - np.asarray(place)).max() / np.abs(np.asarray(place)[:3, :3]).max()
+        if apart > SAME_PLACE:
+            raise InputError(
+                f"{file}: its voxels lie elsewhere than those of the waves, or its axes run the other way: resample "
+                f"{key} to the voxels of the waves"
+            )
     if own is not None:
         size = _lengths(str(file), "spacing", own, "its spacing")
         if not np.allclose(size, spacing, rtol=0.01):
@@ -95,6 +105,8 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray) -> np.ndarray
     return values
 
 
+#: Difference of two affines, in voxels, that counts as none.
+SAME_PLACE = 0.1
 #: Part of the voxels up to which components of exactly 0 are told.
 FEW = 0.2
 

@@ -15,6 +15,7 @@ from liverjax.core.struct import Content
 
 if TYPE_CHECKING:
     import h5py
+    import nibabel
 
 NAMES = (
     "displacement",
@@ -67,17 +68,18 @@ def arrays(path: Path) -> Content:
         raise InputError(f"{path}: is damaged ({type(error).__name__}): write it again") from None
 
 
-def single(path: Path, name: str) -> tuple[np.ndarray, object]:
-    """One array (nx, ny, nz): the array of this name, or the only one of the file; and the file's spacing, or None."""
+def single(path: Path, name: str) -> tuple[np.ndarray, object, object]:
+    """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and affine."""
     found = arrays(path)
+    place = found.get("spacing"), found.get("affine")
     if name in found:
-        return np.asarray(found[name]), found.get("spacing")
+        return np.asarray(found[name]), *place
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
     if len(own) != 1:
         raise InputError(f"{path}: has no {name}: name the array {name}")
     a = np.asarray(own[0])
     a = a.reshape(a.shape[:3]) if a.ndim > 3 and a.size == np.prod(a.shape[:3]) else a
-    return a, found.get("spacing")
+    return a, *place
 
 
 def _numpy(path: Path) -> Content:
@@ -210,9 +212,33 @@ def _nifti(path: Path) -> Content:
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
     unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if it is not stated
-    size = np.asarray(image.header.get_zooms()[:3], float) * unit
+    size = _voxel_size(path, image)
+    found: Content = {"spacing": unit * size} if size.any() else {}
     if not np.iscomplexobj(data):
-        return {"labels": data, "spacing": size}
+        return found | {"labels": data, "affine": image.affine if _has_place(image) else None}
     if data.ndim == 5:
         data = np.moveaxis(data, 3, 0)
-    return {"displacement": data, "spacing": size, "origin": unit * np.asarray(image.affine)[:3, 3]}
+    own = {"affine": image.affine} if _has_place(image) else {}
+    return found | own | {"displacement": data, "origin": unit * np.asarray(image.affine)[:3, 3]}
+
+
+def _has_place(image: "nibabel.Nifti1Image") -> bool:
+    """Whether a NIfTI file says where its voxels are in space."""
+    return bool(image.header["sform_code"] > 0 or image.header["qform_code"] > 0)
+
+
+def _voxel_size(path: Path, image: "nibabel.Nifti1Image") -> np.ndarray:
+    """Size of the voxels (3,) as the file states it; zeros if it states none."""
+    stated = np.asarray(image.header["pixdim"][1:4], float)
+    if not _has_place(image):
+        return np.abs(stated) if np.all(stated) else np.zeros(3)
+    columns = np.asarray(image.affine)[:3, :3]
+    size = np.linalg.norm(columns, axis=0)
+    if not np.all(size > 0) or np.abs(columns.T @ columns / np.outer(size, size) - np.eye(3)).max() > 1e-3:
+        raise InputError(f"{path}: the axes of its voxels are not at right angles: resample it to rectangular voxels")
+    if not np.allclose(np.abs(stated), size, rtol=0.01):
+        raise InputError(
+            f"{path}: its header has voxels of {np.abs(stated).tolist()} and its affine of {size.round(6).tolist()}: "
+            "correct the wrong one"
+        )
+    return size
