@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import jax
@@ -53,6 +54,13 @@ OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"traction": [TOP | {"value": [0, 0, 1.0], "history": [[0.0, 0.0], [1.0, 1.0]]}], "solve": SOLVE},
     ),
 }
+#: Those that one scene can have, so that few are traced; no two of a scene share a file.
+TOGETHER = (
+    ("viscosity", "inertia"),
+    ("sponge", "flow", "traction"),
+    ("averaged volumes", "weight"),
+    ("mixed volumes", "history"),
+)
 
 
 def scene_of(order: int, table: dict[str, Any]) -> lj.Scene:
@@ -78,24 +86,33 @@ def _inner(value: Any) -> bool:
     return hasattr(getattr(value, "jaxpr", value), "eqns")
 
 
+@cache
+def files_of_plain(order: int) -> frozenset[str]:
+    """Source files of the scene that has nothing."""
+    return frozenset(files(traced(scene_of(order, {})).jaxpr))
+
+
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_only_scenes_that_have_it_hold_its_equations(order):
     scene = scene_of(order, {})
     every = replace(scene, physics=tuple(p for t in TABLES.values() for p in scene_of(order, t).physics))
     assert [type(p) for p in every.physics] == list(registry.NAMED)
-    without, with_all = (set(files(traced(s).jaxpr)) for s in (scene, every))
     own = {inspect.getfile(kind) for kind in registry.NAMED}
-    assert not own & without
-    assert own <= with_all
+    assert not own & files_of_plain(order)
+    assert own <= set(files(traced(every).jaxpr))
 
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_has_no_registry_is_in_no_other_program(order):
     own = {name: module.__file__ for name, (module, _) in OTHERS.items()}
-    plain = scene_of(order, {})
-    assert not set(own.values()) & set(files(traced(plain).jaxpr))
-    for name, (_, table) in OTHERS.items():
-        assert own[name] in set(files(traced(scene_of(order, table)).jaxpr)), name
+    assert not set(own.values()) & files_of_plain(order)
+    assert sorted(name for names in TOGETHER for name in names) == sorted(OTHERS)
+    for names in TOGETHER:
+        tables = [OTHERS[name][1] for name in names]
+        solve = {key: value for table in tables for key, value in table.get("solve", {}).items()}
+        scene = scene_of(order, {key: table[key] for table in tables for key in table} | {"solve": solve})
+        found, theirs = set(files(traced(scene).jaxpr)) & set(own.values()), {own[name] for name in names}
+        assert theirs <= found <= theirs | {loads.__file__}, names  # what has a history is a load
 
 
 @pytest.mark.parametrize("kind", registry.NAMED, ids=lambda kind: kind.__name__)
