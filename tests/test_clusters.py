@@ -13,6 +13,8 @@ from liverjax.simulation import tangent
 from liverjax.simulation.equations import equations, initial_state, positions, residual, unknowns
 from liverjax.simulation.mesh_error import padded
 
+pytestmark = pytest.mark.quick_to_compile
+
 LAW = lj.laws.NeoHookean(mu=700.0, bulk=2200.0)
 
 
