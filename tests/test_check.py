@@ -8,7 +8,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
-from liverjax.laws import gradient_check, homogeneous
+from liverjax.laws import figures, gradient_check, homogeneous
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -90,8 +90,10 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_planted_mistakes_are_caught(mistake, tmp_path, capsys):
+def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     body, row = MISTAKES[mistake]
+    if mistake != "NaN at rest":  # one picture of a wrong law is enough, that with the fewest numbers
+        monkeypatch.setattr(figures, "gradient_check", lambda *_: None)
     file = tmp_path / "mine.py"
     file.write_text(HEAD + textwrap.indent(textwrap.dedent(body), "    "))
     assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 1
