@@ -199,12 +199,22 @@ def test_forces_on_obstacles_know_regions_and_precision(precision):
     assert np.isclose(found.force[0, -1, 2], -50.0 * SIDE**2, rtol=tolerance)
 
 
-def test_a_scene_without_obstacles_has_none_in_its_program():
+def on_its_own() -> lj.Scene:
+    """A cube of which nothing comes near."""
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (1, 1, 1))
-    scene = lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))
-    far = replace(scene, physics=(Obstacle(triangles=surface(mesh), position=jnp.array([0.0, 0.0, -1.0])),))
+    return lj.Scene(mesh=mesh, law=LAW, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),))
+
+
+@pytest.mark.slow  # by default tests/test_pay_for_what_is_there.py looks for the equations themselves
+def test_a_scene_without_obstacles_has_none_in_its_program():
+    scene, place = on_its_own(), jnp.array([0.0, 0.0, -1.0])
+    far = replace(scene, physics=(Obstacle(triangles=surface(scene.mesh), position=place),))
     with_, without = (len(str(jax.make_jaxpr(lj.simulate)(s))) for s in (far, scene))
     assert with_ > 1.02 * without
+
+
+def test_a_scene_without_obstacles_has_no_forces_on_them():
+    scene = on_its_own()
     nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(lj.simulate, scene))
     assert lj.obstacle_forces(scene, nothing).force.shape == (0, 1, 3)
 

@@ -238,6 +238,7 @@ def test_bad_supports_are_refused(support, words):
         scene_from(scene_text(support))
 
 
+@pytest.mark.slow  # by default tests/test_pay_for_what_is_there.py looks for the equations themselves
 def test_a_scene_without_supports_pays_nothing():
     mesh = box()
     plain = pulled(mesh, [0.0, 0.0, 30.0], fixed=(lj.Fixed(nodes=jnp.asarray(part(mesh, z_max=0.0))),))
