@@ -157,6 +157,7 @@ def test_a_tie_between_two_points_changes_no_balance():
         ({"to": [0, 0, 1], "where": {"z_min": SIDE}, "pre_tension": 0.1}, "ligament.0 needs stiffness in N/m"),
         ({"to": [0, 0, 1], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 needs either pre_tension in N"),
         ({"to": [0, 0], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 to = .* is not a point"),
+        ({"to": [True, 0.1, 0.1], "where": {"z_min": SIDE}, "stiffness": 1.0}, "ligament.0 to = True is not a number"),
         (
             {"to": [0, 0, 0.2], "where": {"z_min": SIDE}, "stiffness": 1.0, "pre_tension": 50.0},
             "must be below its limit",

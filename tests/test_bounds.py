@@ -63,6 +63,7 @@ REFUSED = (
     ("fixed.0.nodes.0", -1, "fixed.0.nodes = [-1, "),
     ("solve.dt", -0.1, "solve.dt = -0.1 must be above 0 s: give a larger value"),
     ("solve.tolerance", 0.0, "solve.tolerance = 0.0 must be above 0: give e.g. 1e-08"),
+    ("solve.tolerance", 10.0, "solve.tolerance = 10.0 must be at most 0.5: give e.g. 1e-08"),
 )
 COUNTS = (
     ("steps", 0, "solve.steps = 0 must be a whole number above 0: give 1 or more"),

@@ -246,12 +246,13 @@ def _limits_of_energy(energy: Callable) -> list[Row]:
 def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
     """Ranges about rest with positive work and strong ellipticity. The row fails if rest is not stable."""
     rows, ranges = [], {}
+    stress = jax.jit(partial(homogeneous.nominal_stress, law))
     for test, what in homogeneous.TESTS.items():
         if test == "pure_shear":
             continue
         driven = SHEARS if what == "shear" else STRETCHES
         F = np.asarray(homogeneous.deformation_gradient(test, driven))
-        P = _as_numbers(jax.jit(partial(homogeneous.nominal_stress, law)), F)
+        P = _as_numbers(stress, F)
         stable = _work_is_positive(test, driven, P) & (ellipticity(_as_numbers(tangent, F)) > 0)
         start = int(np.argmin(np.abs(driven - (0.0 if what == "shear" else 1.0))))
         low, high = _range(driven, stable, start)

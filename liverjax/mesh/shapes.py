@@ -24,7 +24,9 @@ def box(size: Sequence[float], cells: Sequence[int]) -> TetMesh:
     """
     _positive("size", size)
     if len(cells) != 3 or any(int(n) != n or n < 1 for n in cells):
-        raise InputError(f"box cells = {list(cells)} must be three positive whole numbers: give e.g. [8, 8, 8]")
+        raise InputError(
+            f"box cells = {np.asarray(cells).tolist()} must be three positive whole numbers: give e.g. [8, 8, 8]"
+        )
     _not_too_many(6 * math.prod(int(n) for n in cells), "cells")
     shape = tuple(int(n) + 1 for n in cells)
     grid = np.indices(shape).reshape(3, -1).T

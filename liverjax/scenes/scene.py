@@ -39,7 +39,7 @@ class Solve:
     dt: Any = param("s", "time step; None: load steps without time", above=0.0, default=None)
     kind: str = static(default="static", about="static: no inertia; dynamic; harmonic: waves at `frequencies`")
     steps: int = static(default=1, about="load steps, or time steps of dt", lower=1)
-    tolerance: Any = param("1", "of the residual, relative to the forces at work", above=0.0, default=1e-8)
+    tolerance: Any = param("1", "of the residual, relative to the forces at work", above=0.0, upper=0.5, default=1e-8)
     newton: str = static(
         default="converged",
         about="converged: iterations to the tolerance; one_step: the chapter's linearly implicit scheme, one linear "

@@ -129,6 +129,8 @@ def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: 
 
 
 def _vector(value: object, name: str) -> np.ndarray:
+    for one in value if isinstance(value, (list, tuple)) else ():
+        bounds.check_one(name, one)
     try:
         vector = np.array(value, float)
     except (TypeError, ValueError):
