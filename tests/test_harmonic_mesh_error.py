@@ -7,6 +7,8 @@ from test_harmonic import DENSITY, FREQUENCIES, MU, PRONY, around_a_sphere, modu
 
 import liverjax as lj
 from liverjax.mesh import cylinders
+from liverjax.scenes.enriched import enriched
+from liverjax.waves.harmonic import element_operator
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -84,3 +86,27 @@ def test_ten_quadratic_elements_a_wave(wave, verified):
     name = {plane: "plane wave", torsional: "torsional wave", about_a_sphere: "waves about a sphere"}[wave]
     verified(f"{name}, ten quadratic elements a wave", "closed form", fine[0], 6e-3, order)
     verified(f"{name}, ten quadratic elements a wave, with the mesh's estimate", "closed form", fine[1], 1e-3)
+
+
+def test_a_body_whose_density_varies_keeps_it_in_the_richer_space():
+    """Functions that were added had the mean of the body: a stated error was four times the true one."""
+    mesh = lj.quadratic(lj.shapes.box((0.1, 0.03, 0.03), (4, 1, 1)))
+    density = 2000.0 + 1500.0 * jnp.tanh((mesh.points[:, 0] - 0.05) / 0.02)
+    scene = lj.Scene(
+        mesh=mesh,
+        law=lj.laws.NeoHookean(mu=3000.0, bulk=9000.0),
+        body=lj.Body(density=density),
+        solve=lj.Solve(kind="harmonic", frequencies=jnp.array([2.0])),
+    )
+    richer = enriched(scene)
+    # The functions of vertices and middles add up to one in both spaces; so do the masses of every element.
+    own, more = (np.asarray(element_operator(s).mass)[:10, :10].sum(axis=(0, 1)) for s in (scene, richer))
+    np.testing.assert_allclose(more, own, rtol=1e-12)
+    exact = np.asarray(mesh.volumes * jnp.mean(density[mesh.tetrahedra], axis=1))
+    np.testing.assert_allclose(own, exact, rtol=1e-12)
+    added = np.asarray(richer.body.density)[mesh.number_of_nodes :]
+    nodes = np.stack([np.asarray(n) for n in richer.mesh.element_nodes])[10:] - mesh.number_of_nodes
+    of_element = exact / np.asarray(mesh.volumes)
+    for k, value in enumerate(added):  # between the densities of the elements around
+        around = of_element[np.any(nodes == k, axis=0)]
+        assert around.min() - 1e-9 <= value <= around.max() + 1e-9

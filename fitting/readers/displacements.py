@@ -88,6 +88,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
     else:
         places = scale * np.stack([table[c] for c in "xyz"], axis=1)
         nodes, weights = _measured_at_points(path, mesh, places)
+    _no_copies(path, table)
     return Displacements(
         step=_steps(path, scene, table.get("time"), n),
         nodes=nodes,
@@ -95,6 +96,19 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         measured=np.where(seen, measured, 0.0),
         sd=np.where(seen, sd[:, None], np.inf),
     )
+
+
+def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:
+    """Refuse rows that are the same to the last digit: each would count as a measurement."""
+    rows = np.column_stack(list(table.values()))
+    _, first, of = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[of.ravel()] != np.arange(len(rows)))
+    if len(again):
+        k = int(again[0])
+        raise InputError(
+            f"{path}: row {k + 1} repeats row {first[of.ravel()[k]] + 1} ({len(again)} of {len(rows)} rows are "
+            "copies): leave them out, for each row counts as a measurement"
+        )
 
 
 def _table_of_nodes(path: Path) -> dict[str, np.ndarray]:

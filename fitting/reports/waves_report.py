@@ -204,6 +204,7 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
             continue
         told += _of_residuals(hertz, each, f, "regions" if found.parts else "moduli")
         told += _of_voxel_size(hertz, found, f)
+        told += _of_long_waves(hertz, found, f)
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
         for label in found.labels[few]:
@@ -221,6 +222,31 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, a ratio "
             "of the moduli at several frequencies that is not the same everywhere, or a body that does not move like a "
             "viscous solid; its deviations are too small then, so compare it with regions and with one frequency alone"
+        )
+    return told
+
+
+#: Relative standard error of a modulus above which its interval is not symmetric.
+SKEW = 0.15
+
+
+def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
+    """The interval of each modulus that is known so badly that its error is not the same on both sides.
+
+    Waves that are long beside the organ determine the compliance 1/G, whose error is symmetric.
+    """
+    each, told = found.whole if found.parts is None else found.parts, []
+    for r, (G, e) in enumerate(zip(np.abs(each.modulus[f]), each.standard_errors[f].real, strict=True)):
+        if not SKEW * G < e < G:
+            continue
+        half = 2 * e / G**2
+        top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"
+        which = "the modulus"
+        if found.parts is not None and found.labels is not None:
+            which += f" of region {found.labels[r]}"
+        told.append(
+            f"{hertz:g} Hz: {which} has an error of {100 * e / G:.2g} %, as waves that are long beside the organ leave "
+            f"it: its size may be {1 / (1 / G + half):.3g} Pa to {top} (95 %), which an equal error on both sides hides"
         )
     return told
 
@@ -298,9 +324,15 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
 
 
 def _sign(organ: Organ, found: Found) -> list[str]:
-    """A sentence if the loss modulus of the whole organ is negative, which no passive material has."""
-    rows = zip(organ.field.frequencies, found.whole.modulus, found.whole.standard_errors, strict=True)
-    wrong = [f"{f:g} Hz" for f, G, error in rows if G.imag.min() < -3 * error.imag.max()]
+    """A sentence if every loss modulus that the data determine is negative, which no passive material has.
+
+    Where regions are given, theirs count: one modulus for several materials may have any loss.
+    """
+    wrong, each = [], found.whole if found.parts is None else found.parts
+    for hertz, G, error in zip(organ.field.frequencies, each.modulus, each.standard_errors, strict=True):
+        known = np.abs(G.imag) > 3 * error.imag
+        if known.any() and np.all(G.imag[known] < 0):
+            wrong.append(f"{hertz:g} Hz")
     if not wrong:
         return []
     return [

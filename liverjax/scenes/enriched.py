@@ -58,9 +58,7 @@ def _cubic(scene: Scene) -> Scene:
     still = tuple(Fixed(nodes=more(d.nodes)[len(np.asarray(d.nodes)) :], axes=d.axes) for d in scene.displaced)
     body = scene.body
     if body is not None and jnp.ndim(body.density):
-        density = jnp.asarray(body.density)
-        new = mesh.number_of_nodes - len(density)
-        body = replace(body, density=jnp.concatenate([density, jnp.full(new, jnp.mean(density))]))
+        body = replace(body, density=_of_new_functions(mesh, jnp.asarray(body.density)))
     return replace(
         scene,
         mesh=mesh,
@@ -69,6 +67,14 @@ def _cubic(scene: Scene) -> Scene:
         traction=tuple(_with_faces(mesh, load) for load in scene.traction),
         physics=tuple(p.enriched(mesh, more) for p in scene.physics),
     )
+
+
+def _of_new_functions(mesh: TetMesh, density: jax.Array) -> jax.Array:
+    """Density of all functions: a new one has the mean of the elements around it."""
+    nodes = jnp.stack(mesh.element_nodes)
+    own = jnp.broadcast_to(jnp.mean(density[mesh.tetrahedra], axis=1), nodes.shape)
+    total, count = (jnp.zeros(mesh.number_of_nodes).at[nodes].add(each) for each in (own, 1.0))
+    return jnp.concatenate([density, (total / count)[len(density) :]])
 
 
 def _with_faces(mesh: TetMesh, load: Traction) -> Traction:

@@ -68,7 +68,7 @@ def operator(e: Equations, x: jax.Array, loaded: bool, mass: str) -> Operator:
     springs = node_blocks(e)
     more = tuple(own for own in (a.attached(mesh, x, 1.0) for a in e.nodal) if isinstance(own, Attached))
     nodes = jnp.stack(mesh.element_nodes)
-    heavy = None if scene.body is None else _mass(mesh, jnp.asarray(scene.body.density), nodes, mass)
+    heavy = None if scene.body is None else _mass(mesh, jnp.asarray(scene.body.density), mass)
     whole = None if rest is None else _element_matrices(mesh, rest)
     return Operator(
         mesh.points, nodes, _element_matrices(mesh, relaxing), whole, heavy, springs, more, e.free, pressures
@@ -129,10 +129,10 @@ def _stacked(K: Matrix) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in K])
 
 
-def _mass(mesh: TetMesh, density: jax.Array, nodes: jax.Array, kind: str) -> jax.Array:
+def _mass(mesh: TetMesh, density: jax.Array, kind: str) -> jax.Array:
     if kind == "lumped":
         return density * nodal_volumes(mesh)
-    own = density if density.ndim == 0 else jnp.mean(density[nodes], axis=0)
+    own = density if density.ndim == 0 else jnp.mean(density[mesh.tetrahedra], axis=1)
     M = jnp.asarray(products(mesh.order), mesh.points.dtype)[:, :, None] * (own * mesh.volumes)[None, None]
     return _both_ways(mesh, M)
 

@@ -133,16 +133,21 @@ def _values(dataset: "h5py.Dataset") -> object:
     return values if kind is None else np.asarray(values).T
 
 
-#: Columns that a table needs; frequency and label are optional.
+#: Columns that a table needs; frequency, label and mask are optional.
 COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_im_z")
 
 
+#: Other names of the optional columns.
+ALSO = {"frequency_hz": "frequency", "hertz": "frequency", "labels": "label", "region": "label"}
+
+
 def _voxel_table(path: Path) -> Content:
-    """x, y, z [m], real and imaginary parts, with or without frequency [Hz] and label, on a regular grid."""
+    """x, y, z [m], real and imaginary parts, with or without frequency [Hz], label and mask, on a regular grid."""
     numbered = enumerate(text_of(path, "waves").splitlines(), 1)
     lines = [(k, line) for k, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     between = find_delimiter(lines[0][1]) if lines else ","
     head = [cell.lower() for cell in split_cells(lines[0][1], between)] if lines else []
+    head = [ALSO.get(name, name) for name in head]
     missing = [name for name in COLUMNS if name not in head]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, for several, frequency")
@@ -168,11 +173,11 @@ def _voxel_table(path: Path) -> Content:
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
     found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
-    if "label" not in column:
-        return found
-    labels = np.zeros(shape)
-    labels[tuple(at.T)] = np.nan_to_num(column["label"])
-    return found | {"labels": labels}
+    for name, key in (("label", "labels"), ("mask", "mask")):
+        if name in column:
+            found[key] = np.zeros(shape)
+            found[key][tuple(at.T)] = np.nan_to_num(column[name])
+    return found
 
 
 def _quick_number(text: str, between: str) -> float | None:
