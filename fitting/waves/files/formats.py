@@ -175,8 +175,9 @@ def _voxel_table(path: Path) -> Content:
     found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
     for name, key in (("label", "labels"), ("mask", "mask")):
         if name in column:
-            found[key] = np.zeros(shape)
-            found[key][tuple(at.T)] = np.nan_to_num(column[name])
+            values = np.zeros(shape)
+            values[tuple(at.T)] = np.nan_to_num(column[name])
+            found |= {key: values}
     return found
 
 
