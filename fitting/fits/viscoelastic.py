@@ -82,12 +82,11 @@ def _compiled(function: Callable, tree: Any, kinds: tuple) -> Callable:
 
 
 @lru_cache(maxsize=16)
-def best_of(minimise: Callable, residuals: Callable, each: int = 0) -> Callable[..., Solution]:
-    """The lowest minimum over starting points (S, P). The first `each` arrays of data have one row per start."""
+def best_of(minimise: Callable, residuals: Callable) -> Callable[..., Solution]:
+    """The lowest minimum over starting points (S, P)."""
 
     def best(starts, *data):
-        rows, common = data[:each], data[each:]
-        found = jax.vmap(lambda u, *own: minimise(residuals, u, *own, *common))(starts, *rows)
+        found = jax.vmap(lambda u: minimise(residuals, u, *data))(starts)
         k = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
         return jax.tree.map(lambda leaf: leaf[k], found)
 

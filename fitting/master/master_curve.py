@@ -16,6 +16,8 @@ from liverjax.core.struct import Content
 
 #: Distance of a sweep from the common curve, and error [decades] of a factor, above which there is a sentence.
 FAR_OFF, LOOSE = 0.05, 0.3
+#: Distance from the curve that its spline may cause by itself.
+SMOOTH = 1e-3
 #: Probability of a better match by chance below which factors of the moduli are named.
 CHANCE = 1e-3
 
@@ -114,7 +116,11 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     counts, more = np.array([2 * len(s.storage) for s in sweeps]), len(sweeps) - 1
     alone, both = (float(counts @ s.misfit**2) for s in (found, other))
     freedom = counts.sum() - 2 * more - 2 * shifts.size_of_curve(sweeps, other.log_a)
-    if freedom < 1 or scipy.special.fdtrc(more, freedom, (alone / both - 1) * freedom / more) > CHANCE:
+    if (
+        freedom < 1
+        or found.apart < SMOOTH
+        or scipy.special.fdtrc(more, freedom, (alone / both - 1) * freedom / more) > CHANCE
+    ):
         return []
     b, T = 10.0**other.log_b, celsius(found.temperatures)
     moved = np.abs(other.log_a - found.log_a) / np.maximum(found.log_a_errors, 1e-12)
@@ -122,8 +128,8 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     return [
         f"the moduli have factors too ({b.min():.3g} to {b.max():.3g}): with --vertical the sweeps lie "
         f"{100 * other.apart:.2g} % from one curve instead of {100 * found.apart:.2g} %, and log10 a at {T[k]:.4g} °C "
-        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}: give --vertical, or "
-        "the errors of the shifts do not contain this"
+        f"is {other.log_a[k]:.3g} instead of {found.log_a[k]:.3g} ± {found.log_a_errors[k]:.1g}, an error that does "
+        "not contain this: give --vertical"
     ]
 
 

@@ -31,7 +31,7 @@ class ContactFit(NamedTuple):
     @property
     def quantile(self) -> float:
         """Quantile of Student's t for a 95 % interval."""
-        return float(scipy.special.stdtrit(len(self.residuals) - 2, 0.975))
+        return float(scipy.special.stdtrit(len(self.residuals) - (4 if self.tilt_error else 2), 0.975))
 
 
 def fit_contact(
@@ -46,7 +46,7 @@ def fit_contact(
         tilted: a straight line is added to the force: the base line of a sensor that drifts.
     """
     span = float(np.ptp(depth))
-    line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : 2 * tilted]
+    line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : 2 if tilted else 0]
 
     def linear(start: float) -> tuple[np.ndarray, np.ndarray]:
         f = unit_force(depth - start)

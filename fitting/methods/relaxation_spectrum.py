@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.methods.generalised_maxwell import mode_columns, non_negative
+from fitting.methods.host import Array, arrays_of, exponential
 from fitting.readers.rheometer import Sweep
 
 #: Grids that are tried [times per decade], decades beyond the band on either side, weights that are tried.
@@ -116,6 +117,19 @@ def described(x: np.ndarray, A: np.ndarray, r: np.ndarray, grid: GridOfTimes) ->
         decades=float(carried),
         places=np.flatnonzero(kept),
     )
+
+
+def moduli_of_logarithms(u: Array, omega: np.ndarray, times: np.ndarray, solid: bool) -> tuple[Array, Array]:
+    """G' and G'' (…, n) [Pa] of strengths whose logarithms are u (…, K), in NumPy or JAX.
+
+    Args:
+        u: first that of the equilibrium modulus, if the material is `solid`.
+        omega: angular frequencies (n,) [rad/s].
+        times: relaxation times [s].
+        solid: whether there is an equilibrium modulus.
+    """
+    columns = mode_columns(omega, times)[:, 0 if solid else 1 :]
+    return arrays_of(u).split(exponential(u) @ columns.T, 2, axis=-1)
 
 
 def _restricted_likelihood(x: np.ndarray, A: np.ndarray, r: np.ndarray, L: np.ndarray) -> float:

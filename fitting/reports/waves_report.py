@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 #: chi^2 per equation above which there is a warning that the model misses something.
 TOO_FAR = 1.5
-#: Standard deviations of the chi^2 of a map above which it is told.
-BY_CHANCE = 5.0
+#: Standard deviations of the chi^2 of a map above which it is told, and the part of it that the noise's estimate costs.
+BY_CHANCE, ROUGH = 5.0, 0.03
 #: The same, above which the moduli themselves may be wrong.
 WRONG = 10.0
 #: Fewest frequencies of a sweep.
@@ -216,8 +216,8 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
                 f"regions {names}: the waves place their edges more than a voxel away from the edges of the labels "
                 "(edges_farther_out_voxels): look at the labels"
             )
-    # The mean of n squares scatters by the root of 2/n.
-    if drawn is not None and drawn.chi2 / drawn.components > 1 + BY_CHANCE * np.sqrt(2 / drawn.components):
+    # The mean of n squares scatters by the root of 2/n; the noise that divides them is an estimate.
+    if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, a ratio "
             "of the moduli at several frequencies that is not the same everywhere, or a body that does not move like a "
@@ -241,12 +241,10 @@ def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
             continue
         half = 2 * e / G**2
         top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"
-        which = "the modulus"
-        if found.parts is not None and found.labels is not None:
-            which += f" of region {found.labels[r]}"
         told.append(
-            f"{hertz:g} Hz: {which} has an error of {100 * e / G:.2g} %, as waves that are long beside the organ leave "
-            f"it: its size may be {1 / (1 / G + half):.3g} Pa to {top} (95 %), which an equal error on both sides hides"
+            f"{hertz:g} Hz: {_modulus_named(found, r)} has an error of {100 * e / G:.2g} %. Where waves are long "
+            f"beside the organ the data determine 1/G, so its size may be {1 / (1 / G + half):.3g} Pa to {top} "
+            "(95 %): measure at a higher frequency"
         )
     return told
 
@@ -260,13 +258,16 @@ def _of_voxel_size(hertz: float, found: Found, f: int) -> list[str]:
     r = int(np.argmax(bias / np.maximum(error, 1e-12)))
     if not bias[r] > error[r]:
         return []
-    which = "the modulus"
-    if found.parts is not None and found.labels is not None:
-        which += f" of region {found.labels[r]}"
     return [
-        f"{hertz:g} Hz: the size of the voxels changes {which} by {100 * bias[r]:.2g} % (standard error "
-        f"{100 * error[r]:.2g} %): subtract mesh_bias, or measure smaller voxels"
+        f"{hertz:g} Hz: the size of the voxels changes {_modulus_named(found, r)} by {100 * bias[r]:.2g} % (standard "
+        f"error {100 * error[r]:.2g} %): subtract mesh_bias, or measure smaller voxels"
     ]
+
+
+def _modulus_named(found: Found, r: int) -> str:
+    if found.parts is None or found.labels is None:
+        return "the modulus"
+    return f"the modulus of region {found.labels[r]}"
 
 
 def _of_residuals(hertz: float, each: Regions, f: int, uniform: str) -> list[str]:

@@ -52,7 +52,7 @@ def read_waves(
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
     step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
-    place = found.get("affine")
+    place = found.get(formats.PLACE)
     found |= {key: _on_the_same_voxels(Path(file), key, step, place) for key, file in more.items() if file is not None}
     jumps: list[str] = []
     if found.get("wrapped") is not None:
@@ -84,13 +84,13 @@ def read_waves(
 
 
 def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object) -> np.ndarray:
-    """The mask or labels from a separate file, whose voxels must be those of the waves; `place`: affine of the waves,
-    in the unit of their file, or None.
+    """The mask or labels from a separate file, whose voxels must be those of the waves; `place`: `formats.PLACE` of the
+    waves, or None.
     """
-    values, own, affine = formats.single(file, key)
-    if affine is not None and place is not None:
-        apart = np.abs(np.asarray(affine) - np.asarray(place)).max() / np.abs(np.asarray(place)[:3, :3]).max()
-        if apart > SAME_PLACE:
+    values, own, elsewhere = formats.single(file, key)
+    if elsewhere is not None and place is not None:
+        apart = np.abs(np.asarray(elsewhere) - np.asarray(place)).max()
+        if apart > SAME_PLACE * float(np.min(spacing)):
             raise InputError(
                 f"{file}: its voxels lie elsewhere than those of the waves, or its axes run the other way: resample "
                 f"{key} to the voxels of the waves"
@@ -105,7 +105,7 @@ def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object
     return values
 
 
-#: Difference of two affines, in voxels, that counts as none.
+#: Difference of two places, in voxels, that counts as none.
 SAME_PLACE = 0.1
 #: Part of the voxels up to which components of exactly 0 are told.
 FEW = 0.2

@@ -17,7 +17,6 @@ from fitting.fits.viscoelastic import Fit, Kind, information_criterion, number_o
 from fitting.methods import as_prony_modes, generalised_maxwell, host, relaxation_spectrum, springpots, uncertainty
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Spectrum
-from fitting.methods.host import arrays_of
 from fitting.methods.least_squares import Solution
 from fitting.readers.rheometer import Sweep
 from liverjax.core.struct import Content
@@ -75,8 +74,7 @@ def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = 
     prior = found.prior[:, 1 - solid :]
 
     def moduli(u, omega):
-        columns = generalised_maxwell.mode_columns(np.asarray(omega), found.times)[:, 1 - solid :]
-        return arrays_of(u).split(host.exponential(u) @ columns.T, 2, axis=-1)
+        return relaxation_spectrum.moduli_of_logarithms(u, np.asarray(omega), found.times, bool(solid))
 
     def held(u):
         return host.exponential(u) @ prior.T

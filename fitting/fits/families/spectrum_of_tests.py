@@ -134,16 +134,15 @@ def _as_a_fit(
     slopes = (found.J / grid.unit)[:, free] * strengths  # by the logarithms of the strengths
     prior = told.prior[:, 1 - int(solid) :] * strengths
 
-    def moduli(omega, u):
-        columns = generalised_maxwell.mode_columns(omega, told.times)[:, 1 - int(solid) :]
-        return host.arrays_of(u).split(host.exponential(u) @ columns.T, 2, axis=-1)
+    def moduli(u, omega):
+        return relaxation_spectrum.moduli_of_logarithms(u, omega, told.times, bool(solid))
 
     u = np.log(strengths)
-    made = as_prony_modes.convert(lambda omega: moduli(omega, u), 1 / high, 1 / low, bool(solid))
+    made = as_prony_modes.convert(lambda omega: moduli(u, omega), 1 / high, 1 / low, bool(solid))
     names = ("equilibrium_modulus",) * int(solid) + tuple(f"strengths[{k}]" for k in told.places)
     kind = Kind(
         name="spectrum",
-        maxwell=lambda u: as_prony_modes.modes(made, moduli(made.omega, u)),
+        maxwell=lambda u: as_prony_modes.modes(made, moduli(u, made.omega)),
         names=names,
         units=("Pa",) * len(names),
         values=host.exponential,

@@ -31,6 +31,8 @@ NAMES = (
     "unit",
 )
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
+#: Place of NIfTI's voxels in space (3, 4) [m]: axes, then the corner; no array of another file has this name.
+PLACE = "(place)"
 HDF5 = (".h5", ".hdf5")
 
 
@@ -69,9 +71,9 @@ def arrays(path: Path) -> Content:
 
 
 def single(path: Path, name: str) -> tuple[np.ndarray, object, object]:
-    """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and affine."""
+    """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and `PLACE`."""
     found = arrays(path)
-    place = found.get("spacing"), found.get("affine")
+    place = found.get("spacing"), found.get(PLACE)
     if name in found:
         return np.asarray(found[name]), *place
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
@@ -218,14 +220,14 @@ def _nifti(path: Path) -> Content:
     image: Any = nibabel.load(path)
     data = np.asarray(image.dataobj)
     unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if it is not stated
-    size = _voxel_size(path, image)
+    size, axes = _voxel_size(path, image), unit * np.asarray(image.affine)[:3]
     found: Content = {"spacing": unit * size} if size.any() else {}
+    found |= {PLACE: axes} if _has_place(image) else {}
     if not np.iscomplexobj(data):
-        return found | {"labels": data, "affine": image.affine if _has_place(image) else None}
+        return found | {"labels": data}
     if data.ndim == 5:
         data = np.moveaxis(data, 3, 0)
-    own = {"affine": image.affine} if _has_place(image) else {}
-    return found | own | {"displacement": data, "origin": unit * np.asarray(image.affine)[:3, 3]}
+    return found | {"displacement": data, "origin": axes[:, 3]}
 
 
 def _has_place(image: "nibabel.Nifti1Image") -> bool:
