@@ -12,7 +12,9 @@ refinement.
 
 import itertools
 import os
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -132,7 +134,7 @@ def factorised(A: "scipy.sparse.csr_array", plan: list[Front], single: bool, sma
     kind = np.result_type(A.dtype, np.float32)
     if single:
         kind = np.dtype(np.complex64 if kind.kind == "c" else np.float32)
-    steps = _all_pieces(_Elimination(A, plan, kind, single and small, [None] * len(plan), [[] for _ in plan]))
+    steps = _all_pieces(_Elimination(A, plan, kind, single and small, [None] * len(plan), [[] for _ in plan], {}))
     return Factor(A, scale, steps)
 
 
@@ -145,36 +147,40 @@ class _Elimination(NamedTuple):
     small: bool
     rests: list[np.ndarray | None]  # the remaining matrix that each group leaves to its parent
     steps: list[list[Eliminated]]  # results of each group
+    running: dict[Future, int]  # pieces that are eliminated now
 
-    def piece(self, groups: list[int], cores: int) -> None:
-        """Eliminate `groups` one after the other, with the tiles of each group on `cores` cores."""
+    def idle(self) -> int:
+        """Cores that a piece may use: its own, and those without a piece."""
+        return max(1, _cores() + 1 - len(self.running))
+
+    def piece(self, groups: list[int]) -> None:
+        """Eliminate `groups` one after the other, with the tiles of each group on the cores that are idle."""
         place = np.full(self.A.shape[0], -1)
-        size = max(len(front.own) + len(front.border) for front in (self.plan[k] for k in groups))
-        memory, scratch = np.empty(size**2, self.kind), np.empty((cores, min(size, TILE) ** 2), self.kind)
-        for k in groups:
-            front = self.plan[k]
-            F, n = _matrix_of_group(self.A, front, place, memory), len(front.own)
+        fronts = [self.plan[k] for k in groups]
+        memory = np.empty(max((len(own) + len(border)) * len(own) for own, border, _ in fronts), self.kind)
+        for k, front in zip(groups, fronts, strict=True):
+            own, m = _own_columns(self.A, front, place, memory), len(front.border)
+            rest = np.zeros((m, m), self.kind, order="F")  # much of its upper half is never touched
             for c in front.children:
-                rest = self.rests[c]
-                if rest is not None:  # None: a part of the body that is not coupled with the others
-                    _add(F, place[self.plan[c].border], rest)
+                left = self.rests[c]
+                if left is not None:  # None: a part of the body that is not coupled with the others
+                    _add(own, rest, place[self.plan[c].border], left)
                     self.rests[c] = None
             place[front.own] = place[front.border] = -1
-            steps = _eliminated(F, front, scratch)
+            steps = _eliminated(own, rest, front, self.idle)
             self.steps[k] = [_in_whole_numbers(step) for step in steps] if self.small else steps
-            if len(front.border):
-                self.rests[k] = _lower_triangle(F[n:, n:])
+            if m:
+                self.rests[k] = rest
 
 
 def _all_pieces(own: _Elimination) -> list[Eliminated]:
     """Eliminate all pieces, as many at a time as there are cores. The sums do not depend on which ends first."""
     pieces, waits_for = _work_in_pieces(own.plan)
-    running: dict[Future, int] = {}
+    running = own.running
     with ThreadPoolExecutor(_cores()) as pool:
         ready = [k for k, missing in enumerate(waits_for) if not missing]
         while ready or running:
-            cores = _cores() if len(ready) == 1 and not running else 1
-            running |= {pool.submit(own.piece, pieces[k], cores): k for k in ready}
+            running |= {pool.submit(own.piece, pieces[k]): k for k in ready}
             over = wait(running, return_when=FIRST_COMPLETED).done
             ended = {running.pop(future) for future in over}
             for future in over:
@@ -230,11 +236,11 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
     return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape), scale
 
 
-def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
-    """The group's own columns of A, on and below the diagonal; `place` gets its unknowns' and border's places."""
+def _own_columns(A: Any, front: Front, place: np.ndarray, memory: np.ndarray) -> np.ndarray:
+    """The group's own columns of A (n + m, n), 0 above the diagonal; `place` gets its unknowns' and border's places."""
     n, size = len(front.own), len(front.own) + len(front.border)
     place[front.own], place[front.border] = np.arange(n), np.arange(n, size)
-    F = memory[: size * size].reshape((size, size), order="F")
+    F = memory[: size * n].reshape((size, n), order="F")
     F[...] = 0
     mirrored = A[front.own].tocoo()
     row = place[mirrored.col]
@@ -243,34 +249,68 @@ def _matrix_of_group(A: Any, front: Front, place: np.ndarray, memory: np.ndarray
     return F
 
 
-def _lower_triangle(F: np.ndarray) -> np.ndarray:
-    """A copy of the lower triangle with whole tiles on the diagonal: half of the memory is never touched."""
-    out = np.zeros(F.shape, F.dtype, order="F")
-    for a in range(0, len(F), TILE):
-        out[a:, a : a + TILE] = F[a:, a : a + TILE]
-    return out
+def _add(own: np.ndarray, rest: np.ndarray, at: np.ndarray, left: np.ndarray) -> None:
+    """Add a child's lower triangle to the own columns and the rest, at rising places `at`.
 
-
-def _add(F: np.ndarray, at: np.ndarray, rest: np.ndarray) -> None:
-    """Add a lower triangle to F at rising places `at`, one run of consecutive places after the other."""
-    ends = [0, *(np.flatnonzero(np.diff(at) != 1) + 1), len(at)]
-    runs = [(a, b, at[a]) for a, b in itertools.pairwise(ends) if a < b]
+    Consecutive places are added together.
+    """
+    n = own.shape[1]
+    ends = np.unique([0, *(np.flatnonzero(np.diff(at) != 1) + 1), np.searchsorted(at, n), len(at)])
+    runs = [(a, b, at[a]) for a, b in itertools.pairwise(ends)]
     for k, (a, b, column) in enumerate(runs):
+        to, shift = (own, 0) if column < n else (rest, n)
         for c, d, row in runs[k:]:
-            F[row : row + d - c, column : column + b - a] += rest[c:d, a:b]
+            to[row - shift : row - shift + d - c, column - shift : column - shift + b - a] += left[c:d, a:b]
 
 
-def _eliminated(F: np.ndarray, front: Front, scratch: np.ndarray) -> list[Eliminated]:
-    """Eliminate a group in its matrix F (n + m, n + m); the last m rows become the remaining lower triangle."""
+def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[[], int]) -> list[Eliminated]:
+    """Eliminate a group with its columns (n + m, n); take its part off the lower triangle of the rest (m, m).
+
+    The own columns change after each `PIVOTS` unknowns, the rest once at the end: long products are the fastest.
+    """
     n, every, found = len(front.own), np.concatenate([front.own, front.border]), []
+    X = np.empty((n, len(rest)), own.dtype)
     for a in range(0, n, PIVOTS):
         b = min(a + PIVOTS, n)
-        A = np.tril(F[a:b, a:b])
-        inverse = _inverted(A + np.tril(A, -1).T)
-        B = F[b:, a:b].T
-        X = _taken_off(F[b:, b:], B, inverse, scratch)
-        found.append(Eliminated(every[a:b], every[b:], inverse, X))
+        A = np.tril(own[a:b, a:b])
+        inverse, below = _inverted(A + np.tril(A, -1).T), own[b:, a:b]
+        after = np.empty((b - a, len(below)), own.dtype)
+        _dealt_out(partial(_solve, inverse, below, after), len(below), idle())
+        _take_off(own[b:, b:], below, after[:, : n - b], idle())
+        X[a:b] = after[:, n - b :]
+        found.append(Eliminated(every[a:b], every[b:], inverse, after))
+    _take_off(rest, own[n:], X, idle())
     return found
+
+
+def _solve(inverse: np.ndarray, below: np.ndarray, out: np.ndarray, j: int) -> None:
+    """A tile of columns of the inverse times the transposed rows below."""
+    np.matmul(inverse, below[j : j + TILE].T, out=out[:, j : j + TILE])
+
+
+def _take_off(A: np.ndarray, left: np.ndarray, right: np.ndarray, cores: int) -> None:
+    """Subtract left (N, k) times right (k, M) from A (N, M), tile by tile, where no tile is above the diagonal."""
+
+    def column(j: int) -> None:
+        memory = np.empty(TILE**2, A.dtype)
+        for i in range(j, len(A), TILE):
+            tile = A[i : i + TILE, j : j + TILE]
+            product = memory[: tile.size].reshape(tile.shape, order="F")
+            np.matmul(left[i : i + TILE], right[:, j : j + TILE], out=product)
+            tile -= product
+
+    _dealt_out(column, A.shape[1], cores)
+
+
+def _dealt_out(task: Callable[[int], None], size: int, cores: int) -> None:
+    """Do the task of every column of tiles, on so many cores."""
+    starts = range(0, size, TILE)
+    if cores == 1 or len(starts) < 4:
+        for j in starts:
+            task(j)
+    else:
+        with ThreadPoolExecutor(cores) as pool:
+            list(pool.map(task, starts))
 
 
 def _in_whole_numbers(step: Eliminated) -> Eliminated:
@@ -291,31 +331,6 @@ def _inverted(A: np.ndarray) -> np.ndarray:
     if info or wrong:
         raise np.linalg.LinAlgError("singular")
     return inverse
-
-
-def _taken_off(rest: np.ndarray, B: np.ndarray, inverse: np.ndarray, scratch: np.ndarray) -> np.ndarray:
-    """Subtract the symmetric B^T A^-1 B from the lower triangle of `rest` (m, m), tile by tile; return A^-1 B.
-
-    It runs on as many cores as `scratch` has rows; each row is memory for one tile.
-    """
-    X, starts = np.empty(B.shape, B.dtype), range(0, len(rest), TILE)
-
-    def columns(own: range, memory: np.ndarray) -> None:
-        for j in own:
-            X[:, j : j + TILE] = inverse @ B[:, j : j + TILE]
-            for i in range(j, len(rest), TILE):
-                tile = rest[i : i + TILE, j : j + TILE]
-                product = memory[: tile.size].reshape(tile.shape, order="F")
-                np.matmul(B[:, i : i + TILE].T, X[:, j : j + TILE], out=product)
-                tile -= product
-
-    if len(scratch) == 1 or len(starts) < 4:
-        columns(starts, scratch[0])
-    else:
-        # Later columns have fewer tiles: dealt out in turn, each core gets about the same work.
-        with ThreadPoolExecutor(len(scratch)) as pool:
-            list(pool.map(columns, [starts[k :: len(scratch)] for k in range(len(scratch))], scratch))
-    return X
 
 
 def refined_solution(factor: Factor, b: np.ndarray) -> tuple[np.ndarray, float]:
