@@ -102,7 +102,7 @@ _BAD = {
     "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
     "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is no number: correct it, or leave it empty",
     "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is no number",
-    "node,ux,uy,uz\n5,1e-3,0,0\n6,1e-3,0,0\n5,1e-3,0,0": "row 3 repeats row 1 (1 of 3 rows are copies): leave them out",
+    "node,ux,uy,uz\n5,1e-3,,0\n6,1e-3,0,0\n5,1e-3,,0\n6,1e-3,0,0": "row 3 repeats row 1 (2 of 4 rows are copies)",
     "": "is empty: export it again",
     "node;ux;uy;uz\n5;1e-3;0;0;7": "row 1 has 5 cells under 4 headings",
 }

@@ -165,6 +165,12 @@ def test_a_radius_in_millimetres_is_refused(tmp_path, capsys):
     (tmp_path / "c.csv").write_text("depth_um,force_mN\n0,0\n1,1\n")
     assert main(["indentation", str(tmp_path / "c.csv"), "--radius", "5", "--thickness", "0.01"]) == 2
     assert "--radius 5 is in metres: give e.g. --radius 0.005" in capsys.readouterr().err
+    depth = np.linspace(0, 1e-3, 12)
+    np.savetxt(tmp_path / "c.csv", np.c_[depth, depth**2], delimiter=",", header="depth_m,force_N", comments="")
+    of_cone = ["--shape", "cone", "--radius", "5", "--thickness", "0.01", "--out", str(tmp_path)]
+    main(["indentation", str(tmp_path / "c.csv"), *of_cone])
+    told = capsys.readouterr().err
+    assert "it changes nothing for a cone" in told and "in metres" not in told
 
 
 def test_a_wrong_shape_is_told_behind_a_long_approach(tmp_path, capsys):

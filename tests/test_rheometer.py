@@ -505,3 +505,14 @@ def test_a_column_that_contradicts_the_moduli_is_told(tmp_path, heading, values,
     file.write_text("\n".join([f"angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,{heading}", *lines]))
     told = [note for note in read_sweep(file).notes if "contradicts G' and G''" in note]
     assert len(told) == (wrong != 1.0) and all(heading in note for note in told)
+
+
+def test_a_viscosity_beside_moduli_of_tension_contradicts_nothing(tmp_path):
+    """|E*|/omega was three times G*/omega: a note of 200 %."""
+    omega = np.geomspace(0.1, 100.0, 13)
+    S, L = 3000 * omega**0.1, 600 * omega**0.15
+    lines = [f"{w:.6g},{s:.6g},{k:.6g},{np.hypot(s, k) / w:.4g}" for w, s, k in zip(omega, S, L, strict=True)]
+    file = tmp_path / "dma.csv"
+    file.write_text("\n".join(["omega [rad/s],E' [Pa],E'' [Pa],Complex viscosity [Pa·s]", *lines]))
+    found = read_sweep(file)
+    assert found.storage[0] == pytest.approx(S[0] / 3, rel=1e-5) and not any("contradict" in n for n in found.notes)

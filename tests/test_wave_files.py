@@ -37,6 +37,14 @@ def test_a_table_may_have_the_columns_of_other_formats(tmp_path):
     found = wave_field.read_waves(path)
     np.testing.assert_allclose(found.frequencies, HERTZ)
     assert found.mask.sum() == 75 and found.labels[:, 0, 0].tolist() == [1, 1, 1, 2, 2]
+    whole, n = path.read_text(), len(rows) // 2
+    path.write_text(whole.replace("labels", "label").replace("mask", "region"))
+    with pytest.raises(InputError, match="two columns mean label: leave one of them"):
+        wave_field.read_waves(path)
+    last = rows[-1].split(",")
+    path.write_text(whole.replace(rows[-1], ",".join([*last[:-2], str(1 - int(last[-2])), last[-1]])))
+    with pytest.raises(InputError, match=f"row ({n + 1}|{2 * n + 1}): mask differs from that of another frequency"):
+        wave_field.read_waves(path)
 
 
 def test_instants_of_a_period_and_other_units_are_the_same_waves(tmp_path):
@@ -232,7 +240,8 @@ def test_rounded_places_tell_the_spacing_by_their_whole_length(tmp_path):
 
 def test_a_column_with_another_name_is_told(tmp_path):
     path = written(tmp_path, ".csv", plane_waves((5, 5, 5)))
-    path.write_text(path.read_text().replace("frequency", "freq_Hz"))
+    head, *rows = path.read_text().replace("frequency", "freq_Hz").splitlines()
+    path.write_text("\n".join([f"mask,{head}", *(f"1,{row}" for row in rows)]) + "\n")
     with pytest.raises(InputError, match=r"name the column of the frequencies frequency \(not freq_hz\)"):
         wave_field.read_waves(path)
 
@@ -264,6 +273,9 @@ def test_a_nifti_file_whose_voxels_are_not_known_is_refused(tmp_path, affine, pi
         path.write_bytes(raw)
     with pytest.raises(InputError, match=re.escape(words)):
         wave_field.read_waves(path, frequencies=list(HERTZ))
+    if pixdim is not None:
+        found = wave_field.read_waves(path, frequencies=list(HERTZ), spacing=[0.002] * 3)
+        assert np.array_equal(found.spacing, [0.002] * 3)
 
 
 @pytest.mark.parametrize("turned", [False, True])

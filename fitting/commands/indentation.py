@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     from fitting.rigs.thin_layer import Indenter, Layer
     from liverjax.core.files import writable
 
-    if options.radius > LARGEST:
+    if options.shape != "cone" and options.radius > LARGEST:
         raise InputError(f"--radius {options.radius:g} is in metres: give e.g. --radius {options.radius / 1000:g}")
     angle = HALF_ANGLE if options.half_angle is None else options.half_angle
     rig = Indenter(options.shape, options.thickness, options.poisson, options.radius, angle)

@@ -20,6 +20,8 @@ FAR_OFF, LOOSE = 0.05, 0.3
 SMOOTH = 1e-3
 #: Probability of a better match by chance below which factors of the moduli are named.
 CHANCE = 1e-3
+#: Part of the distance from one curve that factors of the moduli must leave at most to be told.
+BETTER = 0.8
 
 
 class MasterCurve(NamedTuple):
@@ -119,6 +121,7 @@ def _factors_of_moduli(sweeps: list[Sweep], found: Shifts) -> list[str]:
     if (
         freedom < 1
         or found.apart < SMOOTH
+        or not other.apart < BETTER * found.apart
         or scipy.special.fdtrc(more, freedom, (alone / both - 1) * freedom / more) > CHANCE
     ):
         return []

@@ -92,7 +92,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         if column.quantity not in first:
             columns[j] = column_in_si(path, column, written[:, j], notes)
             first[column.quantity] = column, columns[j]
-    notes += to_shear(first)
+    notes += (stretched := to_shear(first))
     good, left_out = _usable(path, table, columns)
     for j, column in enumerate(table.columns):
         if j not in columns and known_unit(column.quantity.removesuffix("_sd"), column.unit):
@@ -103,7 +103,9 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     if len(np.unique(omega)) < 2:
         raise InputError(f"{path}: it has {len(np.unique(omega))} frequency; give at least two different ones")
     values = storage_and_loss(values, notes)
-    beside = [(c, written[good]) for c, written in table.beside]
+    # Beside E' and E'' it is not said whether a viscosity is |E*| or |G*| over omega.
+    known = [(c, values) for c, values in table.beside if not (stretched and c.quantity == "viscosity")]
+    beside = [(c, written[good]) for c, written in known]
     notes += _contradictions(path, beside, values | {"frequency": omega})
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(

@@ -201,8 +201,8 @@ def of_columns(
 #: A note on rows that begin at 0 s with the load there.
 BEGINS_LOADED = (
     "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the load rose before it, or "
-    "the sample was loaded before, give those rows too: what relaxed until then is missing from G0 otherwise. --ramp 0 "
-    "(in a description: ramp = 0) says that it was a step"
+    "the sample was loaded before, give those rows too: what relaxed until then is missing from G0 otherwise. If it "
+    "was a step, ramp = 0 in a description, or (relaxation and creep alone) --ramp 0, says so"
 )
 
 

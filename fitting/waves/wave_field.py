@@ -51,6 +51,8 @@ def read_waves(
     """
     name, found = str(path), formats.arrays(Path(path))
     more = {"mask": mask, "labels": labels}
+    if spacing is None and formats.CONFLICT in found:
+        raise InputError(f"{found[formats.CONFLICT]}, or give --spacing")
     step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
     place = found.get(formats.PLACE)
     found |= {key: _on_the_same_voxels(Path(file), key, step, place) for key, file in more.items() if file is not None}

@@ -33,6 +33,8 @@ NAMES = (
 WAVES = ("displacement", "real", "imag", "phases", "wrapped")
 #: Place of NIfTI's voxels in space (3, 4) [m]: axes, then the corner; no array of another file has this name.
 PLACE = "(place)"
+#: A sentence, if a file contradicts itself about the size of its voxels.
+CONFLICT = "(conflict)"
 HDF5 = (".h5", ".hdf5")
 
 
@@ -73,6 +75,8 @@ def arrays(path: Path) -> Content:
 def single(path: Path, name: str) -> tuple[np.ndarray, object, object]:
     """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and `PLACE`."""
     found = arrays(path)
+    if CONFLICT in found:
+        raise InputError(found[CONFLICT])
     place = found.get("spacing"), found.get(PLACE)
     if name in found:
         return np.asarray(found[name]), *place
@@ -150,6 +154,9 @@ def _voxel_table(path: Path) -> Content:
     between = find_delimiter(lines[0][1]) if lines else ","
     head = [cell.lower() for cell in split_cells(lines[0][1], between)] if lines else []
     head = [ALSO.get(name, name) for name in head]
+    twice = next((name for k, name in enumerate(head) if name in head[:k]), None)
+    if twice is not None:
+        raise InputError(f"{path}: two columns mean {twice}: leave one of them")
     missing = [name for name in COLUMNS if name not in head]
     if missing:
         raise InputError(f"{path}: has no column {missing[0]}: give {','.join(COLUMNS)} and, for several, frequency")
@@ -168,7 +175,7 @@ def _voxel_table(path: Path) -> Content:
             raise InputError(f"{path}: row {lines[1 + empty[0]][0]} has no frequency: give every row its own, in Hz")
         hertz, of = np.unique(column["frequency"], return_inverse=True)
     if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
-        unknown = [name for name in head if name not in (*COLUMNS, "frequency", "label")]
+        unknown = [name for name in head if name not in (*COLUMNS, "frequency", "label", "mask")]
         perhaps = f", or name the column of the frequencies frequency (not {unknown[0]})" if unknown else ""
         raise InputError(f"{path}: a voxel has two rows of one frequency: leave one of them{perhaps}")
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
@@ -177,8 +184,14 @@ def _voxel_table(path: Path) -> Content:
     found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
     for name, key in (("label", "labels"), ("mask", "mask")):
         if name in column:
-            values = np.zeros(shape)
-            values[tuple(at.T)] = np.nan_to_num(column[name])
+            values, own = np.zeros(shape), np.nan_to_num(column[name])
+            values[tuple(at.T)] = own
+            changed = np.flatnonzero(values[tuple(at.T)] != own)
+            if len(changed):
+                number = lines[1 + changed[0]][0]
+                raise InputError(
+                    f"{path}: row {number}: {name} differs from that of another frequency: give one {name}"
+                )
             found |= {key: values}
     return found
 
@@ -222,6 +235,12 @@ def _nifti(path: Path) -> Content:
     unit = {"meter": 1.0, "micron": 1e-6}.get(image.header.get_xyzt_units()[0], 1e-3)  # mm if it is not stated
     size, axes = _voxel_size(path, image), unit * np.asarray(image.affine)[:3]
     found: Content = {"spacing": unit * size} if size.any() else {}
+    stated = np.abs(np.asarray(image.header["pixdim"][1:4], float))
+    if _has_place(image) and not np.allclose(stated, size, rtol=0.01):
+        found[CONFLICT] = (
+            f"{path}: its header has voxels of {stated.tolist()} and its affine of {size.round(6).tolist()}: correct "
+            "the wrong one"
+        )
     found |= {PLACE: axes} if _has_place(image) else {}
     if not np.iscomplexobj(data):
         return found | {"labels": data}
@@ -237,16 +256,11 @@ def _has_place(image: "nibabel.Nifti1Image") -> bool:
 
 def _voxel_size(path: Path, image: "nibabel.Nifti1Image") -> np.ndarray:
     """Size of the voxels (3,) as the file states it; zeros if it states none."""
-    stated = np.asarray(image.header["pixdim"][1:4], float)
     if not _has_place(image):
-        return np.abs(stated) if np.all(stated) else np.zeros(3)
+        stated = np.abs(np.asarray(image.header["pixdim"][1:4], float))
+        return stated if np.all(stated) else np.zeros(3)
     columns = np.asarray(image.affine)[:3, :3]
     size = np.linalg.norm(columns, axis=0)
     if not np.all(size > 0) or np.abs(columns.T @ columns / np.outer(size, size) - np.eye(3)).max() > 1e-3:
         raise InputError(f"{path}: the axes of its voxels are not at right angles: resample it to rectangular voxels")
-    if not np.allclose(np.abs(stated), size, rtol=0.01):
-        raise InputError(
-            f"{path}: its header has voxels of {np.abs(stated).tolist()} and its affine of {size.round(6).tolist()}: "
-            "correct the wrong one"
-        )
     return size

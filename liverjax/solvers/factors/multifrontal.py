@@ -275,7 +275,7 @@ def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[
         A = np.tril(own[a:b, a:b])
         inverse, below = _inverted(A + np.tril(A, -1).T), own[b:, a:b]
         after = np.empty((b - a, len(below)), own.dtype)
-        _dealt_out(partial(_solve, inverse, below, after), len(below), idle())
+        _dealt_out(partial(_solved_tile, inverse, below, after), len(below), idle())
         _take_off(own[b:, b:], below, after[:, : n - b], idle())
         X[a:b] = after[:, n - b :]
         found.append(Eliminated(every[a:b], every[b:], inverse, after))
@@ -283,7 +283,7 @@ def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[
     return found
 
 
-def _solve(inverse: np.ndarray, below: np.ndarray, out: np.ndarray, j: int) -> None:
+def _solved_tile(inverse: np.ndarray, below: np.ndarray, out: np.ndarray, j: int) -> None:
     """A tile of columns of the inverse times the transposed rows below."""
     np.matmul(inverse, below[j : j + TILE].T, out=out[:, j : j + TILE])
 
