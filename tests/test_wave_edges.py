@@ -244,7 +244,10 @@ def test_intervals_of_a_map_hold_the_truth_beside_edges():
     own = organ_of(field)
     found = elastography.regions_of(own._replace(field=field._replace(labels=None)))
     drawn = stiffness_map.map_of(elastography.problem_of_map(own, found, 0.008), draws=0)
-    at = [waves_report.at_voxels(own, value) for value in (drawn.modulus[0], drawn.sd, drawn.posterior_sd * (1 + 1j))]
+    at = [
+        waves_report.at_voxels(own, value)
+        for value in (drawn.modulus[0], drawn.sd[0], drawn.posterior_sd[0] * (1 + 1j))
+    ]
     G, sds, known = at[0], at[1:], np.isfinite(at[0].real)
     off = np.abs(G.real - np.where(field.labels == 2, STIFF, SOFT))[known]
     held = [np.mean(off < 1.645 * stiffness_map.sd_of_modulus(G, sd).real[known]) for sd in sds]

@@ -77,12 +77,12 @@ def measured() -> tuple[WaveField, np.ndarray]:
 def held(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Whether the true storage and loss modulus are in the 90 % interval (2, F, known voxels), and those voxels' (n, 2)
     places [m]."""
-    sd, out = waves_report.at_voxels(organ, drawn.sd), []
-    known = np.isfinite(sd)
+    sds, out = [waves_report.at_voxels(organ, own) for own in drawn.sd], []
+    known = np.isfinite(sds[0])
     for f, hertz in enumerate(HERTZ):
         G = waves_report.at_voxels(organ, drawn.modulus[f])
         exact = SOFT + (STIFF - SOFT) * part + 2j * np.pi * hertz * VISCOSITY
-        off, allowed = (G - exact)[known], 1.645 * stiffness_map.sd_of_modulus(G, sd)[known]
+        off, allowed = (G - exact)[known], 1.645 * stiffness_map.sd_of_modulus(G, sds[f])[known]
         out.append((np.abs(off.real) < allowed.real, np.abs(off.imag) < allowed.imag))
     places = organ.field.origin[:2] + VOXEL * np.argwhere(known)[:, :2]
     return np.moveaxis(np.array(out), 1, 0), places
@@ -104,13 +104,13 @@ def covered(organ: elastography.Organ, drawn: stiffness_map.WaveMap, part: np.nd
 
 def rows_of(organ, found, drawn, usual) -> list[dict]:
     """A row a cylinder and one for the plate: by regions, by the map, by direct inversion."""
-    rows, inside = [], waves_report.at_voxels(organ, drawn.sd)
+    rows, every = [], [waves_report.at_voxels(organ, own) for own in drawn.sd]
     for k, label in enumerate(found.labels):
         place = organ.field.labels == label
         place[:, :, [0, -1]] = False
-        core = place & np.isfinite(inside)
+        core = place & np.isfinite(every[0])
         maps = [waves_report.at_voxels(organ, G)[core] for G in drawn.modulus]
-        sds = [stiffness_map.sd_of_modulus(G, inside[core]).real for G in maps]
+        sds = [stiffness_map.sd_of_modulus(G, sd[core]).real for G, sd in zip(maps, every, strict=True)]
         rows.append(
             {
                 "radius_m": None if label == 1 else CYLINDERS[label - 2][1],

@@ -130,7 +130,7 @@ def main() -> None:
     by_regions = time.perf_counter() - begin
     drawn = stiffness_map.map_of(elastography.problem_of_map(organ, found, 4 * VOXEL))
     usual = direct_inversion.invert(organ.field, DENSITY)
-    G, known = waves_report.at_voxels(organ, drawn.modulus[0]), np.isfinite(waves_report.at_voxels(organ, drawn.sd))
+    G, known = waves_report.at_voxels(organ, drawn.modulus[0]), np.isfinite(waves_report.at_voxels(organ, drawn.sd[0]))
     core, liver = known & (part == 1), known & (part == 0) & organ.field.mask
     data = {
         "hertz": HERTZ,

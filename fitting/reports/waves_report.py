@@ -398,17 +398,20 @@ def _write_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.nda
         if drawn is None:
             return
         whole = np.stack([at_voxels(organ, G) for G in drawn.modulus])
-        sd = at_voxels(organ, drawn.sd)
+        sd = np.stack([at_voxels(organ, own) for own in drawn.sd])
         file["modulus"], file["sd_of_logarithm"], file["sd_of_loss_angle"] = whole, sd.real, sd.imag
         file["sd"] = sd_of_modulus(whole, sd)
-        file["draws_of_exponent"] = np.stack([at_voxels(organ, c) for c in drawn.draws]) if len(drawn.draws) else []
+        file["draws_of_exponent"] = (
+            np.stack([[at_voxels(organ, c) for c in own] for own in drawn.draws]) if len(drawn.draws) else []
+        )
         file["modulus"].attrs["unit"] = file["sd"].attrs["unit"] = "Pa"
 
 
 def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
-    data = {"sd_of_logarithm": drawn.sd.real, "sd_of_loss_angle": drawn.sd.imag}
-    for hertz, G in zip(organ.field.frequencies, drawn.modulus, strict=True):
+    data = {}
+    for hertz, G, sd in zip(organ.field.frequencies, drawn.modulus, drawn.sd, strict=True):
         data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
+        data |= {f"sd_of_logarithm_{hertz:g}_Hz": sd.real, f"sd_of_loss_angle_{hertz:g}_Hz": sd.imag}
     mesh = organ.body.linear
     meshio.write_points_cells(path, np.asarray(mesh.points), {"tetra": np.asarray(mesh.tetrahedra)}, data)
 
@@ -417,7 +420,7 @@ def maps_picture(organ: Organ, drawn: WaveMap, usual: np.ndarray) -> "Figure":
     """Middle slice across the shortest side at the highest frequency: map, its deviation, the direct inversion."""
     f, axis = len(drawn.modulus) - 1, int(np.argmin(organ.field.mask.shape))
     k = int(np.median(organ.body.voxel[organ.body.inner][:, axis]))
-    G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd.real)
+    G, sd = at_voxels(organ, drawn.modulus[f]), at_voxels(organ, drawn.sd[f].real)
     panels = (
         ("storage modulus [kPa]", G.real / 1e3, "viridis"),
         ("loss modulus [kPa]", G.imag / 1e3, "viridis"),

@@ -1,8 +1,10 @@
 """A map of the complex modulus from measured waves: a smooth field, with its uncertainty.
 
-At frequency f the modulus of an element is g_f exp(c). g_f is the modulus of the whole organ; c = ln(size) + i (loss
-angle) is the mean of a complex nodal field (P,), the same for all frequencies. Its real and its imaginary part have the
-prior of `fitting.methods.prior`, with the same standard deviation. Larger and larger deviations are tried. The search
+At frequency f the modulus of an element is g_f exp(c + l_f). g_f is the modulus that a uniform organ would have; c =
+ln(size) + i (loss angle) is the mean of a complex nodal field (P,), the same for all frequencies. Its real and its
+imaginary part have the prior of `fitting.methods.prior`, with the same standard deviation. The levels l_f are complex
+numbers about 0 with the deviation `LEVEL`: an organ that is not uniform may miss the ratios of the g_f. One frequency
+has no level, for the mean of c does the same. Larger and larger deviations of c are tried. The search
 ends when chi^2 is down to the number of equations (discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n
 + |z|^2)/2 - ln det H falls. The deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the
 whitened z is sought by Gauss-Newton.
@@ -34,6 +36,8 @@ from liverjax.core.struct import Content
 
 #: Standard deviations of c to try, from a nearly uniform organ to a free one.
 DEVIATIONS = (0.2, 0.4, 0.8)
+#: Standard deviation of both parts of the levels.
+LEVEL = 0.5
 #: Most steps of Gauss-Newton for each, and relative decrease of the cost below which a step is the last.
 STEPS, LAST = 8, 3e-4
 
@@ -41,11 +45,11 @@ STEPS, LAST = 8, 3e-4
 class WaveMap(NamedTuple):
     """The map and its uncertainty."""
 
-    exponent: np.ndarray  # c (P,) complex at the corners
-    sd: np.ndarray  # (P,) complex: of its real part (logarithm of the size), and of its imaginary part (loss angle)
-    posterior_sd: np.ndarray  # (P,) of both parts, without the uncertainty of places
-    prior_sd: np.ndarray  # (P,)
-    draws: np.ndarray  # (D, P) complex: samples of the posterior, displaced within the length w
+    exponent: np.ndarray  # c + l_f (F, P) complex at the corners
+    sd: np.ndarray  # (F, P) complex: of its real part (logarithm of the size), and of its imaginary part (loss angle)
+    posterior_sd: np.ndarray  # (F, P) of both parts, without the uncertainty of places
+    prior_sd: np.ndarray  # (F, P)
+    draws: np.ndarray  # (D, F, P) complex: samples of the posterior, displaced within the length w
     modulus: np.ndarray  # (F, P) complex [Pa]
     deviation: float  # standard deviation of the prior that was chosen
     length: float  # [m]
@@ -62,41 +66,61 @@ class Course(NamedTuple):
     m: Matrices
     waves: MeasuredWaves
     whole: np.ndarray  # (F,) complex
-    mean: scipy.sparse.csr_array  # (E, P): the corners' mean
+    exponents: tuple[scipy.sparse.csr_array, ...]  # (F,) of (E, P + L): c + l_f of the elements, from c and the levels
     slopes: tuple[scipy.sparse.csr_array, ...]  # (3,) of (P, P): change over the length w along x, y, z
     p: smooth.Prior
     length: float  # [m]
 
-    def at(self, c: np.ndarray) -> list[Balanced]:
-        """The likeliest motions at the nodal field c (P,)."""
-        factor = np.exp(self.mean @ c)
+    @property
+    def corners(self) -> int:
+        """P."""
+        return len(self.p.root_mass)
+
+    def moduli(self, y: np.ndarray) -> list[np.ndarray]:
+        """Moduli (E,) of the elements at every frequency, from y (P + L,): c at the corners, and the levels."""
+        return [g * np.exp(own @ y) for g, own in zip(self.whole, self.exponents, strict=True)]
+
+    def at(self, y: np.ndarray) -> list[Balanced]:
+        """The likeliest motions at y (P + L,)."""
         w = self.waves
+        each = zip(self.moduli(y), w.omega, w.motion, w.sd, strict=True)
+        return [balance.balanced(self.m, *own) for own in each]
+
+    def jacobians(self, y: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
+        """Derivatives (I, P + L) by y of the forces out of balance, divided by the noise."""
+        each = zip(self.moduli(y), self.exponents, here, self.waves.sd, strict=True)
         return [
-            balance.balanced(self.m, g * factor, *each)
-            for g, each in zip(self.whole, zip(w.omega, w.motion, w.sd, strict=True), strict=True)
+            (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(G) @ own).tocsc() / sd
+            for G, own, b, sd in each
         ]
 
-    def jacobians(self, c: np.ndarray, here: list[Balanced]) -> list[scipy.sparse.csc_array]:
-        """Derivatives (I, P) by c of the forces out of balance, divided by the noise."""
-        factor = np.exp(self.mean @ c)
-        return [
-            (balance.by_modulus(self.m, b.motion) @ scipy.sparse.diags_array(g * factor) @ self.mean).tocsc() / sd
-            for g, b, sd in zip(self.whole, here, self.waves.sd, strict=True)
-        ]
+    def scales(self, k: int) -> np.ndarray:
+        """Deviations (P + L,) of y over those of `natural`, for the deviation of number k."""
+        return np.where(np.arange(self.exponents[0].shape[1]) < self.corners, DEVIATIONS[k], 1.0)
 
-    def field(self, z: np.ndarray) -> np.ndarray:
-        """Nodal field of deviation 1 of complex z, (P,) or (P, k)."""
-        return smooth.field_at_nodes(self.p, z.real) + 1j * smooth.field_at_nodes(self.p, z.imag)
+    def natural(self, z: np.ndarray) -> np.ndarray:
+        """y of whitened complex z, (P + L,) or (P + L, n): c of deviation 1, levels of deviation `LEVEL`."""
+        c, levels = z[: self.corners], LEVEL * z[self.corners :]
+        return np.concatenate(
+            [smooth.field_at_nodes(self.p, c.real) + 1j * smooth.field_at_nodes(self.p, c.imag), levels]
+        )
 
     def whitened(self, g: np.ndarray) -> np.ndarray:
-        """The transpose of `field`, (P,) or (P, k)."""
-        return smooth.to_whitened(self.p, g.real) + 1j * smooth.to_whitened(self.p, g.imag)
+        """The transpose of `natural`, (P + L,) or (P + L, n)."""
+        c, levels = g[: self.corners], LEVEL * g[self.corners :]
+        return np.concatenate([smooth.to_whitened(self.p, c.real) + 1j * smooth.to_whitened(self.p, c.imag), levels])
+
+    def by_frequency(self, y: np.ndarray) -> np.ndarray:
+        """c + l_f at the corners (F, P, …), from y (P + L, …)."""
+        c, levels = y[: self.corners], y[self.corners :]
+        return c[None] + (levels[:, None] if len(levels) else np.zeros((1, 1, *y.shape[1:])))
 
     def marks(self) -> dict[str, object]:
         """Marks that identify the problem, by name."""
         m, w = self.m, self.waves
         return {
             "length": self.length,
+            "unknowns": self.exponents[0].shape[1],
             "density": mark_of(m.mass[..., :1]),
             "spacing": mark_of(m.shear[..., :1]),
             "frequencies": mark_of(w.omega),
@@ -131,8 +155,12 @@ def course_of(body: VoxelBody, m: Matrices, waves: MeasuredWaves, whole: np.ndar
         whole: modulus of the whole organ at each frequency (F,) complex [Pa].
         length: correlation length of the prior [m].
     """
-    mean, p = _mean_of_corners(body), smooth.prior(body.linear, length)
-    return Course(m, waves, np.asarray(whole, complex), mean, _changes_over_slopes(body, mean, length), p, length)
+    mean, p, number = _mean_of_corners(body), smooth.prior(body.linear, length), len(whole)
+    levels = np.eye(number) if number > 1 else np.zeros((1, 0))
+    every = np.ones((mean.shape[0], 1))
+    exponents = tuple(scipy.sparse.hstack([mean, scipy.sparse.csr_array(every * own)], "csr") for own in levels)
+    slopes = _changes_over_slopes(body, mean, length)
+    return Course(m, waves, np.asarray(whole, complex), exponents, slopes, p, length)
 
 
 def map_of(
@@ -158,23 +186,23 @@ def map_of(
     begun = _first_or_resumed(course, file if resume else None)
     history, components = begun.history, course.m.balances * len(course.waves.omega)
     visited = _each_deviation(course, begun, file, progress)
-    excess, evidence = _evidences(visited, components)
+    excess, evidence = _evidences(course, visited, components)
     for row, value in zip(history[-len(visited) :], evidence, strict=True):
         row["evidence"] = value
     point = visited[int(np.argmax(evidence))][0]
-    deviation = DEVIATIONS[point.k]
-    c = deviation * course.field(point.z)
+    y = course.natural(course.scales(point.k) * point.z)
+    exponent = course.by_frequency(y)
     before, after, departures = _spread(course, point, excess, draws)
-    slopes = np.stack([D @ c for D in course.slopes])
+    slopes = np.stack([D @ y[: course.corners] for D in course.slopes])
     place = np.random.default_rng(1).uniform(-0.5, 0.5, (draws, 3)) @ slopes
     return WaveMap(
-        exponent=c,
+        exponent=exponent,
         sd=_with_place(after, slopes.real) + 1j * _with_place(after, slopes.imag),
         posterior_sd=after,
         prior_sd=before,
-        draws=c + departures + place,
-        modulus=course.whole[:, None] * np.exp(c),
-        deviation=deviation,
+        draws=exponent + departures + place[:, None],
+        modulus=course.whole[:, None] * np.exp(exponent),
+        deviation=DEVIATIONS[point.k],
         length=course.length,
         chi2=point.chi2,
         components=components,
@@ -190,7 +218,7 @@ def sd_of_modulus(G: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 
 def _with_place(sd: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations (P,) with the uncertainty of places; slopes (3, P) are changes over the length w."""
+    """Standard deviations (F, P) with the uncertainty of places; slopes (3, P) are changes over the length w."""
     return np.sqrt(sd**2 + np.sum(slopes**2, axis=0) / 12)
 
 
@@ -222,20 +250,28 @@ def _changes_over_slopes(
 
 
 def _reached(course: Course, z: np.ndarray, k: int) -> _Reached:
-    here = course.at(DEVIATIONS[k] * course.field(z))
+    here = course.at(course.natural(course.scales(k) * z))
     chi2 = sum(b.chi2 for b in here)
     return _Reached(z, k, here, chi2, 0.5 * chi2 + 0.5 * float(np.vdot(z, z).real))
 
 
-def _evidences(visited: list[tuple[_Reached, np.ndarray]], components: int) -> tuple[float, list[float]]:
+def _evidences(
+    course: Course, visited: list[tuple[_Reached, np.ndarray]], components: int
+) -> tuple[float, list[float]]:
     """The factor by which chi^2 is too large, and the evidence of each deviation tried."""
     excess = max(1.0, min(p.chi2 for p, _ in visited) / components)
-    return excess, [_evidence(p, information, excess) for p, information in visited]
+    return excess, [_evidence(course, p, information, excess) for p, information in visited]
 
 
-def _evidence(point: _Reached, information: np.ndarray, excess: float) -> float:
+def _hessian(course: Course, k: int, information: np.ndarray) -> np.ndarray:
+    """The Hessian (P + L, P + L) by whitened z, of the deviation of number k."""
+    scales = course.scales(k)
+    return np.eye(len(information)) + scales[:, None] * information * scales
+
+
+def _evidence(course: Course, point: _Reached, information: np.ndarray, excess: float) -> float:
     """Logarithm of the probability of the data at this deviation, up to a constant."""
-    H = np.eye(len(information)) + DEVIATIONS[point.k] ** 2 / excess * information
+    H = _hessian(course, point.k, information / excess)
     logarithm = 2 * float(np.sum(np.log(np.real(np.diagonal(np.linalg.cholesky(H))))))
     return -0.5 * (point.chi2 / excess + float(np.vdot(point.z, point.z).real)) - logarithm
 
@@ -265,7 +301,7 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
             }
         )
         visited.append((point, information))
-        evidence = _evidences(visited, components)[1]
+        evidence = _evidences(course, visited, components)[1]
         if point.chi2 <= components or evidence[-1] < max(evidence) or point.k + 1 == len(DEVIATIONS):
             return visited
         start = point = _next_start(course, point)
@@ -273,28 +309,28 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
     """The same field, written with the next deviation."""
-    return _reached(course, point.z * DEVIATIONS[point.k] / DEVIATIONS[point.k + 1], point.k + 1)
+    return _reached(course, point.z * course.scales(point.k) / course.scales(point.k + 1), point.k + 1)
 
 
 def _information(course: Course, point: _Reached) -> np.ndarray:
-    """J^H J in whitened z of a field of deviation 1, complex (P, P)."""
-    c = DEVIATIONS[point.k] * course.field(point.z)
-    H = np.zeros((len(c), len(c)), complex)
-    for J, b in zip(course.jacobians(c, point.here), point.here, strict=True):
+    """J^H J in whitened z of a field of deviation 1, complex (P + L, P + L)."""
+    y = course.natural(course.scales(point.k) * point.z)
+    H = np.zeros((len(y), len(y)), complex)
+    for J, b in zip(course.jacobians(y, point.here), point.here, strict=True):
         X = b.whitened(J, np.complex64)  # the Hessian only directs steps: it needs no more digits
         H += X.conj().T @ X
-    # T^T H T, with T the real matrix of `field`, from both sides.
+    # T^T H T, with T the real matrix of `natural`, from both sides.
     half = course.whitened(H)
     return course.whitened(half.conj().T).conj().T
 
 
 def _stepped(course: Course, point: _Reached, information: np.ndarray) -> _Reached:
     """A step of Gauss-Newton that lowers the cost, or the point itself."""
-    deviation = DEVIATIONS[point.k]
-    c = deviation * course.field(point.z)
-    each = zip(course.jacobians(c, point.here), point.here, course.waves.sd, strict=True)
-    slope = deviation * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
-    H = np.eye(len(c)) + deviation**2 * information
+    scales = course.scales(point.k)
+    y = course.natural(scales * point.z)
+    each = zip(course.jacobians(y, point.here), point.here, course.waves.sd, strict=True)
+    slope = scales * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
+    H = _hessian(course, point.k, information)
     step = -scipy.linalg.solve(H, slope + point.z, assume_a="pos")
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
@@ -304,17 +340,21 @@ def _stepped(course: Course, point: _Reached, information: np.ndarray) -> _Reach
 
 
 def _spread(course: Course, point: _Reached, excess: float, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Standard deviations (P,) before and after the data, and departures (D, P) of samples of the posterior."""
-    deviation, n = DEVIATIONS[point.k], len(point.z)
-    L = np.linalg.cholesky(np.eye(n) + deviation**2 / excess * _information(course, point))
-    roots = course.field(np.linalg.inv(L).conj().T)  # R R^H is the covariance
+    """Standard deviations (F, P) before and after the data, and departures (D, F, P) of samples of the posterior."""
+    scales, n = course.scales(point.k)[:, None], len(point.z)
+    L = np.linalg.cholesky(_hessian(course, point.k, _information(course, point) / excess))
+
+    def by_frequency(z: np.ndarray) -> np.ndarray:
+        return course.by_frequency(course.natural(scales * z))
+
+    roots = by_frequency(np.linalg.inv(L).conj().T)  # R R^H is the covariance
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(n, draws)) + 1j * rng.normal(size=(n, draws))
-    before = course.field(np.eye(n) + 0j)
+    before = by_frequency(np.eye(n) + 0j)
     return (
-        deviation * np.sqrt(np.sum(np.abs(before) ** 2, axis=1)),
-        deviation * np.sqrt(np.sum(np.abs(roots) ** 2, axis=1)),
-        deviation * (roots @ normal).T,
+        np.sqrt(np.sum(np.abs(before) ** 2, axis=-1)),
+        np.sqrt(np.sum(np.abs(roots) ** 2, axis=-1)),
+        np.moveaxis(roots @ normal, -1, 0),
     )
 
 
@@ -334,7 +374,7 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
     """Begin at a uniform organ, or at the point of an earlier run, whose earlier deviations are evaluated again."""
-    start = _reached(course, np.zeros(len(course.p.root_mass), complex), 0)
+    start = _reached(course, np.zeros(course.exponents[0].shape[1], complex), 0)
     if file is None or not file.is_file():
         return _Begun(start, start, [], [])
     try:
