@@ -88,8 +88,10 @@ def test_cards_read_back_are_the_model(model, tmp_path):
 
 def test_the_card_of_sofa_is_the_equilibrium(tmp_path):
     field = ET.fromstring("<s>" + material_cards.sofa(SOLID) + "</s>")[0]
-    mu, bulk = (float(v) for v in field.get("ParameterSet").split())
-    assert mu == pytest.approx(770 * (1 - 0.568)) and bulk > 20 * mu and field.get("materialName") == "NeoHookean"
+    mu, lame = (float(v) for v in field.get("ParameterSet").split())
+    # Its energy has lambda/2 (ln J)^2: nu = lambda / (2 (lambda + mu)).
+    assert lame / (2 * (lame + mu)) == pytest.approx(material_cards.POISSON, abs=1e-9)
+    assert mu == pytest.approx(770 * (1 - 0.568)) and field.get("materialName") == "NeoHookean"
     numbers = re.search(r"each mode: (.*) -->", material_cards.sofa(SOLID))[1]
     assert numbers == "0.235 0.27; 0.333 0.03"
 

@@ -183,7 +183,11 @@ def test_units_and_forms(tmp_path):
     file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.1, -G)
     c = read_time_test(file, "relaxation", Sample(r, h))
     assert np.allclose(c.answer[1:] / c.driven[1:], G * 1e-3 / (np.pi * r**2) / (0.1e-3 / h) / 3)
-    assert "G = E / 3" in c.notes[0]
+    assert "G = E / 3" in c.notes[0] and "strained by 2.5 %" in c.notes[1]
+    exact = 1 - 0.1 / 4  # s - 1/s^2 over 3 (s - 1)
+    assert f"{100 * ((exact - exact**-2) / (3 * (exact - 1)) - 1):.2g} % too large in compression" in c.notes[1]
+    file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.05, -G)
+    assert not any("strained" in note for note in read_time_test(file, "relaxation", Sample(r, h)).notes)
     text = "Result:\tStep strain\nPoint No.\tTime\tShear Strain\tShear Stress\n\t\t\t\n\t[s]\t[%]\t[Pa]\n"
     rows = "".join(f"{k}\t{t:.4f}\t1,0\t{G / 100:.5f}\n".replace(".", ",") for k, (t, G) in enumerate(zip(T, G)))  # noqa: B905
     (tmp_path / "d.txt").write_bytes((text + rows).encode("utf-16"))

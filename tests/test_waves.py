@@ -247,6 +247,15 @@ def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
             stiffness_map._first_or_resumed(course, file)
 
 
+def test_gaps_within_the_organ_are_told():
+    field = plane_waves((9, 9, 13))
+    assert not elastography.notes_on_gaps(field)
+    field.displacement[0, [2, 4, 6], [4, 6, 4], [4, 6, 8], 1] = np.nan
+    (note,) = elastography.notes_on_gaps(field)
+    left = len(np.asarray(elastography.body_of(field).linear.tetrahedra)) / 6 / (4 * 4 * 6)
+    assert f"3 voxels within the organ have no displacement, and {100 * left:.2g} % of its elements are left" in note
+
+
 def test_columns_of_the_table_stay_apart_where_nothing_fits():
     own = {"phase_velocity_m_s": [7.8], "chi2_per_component": [2.67e11]}
     own |= {key: [1.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}

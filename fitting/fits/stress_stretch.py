@@ -286,6 +286,7 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
     half, s = spread(J[:n, known], noise, slope[np.ix_(known, known)])
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
     its_errors, its_correlation = errors_and_correlation(half)
+    its_errors = np.maximum(its_errors, uneven_errors(J[:n, known], misfit, slope[np.ix_(known, known)]))
     if n > p:
         errors[known] = its_errors
     if np.all(np.isfinite(half)):
@@ -317,6 +318,16 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
         limits=limits,
     )
     return result._replace(warnings=_warnings(result, curves, s, bool(np.any(r[n:] < 0))))
+
+
+def uneven_errors(J: np.ndarray, misfit: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Standard errors if the noise is not the same at all points, as where it grows with the stress (HC3: MacKinnon and
+    White 1985)."""
+    if not np.all(np.isfinite(J)) or J.size == 0:
+        return np.zeros(len(slope))
+    inverse = np.linalg.pinv(J)
+    leverage = np.einsum("kn,nk->n", inverse, J)
+    return np.linalg.norm(slope @ (inverse * (misfit / np.maximum(1 - leverage, 0.05))), axis=1)
 
 
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:

@@ -64,7 +64,8 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     for curve in (c for c in curves if c.returns):
         times = "once" if curve.returns == 1 else f"{curve.returns} times"
         notes.append(
-            f"{curve.label}: its rows turn back {times}: loading, unloading or cycles are fitted as one curve; keep one"
+            f"{curve.label}: its rows turn back {times}: loading and unloading, cycles or several samples are fitted "
+            "as one curve, and errors do not contain how these differ; keep one, or give each a file"
         )
     seen: dict[str, int] = {}
     for k, curve in enumerate(curves):
@@ -97,7 +98,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     rows = [row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
     if not rows:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
-    if "F11" not in rows[0] and not {"test", "stretch"} <= set(rows[0]):
+    if "F11" not in rows[0] and not ("test" in rows[0] and {"stretch", "shear"} & set(rows[0])):
         raise InputError(
             f"{file} has columns {', '.join(list(rows[0])[:-1])[:100]}: give F11 … F33, P11 … P33, "
             "or test, stretch, shear, nominal_stress_kPa"
@@ -137,17 +138,22 @@ def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str,
     return None
 
 
+#: A component of stress below this part of the largest one was not measured: programs write roundoff in place of 0.
+ROUNDOFF = 1e-9
+
+
 def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
     F = np.stack([_column(file, rows, f"F{ij}") for ij in _INDICES], axis=1).reshape(-1, 3, 3)
-    measured, named = {}, True
+    measured, stated = {}, {}
     for ij in _INDICES:
         column = _stress_column(file, rows[0], f"P{ij}", unit)
         if column is None:
             continue
-        values = column[1] * _column(file, rows, column[0])
-        if np.any(values != 0):
-            measured[int(ij[0]) - 1, int(ij[1]) - 1] = values
-            named = named and column[2]
+        measured[int(ij[0]) - 1, int(ij[1]) - 1] = column[1] * _column(file, rows, column[0])
+        stated[int(ij[0]) - 1, int(ij[1]) - 1] = column[2]
+    largest = max((np.abs(values).max() for values in measured.values()), default=0.0)
+    measured = {at: values for at, values in measured.items() if np.abs(values).max() > ROUNDOFF * largest}
+    named = all(stated[at] for at in measured)
     if not measured:
         raise InputError(f"{file}: all stresses P11 … P33 are zero or missing: give the measured components")
     if any(2 in ij for ij in measured):
@@ -178,6 +184,8 @@ def _kind(F: np.ndarray) -> str:
 
 #: A test whose smallest stretch is this large began far from rest: strains in % are more likely.
 STRAINED = 1.9
+#: The same for tests that reach `STRAINED` and have a stretch below this one with a stress of the same sign.
+SHORTENED = 0.9
 
 
 def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
@@ -190,7 +198,7 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         if test not in homogeneous.TESTS:
             raise InputError(f"{file}: test {test!r} is not known: use one of {', '.join(homogeneous.TESTS)}")
         groups.setdefault((test, row.get("stretch", "") if test == "simple_shear" else ""), []).append(row)
-    curves = []
+    curves, factor = [], column[1]
     for (test, fixed), group in groups.items():
         shear = homogeneous.TESTS[test] == "shear"
         stretch = _column(file, group, "stretch", 1.0 if shear else None)
@@ -202,10 +210,17 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
                 f"{file}: stretches of {stretch.min():g} to {stretch.max():g} do not begin near 1: a stretch is the "
                 "length over the length at rest; write a strain of 2 % as 1.02"
             )
+        stress = factor * _column(file, group, column[0])
+        ends = stress[[int(np.argmin(stretch)), int(np.argmax(stretch))]]
+        if not shear and stretch.min() < SHORTENED and stretch.max() > STRAINED and np.prod(np.sign(ends)) > 0:
+            raise InputError(
+                f"{file}: stretches of {stretch.min():g} and {stretch.max():g} have stresses of one sign, and tension "
+                "does not shorten: a stretch is the length over the length at rest; write a strain of 2 % as 1.02"
+            )
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
         label = f"{file.stem}, {test.replace('_', ' ')}" + (f" at {fixed}" if shear and fixed not in ("", "1") else "")
         component = (0, 1) if shear else (0, 0)
-        curves.append(_one_curve(file, label, test, F, component, column[1] * _column(file, group, column[0])))
+        curves.append(_one_curve(file, label, test, F, component, stress))
     return curves, column[2]
 
 
@@ -247,9 +262,9 @@ def _returns(driven: np.ndarray) -> int:
             turns += [low] if rises is False else []
             rises, high = True, k
     parts = [driven[a + (a > 0) : b + 1] for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
+    parts = [part for part in parts if len(part) >= 3]  # a jump back to the start is no part of its own
     return sum(
         1
         for before, after in itertools.pairwise(parts)
-        if min(len(before), len(after)) >= 3
-        and min(before.max(), after.max()) - max(before.min(), after.min()) > 2 * least
+        if min(before.max(), after.max()) - max(before.min(), after.min()) > 2 * least
     )

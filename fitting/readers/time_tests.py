@@ -439,7 +439,26 @@ def _as_shear(path, form, columns, sample):
     if form == ("angle", "torque"):
         return columns["angle"] * r / h, columns["torque"] * 2 / (np.pi * r**3), []
     note = "force and displacement are taken as those of an incompressible cylinder between slippery plates: G = E / 3"
-    return columns["displacement"] / h, columns["force"] / (3 * np.pi * r**2), [note]
+    return columns["displacement"] / h, columns["force"] / (3 * np.pi * r**2), [note, *_beyond_small(columns, h)]
+
+
+#: Deviation [1] of the force from a straight line from which it is told.
+BENT = 0.02
+
+
+def _beyond_small(columns: dict[str, np.ndarray], height: float) -> list[str]:
+    """A note if the force of a neo-Hookean sample, stretched or compressed so far, is not in proportion."""
+    strain = float(np.nanmax(np.abs(columns["displacement"]))) / height
+    if not strain < 1:
+        return []
+    longer, shorter = ((s - s**-2) / (3 * (s - 1)) - 1 if strain > 0 else 0.0 for s in (1 + strain, 1 - strain))
+    if shorter < BENT:
+        return []
+    return [
+        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is no straight line: "
+        f"moduli come out {100 * shorter:.2g} % too large in compression, {-100 * longer:.2g} % too small in tension. "
+        "Describe the test in a TOML file to have this computed"
+    ]
 
 
 #: Fewest rows at rest whose mean is an offset, and the part of the largest answer below which it does not matter.

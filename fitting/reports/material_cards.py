@@ -100,7 +100,10 @@ def ansys(model: Maxwell) -> str:
 
 
 def sofa(model: Maxwell) -> str:
-    """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment contains it."""
+    """A hyperelastic force field at the equilibrium modulus. SOFA has no Prony series, so a comment contains it.
+
+    Its energy is mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2: the second number is Lame's, not the bulk modulus.
+    """
     G0, ratios, times = model
     rest = float(G0) * (1 - float(np.sum(ratios)))
     shear = rest if rest > 1e-6 * float(G0) else float(G0)
@@ -110,5 +113,5 @@ def sofa(model: Maxwell) -> str:
         f"<!-- SI units: Pa, s. The {what} shear modulus: SOFA has no Prony series of its own.\n"
         f"     G0 {_written_number(float(G0))}; ratio and relaxation time of each mode: {modes} -->\n"
         '<TetrahedronHyperelasticityFEMForceField materialName="NeoHookean" '
-        f'ParameterSet="{_written_number(shear)} {_written_number(_bulk(shear))}" />\n'
+        f'ParameterSet="{_written_number(shear)} {_written_number(_bulk(shear) - 2 * shear / 3)}" />\n'
     )

@@ -408,7 +408,7 @@ def _write_voxels(path: Path, organ: Organ, drawn: WaveMap | None, usual: np.nda
 
 
 def _for_paraview(path: Path, organ: Organ, drawn: WaveMap) -> None:
-    data = {}
+    data: dict[str, np.ndarray] = {}
     for hertz, G, sd in zip(organ.field.frequencies, drawn.modulus, drawn.sd, strict=True):
         data |= {f"storage_{hertz:g}_Hz": G.real, f"loss_{hertz:g}_Hz": G.imag}
         data |= {f"sd_of_logarithm_{hertz:g}_Hz": sd.real, f"sd_of_loss_angle_{hertz:g}_Hz": sd.imag}

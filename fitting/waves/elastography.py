@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.ndimage
 
 from fitting.waves import balance, edge_places, edges, regions, stiffness_map, voxels
 from fitting.waves.balance import Matrices, gigabytes
@@ -55,6 +56,23 @@ def body_of(field: WaveField) -> VoxelBody:
             f"{field.source or 'waves'}: a balance of forces needs three components of the displacement: measure all"
         )
     return voxels.voxel_body(field.mask & np.all(measured, axis=-1), field.spacing, field.origin)
+
+
+#: Part of the bricks that gaps within the organ must leave, or it is told.
+GAPS = 0.8
+
+
+def notes_on_gaps(field: WaveField) -> list[str]:
+    """A note if voxels without displacement within the organ take many elements away: each needs all its 27 voxels."""
+    inside = field.mask & np.isfinite(field.displacement).all(axis=(0, 4))
+    whole = scipy.ndimage.binary_fill_holes(inside)
+    left, most = voxels.number_of_bricks(inside), voxels.number_of_bricks(whole)
+    if not left < GAPS * most:
+        return []
+    return [
+        f"{int((whole & ~inside).sum())} voxels within the organ have no displacement, and {100 * left / most:.2g} % "
+        "of its elements are left: fill single gaps from their neighbours, and errors become smaller"
+    ]
 
 
 def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:

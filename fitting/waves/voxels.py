@@ -50,6 +50,13 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
     return VoxelBody(linear, mesh, place, inner[tuple((place - first).T)])
 
 
+def number_of_bricks(mask: np.ndarray) -> int:
+    """How many bricks `voxel_body` makes of a mask (nx, ny, nz)."""
+    first = _corner(mask)
+    cells = tuple(int(n) for n in (np.array(mask.shape) - 1 - first) // 2)
+    return int(_whole_bricks(mask[tuple(slice(f, None) for f in first)], cells).sum()) if min(cells) > 0 else 0
+
+
 def _sixths(brick: np.ndarray, cells: tuple[int, ...]) -> np.ndarray:
     """Corners (6 n, 4) of the elements of bricks (n, 3); every second brick is a mirror image along each axis.
 
