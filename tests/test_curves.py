@@ -301,6 +301,20 @@ def test_a_parameter_without_data_is_told():
     assert any("leave c2 free" in w for w in stress_stretch.fit(candidate, small).warnings)
 
 
+def test_a_measured_stretch_of_sheared_samples_is_one_curve(tmp_path):
+    """1, 1.0 and 1.0004 were three curves."""
+    shear = np.linspace(0, 0.5, 12)
+    rows = [f"simple_shear,{('1', '1.0', '1.0004')[k % 3]},{x:.4f},{x:.5f}" for k, x in enumerate(shear)]
+    rows += [f"simple_shear,0.9,{x:.4f},{x:.5f}" for x in shear]
+    file = tmp_path / "s.csv"
+    file.write_text("\n".join(["test,stretch,shear,nominal_stress_kPa", *rows]) + "\n")
+    found, _ = curves.read_curves([file])
+    assert [(c.label, len(c.stress)) for c in found] == [("s, simple shear", 12), ("s, simple shear at 0.9", 12)]
+    file.write_text("\n".join(["test,shear,nominal_stress_kPa", *(f"simple_shear,{x:.4f},{x:.5f}" for x in shear)]))
+    ((curve,), _) = curves.read_curves([file])
+    assert np.allclose(curve.F[:, 0, 0], 1) and len(curve.stress) == 12
+
+
 def test_unloading_preload_and_decimal_commas_are_seen(tmp_path, capsys):
     up = np.linspace(1.0, 1.4, 41)
     stress = 1e3 * (up - up**-2)

@@ -197,7 +197,7 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         test = row["test"]
         if test not in homogeneous.TESTS:
             raise InputError(f"{file}: test {test!r} is not known: use one of {', '.join(homogeneous.TESTS)}")
-        groups.setdefault((test, row.get("stretch", "") if test == "simple_shear" else ""), []).append(row)
+        groups.setdefault((test, _stretch_of_shear(row) if test == "simple_shear" else ""), []).append(row)
     curves, factor = [], column[1]
     for (test, fixed), group in groups.items():
         shear = homogeneous.TESTS[test] == "shear"
@@ -222,6 +222,14 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         component = (0, 1) if shear else (0, 0)
         curves.append(_one_curve(file, label, test, F, component, stress))
     return curves, column[2]
+
+
+def _stretch_of_shear(row: dict[str, str]) -> str:
+    """The stretch at which a sample is sheared: a measured one differs a little from row to row."""
+    try:
+        return f"{round(float(row.get('stretch') or 1.0), 2):g}"
+    except ValueError:
+        return row["stretch"]  # refused where it is read
 
 
 def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, stress: np.ndarray) -> Curve:
