@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
-from fitting.methods.estimate import Estimate, bias_sentences, estimated, mesh_bias
+from fitting.fits.honesty.alike_noise import alike_noise
+from fitting.methods.estimate import Estimate, bias_sentences, errors_and_correlation, estimated, mesh_bias
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.readers.displacements import Displacements, weighted_differences
 from liverjax.core import status
@@ -87,12 +88,48 @@ def fit(
     converged = bool(found.converged) and all(c == status.CONVERGED for c in ended)
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
+    estimate = _of_alike_noise(problem, natural_of, found, estimate)
     left_out = missing_or_none(problem, values_of(found.u)) if mesh_error else None
     if left_out is not None:
         estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out))
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found
+
+
+def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, estimate: Estimate) -> Estimate:
+    """The estimate with the errors of noise that neighbouring points share, if residuals show any; and a warning."""
+    if not np.all(np.isfinite(estimate.standard_errors)):
+        return estimate
+    r, J = np.asarray(found.residuals), np.asarray(found.jacobian)
+    seen = np.concatenate([np.isfinite(d.sd).ravel() for d in problem.data])
+    alike = alike_noise(*_places_and_groups(problem, seen), r[seen], J[seen])
+    if alike is None:
+        return estimate
+    root = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u))) @ alike.root
+    errors, correlation = errors_and_correlation(root)
+    larger = float(np.max(errors / estimate.standard_errors))
+    if larger < 1:
+        return estimate
+    warnings.warn(
+        f"residuals of points within {alike.length:.2g} m are alike: the noise was smoothed, or the scene misses "
+        f"something. The standard errors are those of such noise, up to {larger:.2g} times those of independent noise",
+        stacklevel=3,
+    )
+    errors = np.maximum(errors, estimate.standard_errors)
+    return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
+
+
+def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place (n, 3) [m] of each measured component, and a number (n,) for its scene, step and direction."""
+    places, groups = [], []
+    for k, (scene, data) in enumerate(zip(problem.scenes, problem.data, strict=True)):
+        points = np.asarray(scene.mesh.points)[np.asarray(data.nodes)]
+        places.append(np.repeat(np.einsum("nk,nkc->nc", np.asarray(data.weights), points), 3, axis=0))
+        direction = np.tile(np.arange(3), len(points))
+        groups.append(np.stack([np.full(len(direction), k), np.repeat(np.asarray(data.step), 3), direction], axis=1))
+    of = np.unique(np.concatenate(groups), axis=0, return_inverse=True)[1]
+    return np.concatenate(places)[seen], of.ravel()[seen]
 
 
 def missing(problem: Problem, values: Content) -> np.ndarray:

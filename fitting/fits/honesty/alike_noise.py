@@ -1,0 +1,115 @@
+"""Noise of neighbouring points that is alike: how much larger errors are than those of independent noise.
+
+Registration and image correlation smooth, so neighbours share their noise, and fewer independent numbers are measured
+than there are points. The covariance of two components of the same direction, instant and scene is taken to be s^2 (a
+k(d / l) + (1 - a) [same row]), with d the distance of their points and k the Matérn function of order 3/2. Length l,
+part a and level s are those that make the residuals most probable (restricted maximum likelihood: Patterson and
+Thompson 1971), because a fit takes the part of the noise that looks like its parameters out of the residuals. The
+numbers remain those of the fit. Their covariance is J^+ C (J^+)^T instead of s^2 J^+ (J^+)^T.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.spatial
+
+from liverjax.solvers.blas import one_blas_thread
+
+#: Parts a that are tried, and how many lengths between a third of the distance of neighbours and the body's size.
+PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
+#: Points of a group whose probability is computed: as many near each other as scattered over the body.
+MOST = 400
+#: Gain in the logarithm of the probability from which noise counts as alike: chance reaches it once in a thousand.
+GAIN = 7.0
+#: Level below which the residuals are not the stated noise: synthetic data without noise, say.
+LEAST = 0.5
+#: Rows of C that are made at a time.
+ROWS = 500
+
+
+class Alike(NamedTuple):
+    """What the residuals say of noise that neighbours share."""
+
+    length: float  # [m]
+    part: float  # of the variance
+    level: float  # deviation, over the stated one
+    root: np.ndarray  # (p, p) square root of the covariance of the unknowns
+
+
+def alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray) -> Alike | None:
+    """The noise that neighbours share; None if they share none that is more than chance.
+
+    Args:
+        places: of each residual (n, 3) [m].
+        group: residuals of different numbers (n,) share no noise: other directions, instants, scenes.
+        r: residuals (n,) of a fit, over the stated deviations.
+        J: their derivatives (n, p), of full rank.
+    """
+    with one_blas_thread():  # the matrices are small
+        return _alike_noise(places, group, r, J)
+
+
+def _alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray) -> Alike | None:
+    groups = [np.flatnonzero(group == g) for g in np.unique(group)]
+    chosen = [_subset(places[own], own) for own in groups]
+    far = [scipy.spatial.distance.cdist(places[own], places[own]) for own in chosen]
+    neighbour = np.median([np.sort(d, axis=1)[:, min(1, len(d) - 1)].mean() for d in far])
+    size = float(np.ptp(places, axis=0).max())
+    if not 0 < neighbour < size or len(r) <= 2 * J.shape[1]:
+        return None
+    lengths = np.geomspace(neighbour / 3, size, LENGTHS)
+    data = [(r[own], J[own]) for own in chosen]
+    alone, _ = _probability_at(data, far, 1.0, 0.0)
+    tried = [(*_probability_at(data, far, l, a), l, a) for l, a in itertools.product(lengths, PARTS)]
+    best, level, length, part = max(tried)
+    if best < alone + GAIN or level < LEAST:
+        return None
+    inverse = np.linalg.pinv(J)
+    middle = sum(_of_unknowns(places[own], length, part, inverse[:, own]) for own in groups)
+    values, vectors = np.linalg.eigh(middle)
+    level = max(1.0, level)
+    return Alike(float(length), part, level, level * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """At most `MOST` of the residuals `own` (m,): half of them around one point, half of them from everywhere."""
+    if len(own) <= MOST:
+        return own
+    rng = np.random.default_rng(0)
+    near = np.argsort(np.linalg.norm(places - places[rng.integers(len(own))], axis=1))[: MOST // 2]
+    rest = np.setdiff1d(np.arange(len(own)), near)
+    return own[np.concatenate([near, rng.choice(rest, MOST - len(near), replace=False)])]
+
+
+def _matern(distance: np.ndarray, length: float) -> np.ndarray:
+    """Matérn's function of order 3/2."""
+    x = np.sqrt(3) * distance / length
+    return (1 + x) * np.exp(-x)
+
+
+def _probability_at(data: list, far: list[np.ndarray], length: float, part: float) -> tuple[float, float]:
+    """Logarithm of the restricted likelihood, up to a constant, and the level s that it takes."""
+    p = data[0][1].shape[1]
+    determinant, squares, b, A = 0.0, 0.0, np.zeros(p), np.zeros((p, p))
+    for (r, J), distance in zip(data, far, strict=True):
+        L = np.linalg.cholesky(part * _matern(distance, length) + (1 - part) * np.eye(len(r)))
+        white = scipy.linalg.solve_triangular(L, np.column_stack([r, J]), lower=True, check_finite=False)
+        determinant += 2 * float(np.sum(np.log(np.diagonal(L))))
+        squares += float(white[:, 0] @ white[:, 0])
+        b, A = b + white[:, 1:].T @ white[:, 0], A + white[:, 1:].T @ white[:, 1:]
+    freedom = sum(len(r) for r, _ in data) - p
+    left = max(squares - float(b @ np.linalg.pinv(A) @ b), 1e-300)
+    sign, of_unknowns = np.linalg.slogdet(A)
+    value = -0.5 * (determinant + of_unknowns + freedom * np.log(left / freedom))
+    return (value if sign > 0 else -np.inf), float(np.sqrt(left / freedom))
+
+
+def _of_unknowns(places: np.ndarray, length: float, part: float, inverse: np.ndarray) -> np.ndarray:
+    """J^+ C (J^+)^T (p, p) of one group, a few rows of C at a time."""
+    total = (1 - part) * inverse @ inverse.T
+    for a in range(0, len(places), ROWS):
+        C = _matern(scipy.spatial.distance.cdist(places[a : a + ROWS], places), length)
+        total = total + part * inverse[:, a : a + ROWS] @ C @ inverse.T
+    return total
