@@ -357,6 +357,16 @@ def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_pa
     refused({"body.gravity": np.array([0.0, 9.0, -3.0])}, "body.gravity = .* is far out of its range")
     refused({"body.density": 2000.0}, "body.density is not that of the model's rows")
     refused({"viscosity.relaxation_times": 0.1 + PRONY.relaxation_times}, "relaxation_times is not that of the model's")
+    own = lj.with_parameters(scene, inside)
+    for changed, sentence in (
+        ({"integrator": "euler"}, "solve.integrator = euler and the model's rows have newmark"),
+        ({"steps": 2 * scene.solve.steps}, "solve.dt x solve.steps = .* so nothing is known of the error"),
+    ):
+        with pytest.raises(lj.InputError, match=sentence):
+            lj.stated_error(model, replace(own, solve=replace(own.solve, **changed)), None)
+    refuse_unseen_numbers(model, replace(own, solve=replace(own.solve, dt=0.5 * own.solve.dt)))
+    with pytest.raises(lj.InputError, match="leave the column solve"):
+        lj.reduce_scene(scene, {"solve.dt": [0.01, 0.02]})
     # Traced numbers are not known.
     jax.eval_shape(lambda density: refuse_unseen_numbers(model, _heavier(scene, density)), 2000.0)
 

@@ -233,7 +233,10 @@ def _twist(o: _Oscillation) -> jax.Array:
 def _time_step(o: _Oscillation, cycle: _Cycle, carry: tuple, t: jax.Array) -> tuple[tuple, tuple]:
     """One time step: coordinates and memories, then angle, torque, lift and Newton's statistics."""
     (q_old, memories), rig, mesh = carry, o.rig, o.rig.mesh
-    physics, free = _sample_physics(rig, o.law, o.prony), Free(jnp.ones_like(mesh.points))
+    mask = jnp.ones_like(mesh.points)
+    if not o.by_torque:
+        mask = mask.at[len(mask) - rig.top :, :2].set(0.0)  # the top plate's turn is given
+    physics, free = _sample_physics(rig, o.law, o.prony), Free(mask)
     steps, tolerance = o.drive.steps * o.drive.cycles, o.drive.options.tolerance
     begin = Step(mesh, o.positions(q_old), 1, steps, o.dt, True, tolerance, free)
     solid, *nodal = (p.freeze(memory, begin) for p, memory in zip(physics, memories, strict=True))

@@ -50,6 +50,10 @@ class Tied(Protocol):
     def placed(self, field: jax.Array, s: Number) -> jax.Array:
         """Positions (V, 3) from a field, at part s of the step."""
 
+    def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
+        """Where motion is not given: the mask (V, 3) with 0 at nodes whose motion is, and (V, 3) the only direction
+        that such nodes have free, 0 elsewhere; None: there is none."""
+
 
 class Free(NamedTuple):
     """Where the body can move: a projection of nodal vectors onto the free directions."""

@@ -45,8 +45,11 @@ class Inertia(Physics):
     def freeze(self, memory: Motion, step: Step) -> "Moving":
         """Masses, and the motion at the beginning of the step."""
         mass, shared = self._masses(step.mesh)
-        own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": step.free.mask, "integrator": self.integrator}
-        return Moving(mass=mass, shared=shared, **own)
+        mask, axes = step.free.mask, None
+        for nodes in step.free.tied:
+            mask, axes = nodes.not_given(mask, axes)
+        own = {"x": step.x, "motion": memory, "dt": step.dt, "mask": mask, "integrator": self.integrator}
+        return Moving(mass=mass, shared=shared, axes=axes, **own)
 
     def _masses(self, mesh: TetMesh) -> tuple[jax.Array, Masses | None]:
         """Masses (V,) [kg] of the nodes, and the rest of the elements' consistent mass (None if lumped)."""
@@ -89,9 +92,12 @@ class Moving(NodalForce):
     x: jax.Array = param("m", "positions at the beginning (V, 3)")
     motion: Motion = param("1", "velocity and acceleration there")
     dt: jax.Array = param("s", "time step")
-    mask: jax.Array = param("1", "(V, 3) 1 where free")
+    mask: jax.Array = param("1", "(V, 3) 1 where the motion is not given")
     integrator: str = static(default="euler")
     shared: Masses | None = param("kg", "rest of the elements' consistent mass; None: lumped", default=None)
+    axes: jax.Array | None = param(
+        "1", "(V, 3) axis of a plate with a given turn that lifts, 0 elsewhere", default=None
+    )
 
     everywhere: ClassVar[bool] = True
 
@@ -103,10 +109,14 @@ class Moving(NodalForce):
         if before.acceleration is not None:
             # Free degrees only: where motion is prescribed the average acceleration would oscillate without end.
             average = 4 * acceleration - before.acceleration
-            free = self.mask > 0
-            velocity = jnp.where(free, before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
-            acceleration = jnp.where(free, average, acceleration)
+            velocity = self._where_free(before.velocity + 0.5 * dt * (before.acceleration + average), velocity)
+            acceleration = self._where_free(average, acceleration)
         return velocity, acceleration
+
+    def _where_free(self, own: jax.Array, given: jax.Array) -> jax.Array:
+        """A field (V, 3) from that of free motion and that of given motion."""
+        out = jnp.where(self.mask > 0, own, given)
+        return out if self.axes is None else out + jnp.sum(self.axes * (own - given), axis=1, keepdims=True) * self.axes
 
     def predicted(self) -> jax.Array:
         """Positions after a motion at constant velocity."""

@@ -128,6 +128,15 @@ class Plate(NamedTuple):
         """Moment [N m] about the axis of forces f (V, 3) [N] on the plate's nodes at positions x (V, 3)."""
         return jnp.sum(self.arms(x) * f[self.plate.nodes])
 
+    def not_given(self, mask: jax.Array, axes: jax.Array | None) -> tuple[jax.Array, jax.Array | None]:
+        """See `liverjax.physics.base.Tied`."""
+        if self.plate.by == "torque":
+            return mask, axes
+        nodes = self.plate.nodes
+        if self.plate.lifts:
+            axes = (jnp.zeros_like(mask) if axes is None else axes).at[nodes].set(self._axis(mask))
+        return mask.at[nodes].set(0.0), axes
+
     def spread(self, field: jax.Array, turn: Number, lift: Number) -> jax.Array:
         """The field (V, 3) with the plate's rows computed from the amplitudes of its two motions."""
         rows = turn * self._arms(self.carrier) / self.radius

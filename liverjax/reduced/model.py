@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, replace, static, struct
+from liverjax.core.struct import Content, param, replace, static, struct
 from liverjax.laws import Law
 from liverjax.mesh.nodal import interpolated
 from liverjax.mesh.shape_functions import basis
@@ -206,7 +206,14 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
                 # Equal numbers may differ in their last digits, and in the sign of 0.
                 rounded = np.asarray(leaf, np.float32) + np.float32(0)
                 found[name] = hashlib.sha256(rounded.tobytes()).hexdigest()[:8]
-    return json.dumps(found)
+    return json.dumps(found | _course(scene))
+
+
+def _course(scene: Scene) -> Content:
+    """How a scene runs in time, by names."""
+    solve = scene.solve
+    duration = None if solve.dt is None else float(solve.dt) * solve.steps
+    return {"solve.integrator": solve.integrator, "solve.dt x solve.steps": duration}
 
 
 def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
@@ -229,6 +236,13 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     if not model.others:
         return  # made by an earlier version
     made, own = json.loads(model.others), json.loads(other_numbers(scene, {n: b[0] for n, b in model.ranges.items()}))
+    for name in _course(scene):
+        before, after = made.pop(name, None), own.pop(name)
+        if before is not None and (after > before * (1 + 1e-6) if isinstance(after, float) else after != before):
+            raise InputError(
+                f"{name} = {after} and the model's rows have {before}, so nothing is known of the error: take "
+                "lj.reduced_error, or reduce with such rows"
+            )
     changed = sorted(name for name in made.keys() | own.keys() if made.get(name) != own.get(name))
     if changed:
         raise InputError(

@@ -56,7 +56,7 @@ def reduce_scene(
 
     Raises:
         InputError: physics that a reduced model does not have, a tolerance outside of 0 to 1, no row whose run
-            converged, `runs` that does not fit the number of rows.
+            converged, `runs` that does not fit the number of rows, rows of different time steps.
     """
     refuse_unknown_physics(scene)
     point_tolerance = tolerance if point_tolerance is None else point_tolerance
@@ -64,6 +64,8 @@ def reduce_scene(
         if not 0 < value < 1:
             raise InputError(f"{name} = {value} must be between 0 and 1: give e.g. 1e-4")
     values = {name: np.asarray(value, float) for name, value in rows.items()}
+    if "solve.dt" in values:
+        raise InputError("a reduced model has one time step: leave the column solve.dt out, and give dt in [solve]")
     count = len(next(iter(values.values()), ()))
     runs = count if runs is None else runs
     if not FEWEST_RUNS <= runs <= count and runs != count:

@@ -181,7 +181,10 @@ class Pressing(Touching):
         """The travel by Newton's method, in steps of at most twice the depth: the force grows with the travel."""
         own = jax.lax.stop_gradient(self)
         first = own._resistance(at, own.before)[0]
-        enough = 16 * float(jnp.finfo(at.dtype).eps) * jnp.maximum(load, first)
+        # Positions are rounded too: a light force cannot be balanced better than hardness times that.
+        size = jnp.max(jnp.abs(at)) + jnp.max(jnp.abs(jnp.asarray(own.obstacle.position, at.dtype)))
+        rounded = size * jnp.max(own.hardness)
+        enough = float(jnp.finfo(at.dtype).eps) * (16 * jnp.maximum(load, first) + rounded)
         # No smaller depth can balance the force, even if all points touched.
         least = load / jnp.sum(own.hardness)
 
