@@ -19,8 +19,8 @@ from liverjax.solvers.blas import one_blas_thread
 
 #: Parts a that are tried, and how many lengths between a third of the distance of neighbours and the body's size.
 PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
-#: Points of a group whose probability is computed: as many near each other as scattered over the body.
-MOST = 400
+#: Groups whose probability is computed, and points of each: as many near each other as scattered over the body.
+FEW, MOST = 12, 400
 #: Gain in the logarithm of the probability from which noise counts as alike: chance reaches it once in a thousand.
 GAIN = 7.0
 #: Level below which the residuals are not the stated noise: synthetic data without noise, say.
@@ -53,7 +53,8 @@ def alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndar
 
 def _alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray) -> Alike | None:
     groups = [np.flatnonzero(group == g) for g in np.unique(group)]
-    chosen = [_subset(places[own], own) for own in groups]
+    some = np.unique(np.linspace(0, len(groups) - 1, FEW).round().astype(int))
+    chosen = [_subset(places[groups[k]], groups[k]) for k in some]
     far = [scipy.spatial.distance.cdist(places[own], places[own]) for own in chosen]
     neighbour = np.median([np.sort(d, axis=1)[:, min(1, len(d) - 1)].mean() for d in far])
     size = float(np.ptp(places, axis=0).max())
