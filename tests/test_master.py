@@ -126,6 +126,7 @@ def test_a_file_with_a_column_of_temperature(tmp_path, unit, order):
     write_rows(tmp_path / "a.csv", unit, order=order)
     data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
     assert np.allclose(data.temperatures, TEMPERATURES, atol=0.05) and data.shift_factors is None
+    assert not any("repeated" in note for own in data.sweeps for note in own.notes)
     found = master_curve.master_curve(data, TEMPERATURES[REFERENCE] + 3)
     assert found.shifts.reference == REFERENCE and np.abs(found.shifts.log_a - TRUE).max() < 3e-3
     assert np.allclose(found.sweep.storage, moduli_of_polymer(found.sweep.angular_frequency).real, rtol=0.01)

@@ -116,11 +116,14 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
         notes.append("the frequencies were not in ascending order and have been sorted")
     repeated = len(omega) - len(np.unique(omega))
     if repeated:
-        notes.append(f"{repeated} frequencies are repeated; each line counts as a measurement of its own")
+        notes.append(f"{repeated} {REPEATED}")
     get: Content = {q: values[q][order] if q in values else None for q in ("storage", "loss", "storage_sd", "loss_sd")}
     raw = {q: v[good][order] for q, v in table.raw.items()}
     return Sweep(omega[order], **get, source=path, notes=tuple(notes), raw=raw or None)
 
+
+#: A note on frequencies that several lines have, after their number.
+REPEATED = "frequencies are repeated; each line counts as a measurement of its own"
 
 #: Differences within one sweep, of the temperature [K] and of the strain (largest over smallest), that get a note.
 WARMER, STRAINED = 2.0, 1.5
