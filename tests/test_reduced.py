@@ -368,6 +368,7 @@ def test_errors_are_not_stated_for_numbers_that_no_row_has_shown(trained, tmp_pa
     with pytest.raises(lj.InputError, match="leave the column solve"):
         lj.reduce_scene(scene, {"solve.dt": [0.01, 0.02]})
     # Traced numbers are not known.
+    jax.eval_shape(lambda dt: refuse_unseen_numbers(model, replace(own, solve=replace(own.solve, dt=dt))), own.solve.dt)
     jax.eval_shape(lambda density: refuse_unseen_numbers(model, _heavier(scene, density)), 2000.0)
 
 

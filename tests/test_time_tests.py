@@ -188,6 +188,9 @@ def test_units_and_forms(tmp_path):
     assert f"{100 * ((exact - exact**-2) / (3 * (exact - 1)) - 1):.2g} % too large in compression" in c.notes[1]
     file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T - 0.05, -G)
     assert not any("strained" in note for note in read_time_test(file, "relaxation", Sample(r, h)).notes)
+    file = write(tmp_path / "c.csv", "time_s,displacement_mm,force_mN", T, 0 * T + 4.4, G)  # 110 %: no compression
+    note = read_time_test(file, "relaxation", Sample(r, h)).notes[1]
+    assert "moduli come out 43 % too small in tension" in note and "compression" not in note
     text = "Result:\tStep strain\nPoint No.\tTime\tShear Strain\tShear Stress\n\t\t\t\n\t[s]\t[%]\t[Pa]\n"
     rows = "".join(f"{k}\t{t:.4f}\t1,0\t{G / 100:.5f}\n".replace(".", ",") for k, (t, G) in enumerate(zip(T, G)))  # noqa: B905
     (tmp_path / "d.txt").write_bytes((text + rows).encode("utf-16"))

@@ -210,7 +210,7 @@ def test_from_rest_a_given_angle_with_inertia_does_not_oscillate(law, prony):
     for drive in (Drive(steps=40, cycles=2, by="angle"), Drive(steps=40, cycles=2, by="angle", start="rest")):
         torque, angle = torsion.demodulate(torsion.oscillate(rig, law, prony, omega, 0.02, drive), omega, drive)
         found.append(complex(torque / angle))
-    # The plate's own inertia is late by the order of a time step, here 0.16 rad.
+    # The plate's own inertia is late by the order of a time step, here 0.16 rad; it is less than 0.3 of the torque.
     assert abs(found[1] - found[0]) < 0.16 * 0.3 * abs(found[0])
 
 

@@ -91,16 +91,20 @@ def plate() -> str:
         "",
         f"On {data['environment']['cores']} cores regions took {data['regions_s']:.0f} s and the map "
         f"{data['map_s']:.0f} s, with {data['unknowns']:,} unknowns at {len(hertz)} frequencies.",
-        f"90 % intervals of the map hold the true storage modulus in {percent(min(cover['storage']))} to "
-        f"{percent(max(cover['storage']))} of the voxels, and the loss modulus in {percent(min(cover['loss']))} to "
-        f"{percent(max(cover['loss']))}. The map is smooth at edges; there its deviation is that of a place known "
-        "to the prior's length. By the distance from the nearest edge:",
+        f"90 % intervals of the map hold the true storage modulus in {_span(cover['storage'])} of the voxels, and the "
+        f"loss modulus in {_span(cover['loss'])}. The map is smooth at edges; there its deviation is that of a place "
+        "known to the prior's length. By the distance from the nearest edge:",
         "",
         "| " + " | ".join(_between(row) for row in cover["by_distance"]) + " |",
         "|" + len(cover["by_distance"]) * "---|",
         "| " + " | ".join(percent(row["storage"]) for row in cover["by_distance"]) + " |",
     ]
     return "\n".join(rows)
+
+
+def _span(parts: list[float]) -> str:
+    """The smallest and the largest part, once if they are written alike."""
+    return " to ".join(dict.fromkeys(percent(part) for part in (min(parts), max(parts))))
 
 
 def _between(row: dict) -> str:

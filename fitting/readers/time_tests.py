@@ -449,15 +449,18 @@ BENT = 0.02
 def _beyond_small(columns: dict[str, np.ndarray], height: float) -> list[str]:
     """A note if the force of a neo-Hookean sample, stretched or compressed so far, is not in proportion."""
     strain = float(np.nanmax(np.abs(columns["displacement"]))) / height
-    if not strain < 1:
+
+    def off(stretch: float) -> float:
+        """The force over that of the straight line, less 1."""
+        return (stretch - stretch**-2) / (3 * (stretch - 1)) - 1
+
+    if not strain > 0 or -off(1 + strain) < BENT:
         return []
-    longer, shorter = ((s - s**-2) / (3 * (s - 1)) - 1 if strain > 0 else 0.0 for s in (1 + strain, 1 - strain))
-    if shorter < BENT:
-        return []
+    shorter = f"{100 * off(1 - strain):.2g} % too large in compression, " if strain < 1 else ""
     return [
         f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is no straight line: "
-        f"moduli come out {100 * shorter:.2g} % too large in compression, {-100 * longer:.2g} % too small in tension. "
-        "Describe the test in a TOML file to have this computed"
+        f"moduli come out {shorter}{-100 * off(1 + strain):.2g} % too small in tension. Describe the test in a TOML "
+        "file to have this computed"
     ]
 
 

@@ -222,7 +222,7 @@ def refuse_unseen_numbers(model: ReducedModel, scene: Scene) -> None:
     Raises:
         InputError: a number far out of its range in the rows, or another number than that of the rows' scene.
     """
-    parts = [getattr(scene, part) for part in _PARTS]
+    parts = [*(getattr(scene, part) for part in _PARTS), scene.solve.dt]
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((parts, model.ranges))):
         return
     for name, bounds in model.ranges.items():

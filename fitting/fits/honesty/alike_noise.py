@@ -65,7 +65,7 @@ def _alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.nda
     alone, _ = _probability_at(data, far, 1.0, 0.0)
     tried = [(*_probability_at(data, far, l, a), l, a) for l, a in itertools.product(lengths, PARTS)]
     best, level, length, part = max(tried)
-    if best < alone + GAIN or level < LEAST:
+    if not best > alone + GAIN or level < LEAST:  # not larger: nor is it if both are -inf
         return None
     inverse = np.linalg.pinv(J)
     middle = sum(_of_unknowns(places[own], length, part, inverse[:, own]) for own in groups)
