@@ -156,3 +156,24 @@ def test_a_series_that_cannot_be_is_refused_in_python_before_anything_is_compile
     traced(0.7)
     with pytest.raises(lj.InputError, match="has 2 ratios and 1 relaxation_times"):
         jax.make_jaxpr(lambda g: viscosity.check_series(lj.Prony(ratios=(g, g), relaxation_times=(1.0,))))(0.7)
+
+
+@pytest.mark.parametrize("number", ["relaxation_time", "dt"])
+def test_coefficients_have_a_derivative_where_the_step_is_a_relaxation_time(number):
+    """Two formulas meet at dt = tau; derivatives of both halves were half as large. Formulas of the docstring, by complex
+    steps."""
+    g, t = 0.3, 0.05
+
+    def exact(tau, dt):
+        r = dt / tau
+        q = (1 - np.exp(-r)) / r
+        return np.array([g * (1 - q), np.exp(-r), g * (q - np.exp(-r))])
+
+    def found(tau, dt):
+        prony = lj.Prony(ratios=jnp.array([g]), relaxation_times=jnp.asarray(tau)[None])
+        return jnp.concatenate(lj.viscosity.coefficients(prony, dt))
+
+    k = ("relaxation_time", "dt").index(number)
+    h = 1e-20j * np.eye(2)[k]
+    for derivative in (jax.jacfwd(found, k), jax.jacrev(found, k)):
+        assert np.allclose(derivative(t, t), exact(t + h[0], t + h[1]).imag / 1e-20, rtol=1e-13)

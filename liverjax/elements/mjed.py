@@ -61,6 +61,16 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     return nodal_force(mesh, first_piola(mesh.at_points(law), deformation_gradient(mesh, x)))
 
 
+def first_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
+    """Derivative of `internal_force` along a motion (V, 3) [m] of the reference shape, (V, 3) [N].
+
+    The gradient and the sum at nodes are linear in the motion; only the stress has to be differentiated.
+    """
+    law, dF = mesh.at_points(law), deformation_gradient(mesh, motion)
+    rest = tuple(tuple(jnp.full_like(dF[i][j], i == j) for j in range(3)) for i in range(3))
+    return nodal_force(mesh, jax.jvp(partial(first_piola, law), (rest,), (dF,))[1])
+
+
 def element_stiffness(
     mesh: TetMesh, law: Law, x: jax.Array, regularised: bool = False, terms: str = "contracted"
 ) -> dict[tuple[int, int], Matrix]:

@@ -151,7 +151,8 @@ def _beside(numbers: jax.Array, ndim: int) -> jax.Array:
 
 def _weights(r: jax.Array) -> tuple[jax.Array, jax.Array]:
     """1 - q and q - e without cancellation; below r = 1 by the Taylor series of 1 - q (truncated at 1/20!)."""
-    small, large = jnp.minimum(r, 1.0), jnp.maximum(r, 1.0)
+    # Not minimum and maximum: at r = 1, where the time step is a relaxation time, they halve the derivative.
+    small, large = jnp.where(r < 1, r, 1.0), jnp.where(r < 1, 1.0, r)
     series = jnp.zeros_like(r)
     for k in range(18, 0, -1):
         series = small / (k + 1) * (1 - series)
