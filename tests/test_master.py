@@ -127,6 +127,10 @@ def test_a_file_with_a_column_of_temperature(tmp_path, unit, order):
     data = temperature_sweeps.read_temperatures([tmp_path / "a.csv"])
     assert np.allclose(data.temperatures, TEMPERATURES, atol=0.05) and data.shift_factors is None
     assert not any("repeated" in note for own in data.sweeps for note in own.notes)
+    head, *rows = (tmp_path / "a.csv").read_text().splitlines()
+    (tmp_path / "b.csv").write_text("\n".join([head, *(row for row in rows for _ in range(2))]) + "\n")
+    again = temperature_sweeps.read_temperatures([tmp_path / "b.csv"])
+    assert all(any("repeated" in note for note in own.notes) for own in again.sweeps)
     found = master_curve.master_curve(data, TEMPERATURES[REFERENCE] + 3)
     assert found.shifts.reference == REFERENCE and np.abs(found.shifts.log_a - TRUE).max() < 3e-3
     assert np.allclose(found.sweep.storage, moduli_of_polymer(found.sweep.angular_frequency).real, rtol=0.01)

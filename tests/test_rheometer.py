@@ -516,3 +516,8 @@ def test_a_viscosity_beside_moduli_of_tension_contradicts_nothing(tmp_path):
     file.write_text("\n".join(["omega [rad/s],E' [Pa],E'' [Pa],Complex viscosity [Pa·s]", *lines]))
     found = read_sweep(file)
     assert found.storage[0] == pytest.approx(S[0] / 3, rel=1e-5) and not any("contradict" in n for n in found.notes)
+    for heading, factor in (("Complex modulus E* [Pa]", 1.0), ("Complex modulus [Pa]", 1 / 3), ("|eta*| [Pa·s]", 10.0)):
+        size = factor * np.hypot(S, L) / (omega if "eta" in heading else 1.0)
+        lines = [f"{w:.6g},{s:.6g},{k:.6g},{c:.6g}" for w, s, k, c in zip(omega, S, L, size, strict=True)]
+        file.write_text("\n".join([f"omega [rad/s],E' [Pa],E'' [Pa],{heading}", *lines]))
+        assert any("contradict" in n for n in read_sweep(file).notes) == (factor == 10.0)

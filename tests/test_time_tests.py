@@ -449,3 +449,9 @@ def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):
     file.write_text("\n".join(["time,strain,stress", "fortnights,%,Pa", *lines[1:]]))
     with pytest.raises(InputError, match="unit 'fortnights' of time is not known"):
         read_time_test(file, "relaxation", ramp=0.0)
+
+
+def test_a_column_without_a_number_is_refused_in_one_sentence(tmp_path):
+    (tmp_path / "n.csv").write_text("time_s,relaxation_modulus_Pa\n" + "\n".join(f"{k},nan" for k in range(9)) + "\n")
+    with pytest.raises(InputError, match="every row has an empty cell or one that is not finite"):
+        read_time_test(tmp_path / "n.csv", "relaxation")

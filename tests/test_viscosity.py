@@ -160,7 +160,7 @@ def test_a_series_that_cannot_be_is_refused_in_python_before_anything_is_compile
 
 @pytest.mark.parametrize("number", ["relaxation_time", "dt"])
 def test_coefficients_have_a_derivative_where_the_step_is_a_relaxation_time(number):
-    """Two formulas meet at dt = tau; derivatives of both halves were half as large. Formulas of the docstring, by complex
+    """Two formulas meet at dt = tau; derivatives by both were half as large. The formulas of the docstring, by complex
     steps."""
     g, t = 0.3, 0.05
 

@@ -41,6 +41,11 @@ def test_a_table_may_have_the_columns_of_other_formats(tmp_path):
     path.write_text(whole.replace("labels", "label").replace("mask", "region"))
     with pytest.raises(InputError, match="two columns mean label: leave one of them"):
         wave_field.read_waves(path)
+    # A spreadsheet leaves empty columns, and two of one unknown name mean nothing.
+    head, *lines = whole.splitlines()
+    for more in (",,", ",note,note"):
+        path.write_text("\n".join([head + more, *(line + ",," for line in lines)]) + "\n")
+        assert wave_field.read_waves(path).mask.sum() == 75
     last = rows[-1].split(",")
     path.write_text(whole.replace(rows[-1], ",".join([*last[:-2], str(1 - int(last[-2])), last[-1]])))
     with pytest.raises(InputError, match=f"row ({n + 1}|{2 * n + 1}): mask differs from that of another frequency"):
@@ -276,6 +281,14 @@ def test_a_nifti_file_whose_voxels_are_not_known_is_refused(tmp_path, affine, pi
     if pixdim is not None:
         found = wave_field.read_waves(path, frequencies=list(HERTZ), spacing=[0.002] * 3)
         assert np.array_equal(found.spacing, [0.002] * 3)
+        # A mask with the same wrong header: its place is not known, so only its shape counts.
+        nibabel = pytest.importorskip("nibabel")
+        nibabel.save(nibabel.Nifti1Image(np.ones(found.mask.shape, np.int16), affine), tmp_path / "m.nii")
+        raw = bytearray((tmp_path / "m.nii").read_bytes())
+        raw[80:92] = np.array(pixdim, "<f4").tobytes()
+        (tmp_path / "m.nii").write_bytes(raw)
+        masked = wave_field.read_waves(path, frequencies=list(HERTZ), spacing=[0.002] * 3, mask=tmp_path / "m.nii")
+        assert masked.mask.shape == found.mask.shape
 
 
 @pytest.mark.parametrize("turned", [False, True])

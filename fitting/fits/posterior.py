@@ -22,7 +22,7 @@ from fitting.fits import instrument, simulated_rheometer, time_tests, viscoelast
 from fitting.fits.families import springpots_in_time
 from fitting.fits.instrument import Nuisance
 from fitting.fits.simulated_rheometer import Simulation
-from fitting.fits.time_tests import TimeFit
+from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit, Kind
 from fitting.methods import generalised_maxwell, springpots
 from fitting.methods.generalised_maxwell import Maxwell
@@ -87,12 +87,13 @@ class Target(NamedTuple):
     residuals: Callable[[np.ndarray], np.ndarray]  # u (W, P) -> (W, m), errors divided by their scales
     prior: "Modes | Springpots | WithInstrument"
     deviations_given: bool
+    weight: float = 1.0  # residuals of independent noise that measure as much, over their number
 
     def log_likelihood(self, u: np.ndarray) -> np.ndarray:
         """Log likelihood of u (W, P), up to a constant, with the size of the errors integrated out."""
         with np.errstate(all="ignore"):  # an overflow is a point without likelihood
             r = self.residuals(u)
-            return log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
+            return self.weight * log_likelihood(np.sum(r * r, axis=-1), r.shape[-1], self.deviations_given)
 
 
 def log_likelihood(square: np.ndarray, count: int, deviations_given: bool) -> np.ndarray:
@@ -357,7 +358,10 @@ def of_simulation(fit: Fit, sweep: Sweep, simulation: Simulation, count: int, se
 
 
 def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Posterior:
-    """Sample the posterior of a relaxation or creep test in closed form, of Prony modes or of a fractional model."""
+    """Sample the posterior of a relaxation or creep test in closed form, of Prony modes or of a fractional model.
+
+    If neighbouring answers share their noise, the likelihood counts only as many answers as are independent.
+    """
     if fit.kind.values is None:
         one, data = time_tests.residuals_in_time(test, fit.kind)
         residuals = jax.jit(jax.vmap(lambda u: one(u, *data)))
@@ -365,4 +369,5 @@ def of_time_test(fit: TimeFit, test: TimeTest, count: int, seed: int = 0) -> Pos
         residuals = jax.jit(jax.vmap(springpots_in_time.residuals_of_springpot(fit.kind.name, test)))
     size = np.abs(fit.model.shear_modulus) * np.array([1e-2, 1.0])
     own = target(fit.kind, lambda u: np.asarray(residuals(u)), test.resolved, size, False)
+    own = own._replace(weight=fit.details.get(INDEPENDENT, len(fit.measured)) / len(fit.measured))
     return sample(own, len(fit.solution.u), count, seed)

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
-from fitting.fits.honesty.alike_noise import alike_noise
 from fitting.methods.estimate import Estimate, bias_sentences, errors_and_correlation, estimated, mesh_bias
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
+from fitting.methods.noise.alike_noise import alike_noise
 from fitting.readers.displacements import Displacements, weighted_differences
 from liverjax.core import status
 from liverjax.core.errors import InputError

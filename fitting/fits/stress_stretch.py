@@ -13,6 +13,7 @@ import scipy.stats
 from fitting.methods.estimate import errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers.curves import Curve
 from liverjax import laws
 from liverjax.core.errors import InputError
@@ -64,6 +65,8 @@ class LawFit(NamedTuple):
 
 #: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law.
 RUNAWAY = 1e6
+#: Ratio of an error of uneven noise and that of equal noise from which the correlation is that of uneven noise.
+_UNEVEN = 1.2
 _tangents = jax.jit(lambda law, F: law.tangent(F))
 
 
@@ -286,7 +289,14 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
     half, s = spread(J[:n, known], noise, slope[np.ix_(known, known)])
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
     its_errors, its_correlation = errors_and_correlation(half)
-    its_errors = np.maximum(its_errors, uneven_errors(J[:n, known], misfit, slope[np.ix_(known, known)]))
+    own_slope = slope[np.ix_(known, known)]
+    fitted = np.concatenate([c.stress / c.scale for c in curves]) + misfit
+    growing = growing_root(J[:n, known], misfit, fitted, own_slope)
+    for root in (uneven_root(J[:n, known], misfit, own_slope), growing):
+        uneven = errors_and_correlation(root)
+        if np.any(uneven[0] > _UNEVEN * its_errors):
+            its_correlation = uneven[1]
+        its_errors = np.maximum(its_errors, uneven[0])
     if n > p:
         errors[known] = its_errors
     if np.all(np.isfinite(half)):
@@ -318,16 +328,6 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
         limits=limits,
     )
     return result._replace(warnings=_warnings(result, curves, s, bool(np.any(r[n:] < 0))))
-
-
-def uneven_errors(J: np.ndarray, misfit: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Standard errors if the noise is not the same at all points, as where it grows with the stress (HC3: MacKinnon and
-    White 1985)."""
-    if not np.all(np.isfinite(J)) or J.size == 0:
-        return np.zeros(len(slope))
-    inverse = np.linalg.pinv(J)
-    leverage = np.einsum("kn,nk->n", inverse, J)
-    return np.linalg.norm(slope @ (inverse * (misfit / np.maximum(1 - leverage, 0.05))), axis=1)
 
 
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:

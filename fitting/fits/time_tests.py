@@ -22,6 +22,8 @@ from liverjax.core.struct import Content
 
 #: Most answers (measured responses) that are fitted; a longer record is thinned to equal steps of log time.
 MOST = 300
+#: Key in `TimeFit.details`: answers of independent noise that measure as much, if neighbours share their noise.
+INDEPENDENT = "independent_answers"
 #: Starting points of a fit.
 STARTS = 12
 

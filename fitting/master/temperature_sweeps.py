@@ -96,5 +96,9 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
     for k in range(group.max() + 1):
         mine = group == k
         factor = float(np.exp(np.mean(np.log(factors[mine]))))
-        out.append((float(np.mean(T[mine])), factor, some(sweep, mine)))
+        own = some(sweep, mine)
+        repeated = len(own.angular_frequency) - len(np.unique(own.angular_frequency))
+        if repeated and group.max() > 0:
+            own = own._replace(notes=(*own.notes, f"{repeated} {REPEATED}"))
+        out.append((float(np.mean(T[mine])), factor, own))
     return out

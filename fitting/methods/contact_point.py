@@ -12,11 +12,16 @@ import numpy as np
 import scipy.optimize
 import scipy.special
 
+from fitting.methods.estimate import errors_and_correlation
+from fitting.methods.noise.alike_noise import Alike, alike_noise
+from fitting.methods.noise.uneven_noise import uneven_root
+
 _GRID = 200
 
 
 class ContactFit(NamedTuple):
-    """Modulus and contact point. Their standard errors come from the noise of the residuals."""
+    """Modulus and contact point. Their standard errors come from the residuals, whatever noise is in them: the same at
+    all points, larger with the force, or shared by neighbours."""
 
     modulus: float  # E [Pa]
     contact_point: float  # d0 [m]
@@ -27,11 +32,13 @@ class ContactFit(NamedTuple):
     before: int  # points before contact
     tilt: float = 0.0  # rise of the base line over all depths [N]
     tilt_error: float = 0.0
+    independent: float | None = None  # points of independent noise that measure as much; None: all
 
     @property
     def quantile(self) -> float:
         """Quantile of Student's t for a 95 % interval."""
-        return float(scipy.special.stdtrit(len(self.residuals) - (4 if self.tilt_error else 2), 0.975))
+        points = len(self.residuals) if self.independent is None else self.independent
+        return float(scipy.special.stdtrit(max(1.0, points - (4 if self.tilt_error else 2)), 0.975))
 
 
 def fit_contact(
@@ -75,12 +82,27 @@ def fit_contact(
     J = np.column_stack([A[:, 0] * E, E * slope * span, line * np.abs(force).max()])
     residuals = force - A @ numbers
     noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
-    covariance = noise**2 * np.linalg.pinv(J.T @ J)
-    sizes = np.sqrt(np.diag(covariance))
-    correlation = float(covariance[0, 1] / max(sizes[0] * sizes[1], 1e-300))
+    sizes, correlation, alike = _errors_of_any_noise(J, residuals, noise)
+    independent = None if alike is None else alike.independent
     tilt = (float(numbers[2]), float(sizes[3] * np.abs(force).max())) if tilted else (0.0, 0.0)
     before = int(np.sum(depth <= start))
-    return ContactFit(E, start, sizes[:2] * np.array([E, span]), correlation, noise, residuals, before, *tilt)
+    errors = sizes[:2] * np.array([E, span])
+    return ContactFit(E, start, errors, correlation, noise, residuals, before, *tilt, independent)
+
+
+def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
+    """Errors of all unknowns, the correlation of the first two, and the noise that neighbours share."""
+    equal = noise * np.linalg.pinv(J)
+    roots, alike = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))], None
+    if noise > 0 and np.all(np.isfinite(J)):
+        # The points were measured one after another: noise is shared by points of near numbers.
+        places = np.arange(len(J))[:, None] * np.array([1.0, 0.0, 0.0])
+        alike = alike_noise(places, np.zeros(len(J)), residuals / noise, J / noise)
+    if alike is not None:
+        roots.append(alike.root)
+    errors, correlations = zip(*(errors_and_correlation(root) for root in roots), strict=True)
+    largest = int(np.argmax([e[0] for e in errors]))
+    return np.max(errors, axis=0), float(correlations[largest][0, 1]), alike
 
 
 #: Part of the approach in which contact has not begun in spite of a tilt, and fewest points there.

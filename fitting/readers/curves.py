@@ -138,8 +138,9 @@ def _stress_column(file: Path, row: dict, pattern: str, unit: str) -> tuple[str,
     return None
 
 
-#: A component of stress below this part of the largest one was not measured: programs write roundoff in place of 0.
-ROUNDOFF = 1e-9
+#: A component of stress below this part of the largest one was not measured: programs write roundoff in place of 0,
+#: some of them of single precision.
+ROUNDOFF = 1e-5
 
 
 def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
@@ -193,11 +194,12 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     if column is None:
         raise InputError(f"{file} has no column nominal_stress_Pa (or _kPa, _MPa): name the measured stress so")
     groups: dict[tuple, list[dict]] = {}
+    at = _stretches_of_shear(rows)
     for row in rows:
         test = row["test"]
         if test not in homogeneous.TESTS:
             raise InputError(f"{file}: test {test!r} is not known: use one of {', '.join(homogeneous.TESTS)}")
-        groups.setdefault((test, _stretch_of_shear(row) if test == "simple_shear" else ""), []).append(row)
+        groups.setdefault((test, at.get(_stretch_of_shear(row), "") if test == "simple_shear" else ""), []).append(row)
     curves, factor = [], column[1]
     for (test, fixed), group in groups.items():
         shear = homogeneous.TESTS[test] == "shear"
@@ -212,9 +214,10 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
             )
         stress = factor * _column(file, group, column[0])
         ends = stress[[int(np.argmin(stretch)), int(np.argmax(stretch))]]
-        if not shear and stretch.min() < SHORTENED and stretch.max() > STRAINED and np.prod(np.sign(ends)) > 0:
+        of_one_sign = np.prod(np.sign(ends)) >= 0
+        if not shear and stretch.min() < SHORTENED and stretch.max() > STRAINED and of_one_sign:
             raise InputError(
-                f"{file}: stretches of {stretch.min():g} and {stretch.max():g} have stresses of one sign, and tension "
+                f"{file}: stretches of {stretch.min():g} and {stretch.max():g} do not have opposite stresses: tension "
                 "does not shorten: a stretch is the length over the length at rest; write a strain of 2 % as 1.02"
             )
         F = np.asarray(homogeneous.deformation_gradient(test, driven, stretch))
@@ -224,12 +227,24 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
     return curves, column[2]
 
 
-def _stretch_of_shear(row: dict[str, str]) -> str:
-    """The stretch at which a sample is sheared: a measured one differs a little from row to row."""
+#: Stretches of sheared samples that differ by less are one, measured from row to row.
+SAME_STRETCH = 0.01
+
+
+def _stretch_of_shear(row: dict[str, str]) -> float:
+    """The stretch at which a sample is sheared; NaN if it is no number, which is refused where it is read."""
     try:
-        return f"{round(float(row.get('stretch') or 1.0), 2):g}"
+        return float(row.get("stretch") or 1.0)
     except ValueError:
-        return row["stretch"]  # refused where it is read
+        return np.nan
+
+
+def _stretches_of_shear(rows: list[dict[str, str]]) -> dict[float, str]:
+    """The stretch of each sheared sample, as text, by the stretches of its rows."""
+    own = {_stretch_of_shear(row) for row in rows if row["test"] == "simple_shear"}
+    values = np.array(sorted(v for v in own if np.isfinite(v)))
+    parts = np.split(values, np.flatnonzero(np.diff(values) >= SAME_STRETCH) + 1)
+    return {float(v): f"{round(float(np.median(part)), 2):g}" for part in parts for v in part}
 
 
 def _one_curve(file: Path, label: str, test: str, F: np.ndarray, component: tuple, stress: np.ndarray) -> Curve:
@@ -270,9 +285,10 @@ def _returns(driven: np.ndarray) -> int:
             turns += [low] if rises is False else []
             rises, high = True, k
     parts = [driven[a + (a > 0) : b + 1] for a, b in zip(turns, [*turns[1:], len(driven) - 1], strict=True)]
-    parts = [part for part in parts if len(part) >= 3]  # a jump back to the start is no part of its own
+    # A jump back to the start is no part of its own, and one wrong value does not make a range.
+    parts = [np.sort(part)[1:-1] for part in parts if len(part) >= 3]
     return sum(
         1
         for before, after in itertools.pairwise(parts)
-        if min(before.max(), after.max()) - max(before.min(), after.min()) > 2 * least
+        if min(before[-1], after[-1]) - max(before[0], after[0]) > 2 * least
     )

@@ -103,10 +103,8 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     if len(np.unique(omega)) < 2:
         raise InputError(f"{path}: it has {len(np.unique(omega))} frequency; give at least two different ones")
     values = storage_and_loss(values, notes)
-    # Beside E' and E'' it is not said whether a viscosity is |E*| or |G*| over omega.
-    known = [(c, values) for c, values in table.beside if not (stretched and c.quantity == "viscosity")]
-    beside = [(c, written[good]) for c, written in known]
-    notes += _contradictions(path, beside, values | {"frequency": omega})
+    beside = [(c, written[good]) for c, written in table.beside]
+    notes += _contradictions(path, beside, values | {"frequency": omega}, bool(stretched))
     if ("storage_sd" in values) != ("loss_sd" in values):
         raise InputError(
             f"{path}: only one of storage_modulus_sd_Pa and loss_modulus_sd_Pa is there; give both or none"
@@ -163,8 +161,11 @@ def _what_differs(sweep: Sweep) -> list[str]:
 CONTRADICTS = 0.03
 
 
-def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: Content) -> list[str]:
-    """Notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from what G' and G'' say of them."""
+def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: Content, stretched: bool) -> list[str]:
+    """Notes on columns of |G*|, phase, tan(delta) or |eta*| that differ from what G' and G'' say of them.
+
+    Beside E' and E'' (`stretched`) a modulus or viscosity may be that of E* as well as that of G*.
+    """
     G = values["storage"] + 1j * values["loss"]
     expected = {"complex": np.abs(G), "phase": np.angle(G), "tangent": values["loss"] / values["storage"]}
     expected["viscosity"] = np.abs(G) / values["frequency"]
@@ -176,10 +177,14 @@ def _contradictions(path: str, beside: list[tuple[Column, np.ndarray]], values: 
         seen = np.isfinite(found)
         steps = np.diff(np.unique(found[seen]))
         rounding = 0.5 * steps.min() if steps.size else 0.0
-        apart = np.maximum(np.abs(found - known)[seen] - rounding, 0.0) / known[seen]
-        if np.median(apart) > CONTRADICTS:
+        factors = (1.0, 3.0) if stretched and column.quantity in ("complex", "viscosity") else (1.0,)
+        apart = min(
+            float(np.median(np.maximum(np.abs(found / k - known)[seen] - rounding / k, 0.0) / known[seen]))
+            for k in factors
+        )
+        if apart > CONTRADICTS:
             out.append(
-                f"column {column.name!r} is not used; it contradicts G' and G'' by {100 * np.median(apart):.2g} % "
+                f"column {column.name!r} is not used; it contradicts G' and G'' by {100 * apart:.2g} % "
                 "(median): find out which column is wrong or was corrected"
             )
     return out

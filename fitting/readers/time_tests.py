@@ -163,6 +163,8 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
     """
     columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
     time = columns["time"]
+    if not len(time):
+        raise InputError(f"{path}: every row has an empty cell or one that is not finite; give numbers")
     if len(time) > 2 and np.all(np.diff(time) < 0):
         raise InputError(
             f"{path}: the rows run backwards, from {time[0]:g} s to {time[-1]:g} s; turn their order round"

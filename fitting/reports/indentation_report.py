@@ -45,6 +45,7 @@ def write(
             "interval_quantile_95": fit.quantile,
             "correlation": fit.correlation,
             "noise_N": fit.noise,
+            "independent_points": fit.independent,
             "mean_relative_error": float(np.mean(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
             "max_relative_error": float(np.max(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
             "half_space_young_modulus": float(alone @ curve.force / max(float(alone @ alone), 1e-300)),
@@ -98,7 +99,12 @@ def indentation_warnings(
     if chance < 1e-3:
         told.append(
             f"structured misfit: residuals in contact change sign {runs - 1} times over {len(touching)} points (by "
-            f"chance: {chance:.1g}): another shape, layer or material; standard errors are too small then"
+            f"chance: {chance:.1g}): another shape, layer or material, or noise that neighbours share"
+        )
+    if fit.independent is not None:
+        told.append(
+            f"neighbouring points share their noise, or the model misses something: {len(fit.residuals)} points "
+            f"measure as much as {fit.independent:.0f} of independent noise; standard errors are those of such noise"
         )
     if curve.force.min() < -5 * fit.noise:
         told.append("forces are negative: this is adhesion, which the model does not have")

@@ -237,7 +237,8 @@ def _of_long_waves(hertz: float, found: Found, f: int) -> list[str]:
     """
     each, told = found.whole if found.parts is None else found.parts, []
     for r, (G, e) in enumerate(zip(np.abs(each.modulus[f]), each.standard_errors[f].real, strict=True)):
-        if e <= SKEW * G or (found.parts is not None and e >= G):  # a region has a sentence for e >= G
+        told_already = found.parts is not None and e >= G  # a region has a sentence of its own
+        if told_already or not (np.isfinite(e) and e > SKEW * G):
             continue
         half = 2 * e / G**2
         top = f"{1 / (1 / G - half):.3g} Pa" if half < 1 / G else "any value above"

@@ -70,8 +70,9 @@ def notes_on_gaps(field: WaveField) -> list[str]:
     if not left < GAPS * most:
         return []
     return [
-        f"{int((whole & ~inside).sum())} voxels within the organ have no displacement, and {100 * left / most:.2g} % "
-        "of its elements are left: fill single gaps from their neighbours, and errors become smaller"
+        f"{int((whole & ~inside).sum())} voxels within the organ have no displacement or are not in the mask, and "
+        f"{100 * left / most:.2g} % of its elements are left: fill single gaps from their neighbours, and errors "
+        "become smaller"
     ]
 
 

@@ -16,7 +16,7 @@ known only to this length w, with the variance w^2/12, which adds |w dc/dx|^2/12
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -344,18 +344,20 @@ def _spread(course: Course, point: _Reached, excess: float, draws: int) -> tuple
     scales, n = course.scales(point.k)[:, None], len(point.z)
     L = np.linalg.cholesky(_hessian(course, point.k, _information(course, point) / excess))
 
-    def by_frequency(z: np.ndarray) -> np.ndarray:
-        return course.by_frequency(course.natural(scales * z))
-
-    roots = by_frequency(np.linalg.inv(L).conj().T)  # R R^H is the covariance
+    roots = course.natural(scales * np.linalg.inv(L).conj().T)  # R R^H is the covariance
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(n, draws)) + 1j * rng.normal(size=(n, draws))
-    before = by_frequency(np.eye(n) + 0j)
-    return (
-        np.sqrt(np.sum(np.abs(before) ** 2, axis=-1)),
-        np.sqrt(np.sum(np.abs(roots) ** 2, axis=-1)),
-        np.moveaxis(roots @ normal, -1, 0),
-    )
+    before = course.natural(scales * np.eye(n))
+
+    def each(y: np.ndarray) -> Iterator[np.ndarray]:
+        """c + l_f at the corners (P, n), one frequency at a time: all together would not fit into the memory."""
+        levels = y[course.corners :]
+        return (y[: course.corners] + level for level in (levels if len(levels) else [0.0]))
+
+    def deviations(y: np.ndarray) -> np.ndarray:
+        return np.stack([np.sqrt(np.sum(own.real**2 + own.imag**2, axis=1)) for own in each(y)])
+
+    return deviations(before), deviations(roots), np.stack([(own @ normal).T for own in each(roots)], axis=1)
 
 
 _HISTORY = ("deviation", "chi2_per_component", "steps", "seconds")

@@ -55,7 +55,8 @@ def read_waves(
         raise InputError(f"{found[formats.CONFLICT]}, or give --spacing")
     step = _lengths(name, "spacing", spacing if spacing is not None else found.get("spacing"), "--spacing")
     place = found.get(formats.PLACE)
-    found |= {key: _on_the_same_voxels(Path(file), key, step, place) for key, file in more.items() if file is not None}
+    given = (step, place, spacing is not None)
+    found |= {key: _on_the_same_voxels(Path(file), key, *given) for key, file in more.items() if file is not None}
     jumps: list[str] = []
     if found.get("wrapped") is not None:
         found["phases"], jumps = unwrapped(name, _instants(name, "wrapped", found["wrapped"]))
@@ -85,11 +86,11 @@ def read_waves(
     return field._replace(noise=noise_of(field))
 
 
-def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object) -> np.ndarray:
+def _on_the_same_voxels(file: Path, key: str, spacing: np.ndarray, place: object, spacing_given: bool) -> np.ndarray:
     """The mask or labels from a separate file, whose voxels must be those of the waves; `place`: `formats.PLACE` of the
     waves, or None.
     """
-    values, own, elsewhere = formats.single(file, key)
+    values, own, elsewhere = formats.single(file, key, spacing_given)
     if elsewhere is not None and place is not None:
         apart = np.abs(np.asarray(elsewhere) - np.asarray(place)).max()
         if apart > SAME_PLACE * float(np.min(spacing)):

@@ -15,6 +15,7 @@ import numpy as np
 from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
+from fitting.fits.honesty.alike_answers import with_alike_noise
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
@@ -169,7 +170,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     """
     prony = time_tests.fit(test, modes)
     if model == "prony":
-        return prony
+        return with_alike_noise(prony)
     tried = [prony] if model == "auto" else []
     tried += fractional_in_time(test, prony.model) if model in ("fractional", "auto") else []
     tried += [spectrum_of_tests.spectrum_in_time(test, prony.model)] if model in ("spectrum", "auto") else []
@@ -178,7 +179,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     rows = _compared_models(tried, time_tests.criterion, test)
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
-    return best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds)
+    return with_alike_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
 
 
 AFit = TypeVar("AFit", TimeFit, Together)

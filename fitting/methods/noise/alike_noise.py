@@ -23,8 +23,12 @@ PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
 FEW, MOST = 12, 400
 #: Gain in the logarithm of the probability from which noise counts as alike: chance reaches it once in a thousand.
 GAIN = 7.0
-#: Level below which the residuals are not the stated noise: synthetic data without noise, say.
-LEAST = 0.5
+#: Root mean square below which the residuals are not the stated noise: synthetic data without noise, say.
+LEAST = 0.2
+#: A residual beyond so many typical ones counts as one of this size: a single wrong point is no order of many.
+OUTLIER = 5.0
+#: Part of an unknown's derivatives that the chosen groups must have.
+SHOWN = 1e-9
 #: Rows of C that are made at a time.
 ROWS = 500
 
@@ -36,6 +40,8 @@ class Alike(NamedTuple):
     part: float  # of the variance
     level: float  # deviation, over the stated one
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
+    gain: float  # in the logarithm of the probability, over independent noise
+    independent: float  # residuals of independent noise that would measure as much
 
 
 def alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray) -> Alike | None:
@@ -56,22 +62,36 @@ def _alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.nda
     some = np.unique(np.linspace(0, len(groups) - 1, FEW).round().astype(int))
     chosen = [_subset(places[groups[k]], groups[k]) for k in some]
     far = [scipy.spatial.distance.cdist(places[own], places[own]) for own in chosen]
-    neighbour = np.median([np.sort(d, axis=1)[:, min(1, len(d) - 1)].mean() for d in far])
+    neighbour = np.median([_to_neighbours(d) for d in far])
     size = float(np.ptp(places, axis=0).max())
     if not 0 < neighbour < size or len(r) <= 2 * J.shape[1]:
         return None
     lengths = np.geomspace(neighbour / 3, size, LENGTHS)
-    data = [(r[own], J[own]) for own in chosen]
+    # Unknowns that the chosen groups do not show take nothing out of their residuals.
+    shown = np.linalg.norm(J[np.concatenate(chosen)], axis=0) > SHOWN * np.linalg.norm(J, axis=0)
+    if sum(map(len, chosen)) <= shown.sum():
+        return None
+    limit = OUTLIER * 1.4826 * float(np.median(np.abs(r)))
+    clipped = np.clip(r, -limit, limit) if limit > 0 else r
+    data = [(clipped[own], J[np.ix_(own, shown)]) for own in chosen]
     alone, _ = _probability_at(data, far, 1.0, 0.0)
     tried = [(*_probability_at(data, far, l, a), l, a) for l, a in itertools.product(lengths, PARTS)]
     best, level, length, part = max(tried)
-    if not best > alone + GAIN or level < LEAST:  # not larger: nor is it if both are -inf
+    # Not larger: nor is it if both are -inf. The level says less: it is small for noise smoother than the function.
+    if not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
         return None
     inverse = np.linalg.pinv(J)
-    middle = sum(_of_unknowns(places[own], length, part, inverse[:, own]) for own in groups)
-    values, vectors = np.linalg.eigh(middle)
-    level = max(1.0, level)
-    return Alike(float(length), part, level, level * vectors * np.sqrt(np.maximum(values, 0.0)))
+    parts = [_of_unknowns(places[own], length, part, inverse[:, own]) for own in groups]
+    values, vectors = np.linalg.eigh(sum(middle for middle, _ in parts))
+    root = max(1.0, level) * vectors * np.sqrt(np.maximum(values, 0.0))
+    return Alike(float(length), part, max(1.0, level), root, best - alone, sum(count for _, count in parts))
+
+
+def _to_neighbours(distance: np.ndarray) -> float:
+    """Mean distance to the nearest other place; a place may have several rows."""
+    nearest = np.where(distance > 0, distance, np.inf).min(axis=1)
+    known = np.isfinite(nearest)
+    return float(nearest[known].mean()) if known.any() else 0.0
 
 
 def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -107,10 +127,11 @@ def _probability_at(data: list, far: list[np.ndarray], length: float, part: floa
     return (value if sign > 0 else -np.inf), float(np.sqrt(left / freedom))
 
 
-def _of_unknowns(places: np.ndarray, length: float, part: float, inverse: np.ndarray) -> np.ndarray:
-    """J^+ C (J^+)^T (p, p) of one group, a few rows of C at a time."""
-    total = (1 - part) * inverse @ inverse.T
+def _of_unknowns(places: np.ndarray, length: float, part: float, inverse: np.ndarray) -> tuple[np.ndarray, float]:
+    """J^+ C (J^+)^T (p, p) of one group, a few rows of C at a time, and its n^2 / sum(C) independent residuals."""
+    total, sum_of_C = (1 - part) * inverse @ inverse.T, (1 - part) * len(places)
     for a in range(0, len(places), ROWS):
         C = _matern(scipy.spatial.distance.cdist(places[a : a + ROWS], places), length)
         total = total + part * inverse[:, a : a + ROWS] @ C @ inverse.T
-    return total
+        sum_of_C += part * float(C.sum())
+    return total, len(places) ** 2 / sum_of_C

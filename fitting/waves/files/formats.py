@@ -72,12 +72,15 @@ def arrays(path: Path) -> Content:
         raise InputError(f"{path}: is damaged ({type(error).__name__}): write it again") from None
 
 
-def single(path: Path, name: str) -> tuple[np.ndarray, object, object]:
-    """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and `PLACE`."""
+def single(path: Path, name: str, spacing_given: bool = False) -> tuple[np.ndarray, object, object]:
+    """One array (nx, ny, nz): the array of this name, or the only one of the file; the file's spacing and `PLACE`.
+
+    A file that contradicts itself about its spacing has neither, if the spacing is given.
+    """
     found = arrays(path)
-    if CONFLICT in found:
+    if CONFLICT in found and not spacing_given:
         raise InputError(found[CONFLICT])
-    place = found.get("spacing"), found.get(PLACE)
+    place = (None, None) if CONFLICT in found else (found.get("spacing"), found.get(PLACE))
     if name in found:
         return np.asarray(found[name]), *place
     own = [v for k, v in found.items() if k in ("displacement", "mask", "labels") and v is not None]
@@ -147,6 +150,9 @@ COLUMNS = ("x", "y", "z", "u_re_x", "u_im_x", "u_re_y", "u_im_y", "u_re_z", "u_i
 ALSO = {"frequency_hz": "frequency", "hertz": "frequency", "labels": "label", "region": "label"}
 
 
+_KNOWN = (*COLUMNS, "frequency", "label", "mask")
+
+
 def _voxel_table(path: Path) -> Content:
     """x, y, z [m], real and imaginary parts, with or without frequency [Hz], label and mask, on a regular grid."""
     numbered = enumerate(text_of(path, "waves").splitlines(), 1)
@@ -154,7 +160,7 @@ def _voxel_table(path: Path) -> Content:
     between = find_delimiter(lines[0][1]) if lines else ","
     head = [cell.lower() for cell in split_cells(lines[0][1], between)] if lines else []
     head = [ALSO.get(name, name) for name in head]
-    twice = next((name for k, name in enumerate(head) if name in head[:k]), None)
+    twice = next((name for k, name in enumerate(head) if name in head[:k] and name in _KNOWN), None)
     if twice is not None:
         raise InputError(f"{path}: two columns mean {twice}: leave one of them")
     missing = [name for name in COLUMNS if name not in head]
@@ -175,7 +181,7 @@ def _voxel_table(path: Path) -> Content:
             raise InputError(f"{path}: row {lines[1 + empty[0]][0]} has no frequency: give every row its own, in Hz")
         hertz, of = np.unique(column["frequency"], return_inverse=True)
     if len(np.unique(np.column_stack([of, at]), axis=0)) < len(at):
-        unknown = [name for name in head if name not in (*COLUMNS, "frequency", "label", "mask")]
+        unknown = [name for name in head if name and name not in _KNOWN]
         perhaps = f", or name the column of the frequencies frequency (not {unknown[0]})" if unknown else ""
         raise InputError(f"{path}: a voxel has two rows of one frequency: leave one of them{perhaps}")
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)

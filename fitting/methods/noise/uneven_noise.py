@@ -1,0 +1,50 @@
+"""Noise that is not the same at all points, as where it grows with the stress: errors of least squares that hold."""
+
+import numpy as np
+import scipy.linalg
+
+#: Smallest noise, over the largest, of noise in proportion to a size.
+_LEAST = 1e-6
+#: Least part of a residual that the fit cannot have taken up.
+_LEFT = 0.05
+
+
+def uneven_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Square root (P, n) of the covariance of P numbers, each residual with its own variance (HC3: MacKinnon and White
+    1985).
+
+    Args:
+        J: derivatives of the residuals by unknowns u (n, p), of full rank.
+        r: residuals of the fit (n,).
+        slope: derivatives of the numbers by u (P, p).
+    """
+    if not np.all(np.isfinite(J)) or J.size == 0:
+        return np.zeros((len(slope), len(r)))
+    inverse = np.linalg.pinv(J)
+    leverage = np.einsum("kn,nk->n", inverse, J)
+    return slope @ (inverse * (r / np.maximum(1 - leverage, _LEFT)))
+
+
+def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Square root (P, n) of the covariance of P numbers for noise in proportion to `size` (n,); 0 if the residuals make
+    equal noise more probable, by restricted likelihood.
+
+    `uneven_root` does not see the noise of a point with a leverage near 1: the fit goes through it.
+    """
+    (n, p), largest, none = J.shape, np.abs(size).max(initial=0.0), np.zeros((len(slope), len(r)))
+    if not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and p and n > p + 1 and largest > 0):
+        return none
+    beside = scipy.linalg.null_space(J.T)
+    left = beside.T @ r
+
+    def probability(variance: np.ndarray) -> tuple[float, float]:
+        L = np.linalg.cholesky(beside.T @ (variance[:, None] * beside))
+        level = float(np.mean(scipy.linalg.solve_triangular(L, left, lower=True) ** 2))
+        return -float(np.sum(np.log(np.diagonal(L)))) - 0.5 * len(left) * np.log(max(level, 1e-300)), level
+
+    growing = np.maximum(np.abs(size) / largest, _LEAST) ** 2
+    try:
+        (equal, _), (better, level) = probability(np.ones(n)), probability(growing)
+    except np.linalg.LinAlgError:
+        return none
+    return slope @ (np.linalg.pinv(J) * np.sqrt(level * growing)) if better > equal else none

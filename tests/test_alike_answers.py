@@ -1,0 +1,79 @@
+"""Noise that neighbouring answers of a test in time share: errors, models, posterior."""
+
+import numpy as np
+import pytest
+
+from fitting.fits import posterior, time_tests
+from fitting.fits.families.springpots_in_time import choose_in_time
+from fitting.fits.honesty.alike_answers import with_alike_noise
+from fitting.fits.time_tests import INDEPENDENT
+from fitting.readers.time_tests import TimeTest
+
+G0, RATIOS, TIMES, STRAIN = 1000.0, np.array([0.3, 0.25]), np.array([2.0, 40.0]), 0.05
+
+
+def _relaxation(time: np.ndarray, noise: np.ndarray) -> TimeTest:
+    """A step at 0 s of two exact modes; `noise` (n,) relative."""
+    G = G0 * (1 - RATIOS.sum() + np.exp(-time[:, None] / TIMES) @ RATIOS)
+    at = np.concatenate([[0.0, 1e-7], time])
+    strain = np.concatenate([[0.0], np.full(len(time) + 1, STRAIN)])
+    return TimeTest("relaxation", at, strain, np.concatenate([[0.0, 0.0], STRAIN * G * (1 + noise)]), at > 1e-6)
+
+
+def _autoregression(rng: np.random.Generator, n: int, part: float) -> np.ndarray:
+    own, out = rng.normal(size=n), np.empty(n)
+    out[0] = own[0]
+    for k in range(1, n):
+        out[k] = part * out[k - 1] + np.sqrt(1 - part**2) * own[k]
+    return out
+
+
+def test_errors_of_shared_noise_are_those_of_many_draws():
+    """Drifting noise in equal steps of time: independent noise leaves errors of ratios and times 2 to 5 times too
+    small."""
+    time, rng = np.arange(0.1, 300.0, 2.0), np.random.default_rng(0)
+    values, before, after = [], [], []
+    for _ in range(16):
+        fit = time_tests.fit(_relaxation(time, 0.01 * _autoregression(rng, len(time), 0.9)), modes=2)
+        wide = with_alike_noise(fit)
+        assert INDEPENDENT in wide.details and "share their noise" in wide.warnings[-1]
+        values.append(fit.uncertainty.values)
+        before.append(fit.uncertainty.standard_errors)
+        after.append(wide.uncertainty.standard_errors)
+    scatter = np.std(values, axis=0)
+    assert np.all((np.median(before, axis=0) < 0.7 * scatter)[1:])
+    # The scatter of 16 draws is known to 18 %, and the length of the noise to a factor.
+    assert np.all(np.median(after, axis=0) > 0.6 * scatter) and np.all(np.median(after, axis=0) < 2.5 * scatter)
+
+
+def test_white_noise_changes_nothing():
+    """The noise of the measured answers is in the scales of the residuals too, and is not taken for an order."""
+    rng = np.random.default_rng(1)
+    for time in (np.geomspace(0.1, 600, 120), np.arange(0.1, 300.0, 1.0)):
+        fit = time_tests.fit(_relaxation(time, 0.01 * rng.normal(size=len(time))), modes=2)
+        assert with_alike_noise(fit) is fit
+    assert with_alike_noise(exact := time_tests.fit(_relaxation(time, 0.0 * time), modes=2)) is exact
+
+
+@pytest.mark.parametrize("model", ["prony", "fractional"])
+def test_the_posterior_counts_independent_answers(model, monkeypatch):
+    """The log likelihood is that of fewer answers, so that its intervals are as wide as the errors."""
+    time, rng = np.geomspace(0.1, 600, 100), np.random.default_rng(2)
+    test = _relaxation(time, 0.01 * _autoregression(rng, len(time), 0.9))
+    fit = choose_in_time(test, model, 2 if model == "prony" else "auto")
+    assert fit.details[INDEPENDENT] < 40
+    seen = []
+    monkeypatch.setattr(posterior, "sample", lambda own, *rest: seen.append(own))
+    for each in (fit, fit._replace(details={})):
+        posterior.of_time_test(each, test, 10)
+    u = np.asarray(fit.solution.u)[None] + 0.01 * rng.normal(size=(3, len(fit.solution.u)))
+    few, all_of_them = (own.log_likelihood(u) for own in seen)
+    assert np.allclose(few, all_of_them * fit.details[INDEPENDENT] / len(time), rtol=1e-12)
+    own = fit.parameters or fit.uncertainty
+    assert np.all(np.isfinite(own.standard_errors)) and own.freedom < 40
+
+
+def test_a_spectrum_keeps_its_own_errors():
+    time, rng = np.geomspace(0.1, 600, 100), np.random.default_rng(2)
+    fit = choose_in_time(_relaxation(time, 0.01 * _autoregression(rng, len(time), 0.9)), "spectrum")
+    assert with_alike_noise(fit) is fit and INDEPENDENT not in fit.details
