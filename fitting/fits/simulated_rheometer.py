@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import sample_inertia
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, BestPoint, Fit, Kind, by_importance, fit_at, timed
 from fitting.methods import uncertainty
 from fitting.methods.estimate import Estimate, mesh_bias, with_shared_errors
@@ -163,7 +164,16 @@ OF_THE_DATA = (
 )
 
 
-KEPT = ("conversion", "spectrum", "models_compared", "band_sensitivity", "consistency", "instrument", "gap_error")
+KEPT = (
+    "conversion",
+    "spectrum",
+    "models_compared",
+    "band_sensitivity",
+    "consistency",
+    "instrument",
+    "gap_error",
+    INTERVAL,
+)
 
 
 def through_torsion(

@@ -308,8 +308,8 @@ def closer_but_not_chosen(modes: int, errors: list[float], converged: bool) -> s
 
 
 #: Words of the warnings that come first, the most important at the beginning.
-MISSES = "the fit misses the data"
-IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", "half decade")
+MISSES, SHORT = "the fit misses the data", "the test ends before the material has relaxed"
+IMPORTANT = ("did not converge", MISSES, "Kramers-Kronig", "that relaxes", "structured misfit", SHORT, "half decade")
 
 
 def by_importance(sentences: Sequence[str]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 from fitting.fits.families import limits
 from fitting.fits.honesty import edges
 from fitting.fits.samples import Samples, outliers
+from fitting.fits.viscoelastic import SHORT
 from fitting.readers.rheometer import WARMER
 from fitting.readers.units import celsius
 from fitting.reports.sweep_report import band_sensitivity, numbers, summary
@@ -140,6 +141,7 @@ def warnings(found: Samples) -> list[str]:
         ("Kramers-Kronig", "the data do not agree with themselves"),
         ("structured misfit", "the misfit has structure"),
         ("half decade", "the ends of the band decide some numbers"),
+        (SHORT, "the test ends before the material has relaxed, and no interval of G_inf contains the rest"),
         ("(a fluid)", "the equilibrium modulus cannot be distinguished from zero"),
         ("have merged", "two relaxation times have merged"),
         ("extrapolated", "a relaxation time lies outside of what the frequencies resolve"),

@@ -11,6 +11,7 @@ import numpy as np
 
 from fitting.fits.families import limits, models
 from fitting.fits.honesty import edges, moduli_errors, total_error
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.posterior import Posterior
 from fitting.fits.simulated_rheometer import largest_shift
 from fitting.fits.viscoelastic import Fit, Kind
@@ -68,6 +69,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "mesh_bias": _bias_by_name(u, n, u.mesh_bias),
         "time_step_bias": _bias_by_name(u, n, u.time_step_bias),
         **own_numbers(fit.parameters, fit.kind),
+        INTERVAL: ends_of_interval(fit.details),
         "interval_quantile_95": u.quantile,
         "correlation": u.correlation.tolist(),
         "correlation_names": list(u.names),
@@ -82,6 +84,12 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "compile_time_s": fit.compile_time,
         "details": fit.details,
     }
+
+
+def ends_of_interval(details: Content) -> list[float] | None:
+    """Ends of the interval of the equilibrium modulus; None for another model than Prony modes."""
+    found = details.get(INTERVAL)
+    return [found["low"], found["high"]] if found else None
 
 
 def moduli_rows(fit: Fit, sweep: Sweep) -> Content:
@@ -425,6 +433,7 @@ SOURCES = {
     "noise": "noise",
     "geometry": "gap and radius",
     "band": "ends of the band",
+    "long_times": "relaxation after the test",
     "mesh": "mesh",
     "time_step": "time step",
 }

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitting.fits.families import limits
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.posterior import Posterior
 from fitting.fits.time_tests import TimeFit
 from fitting.methods import time_response
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.time_tests import TimeTest
 from fitting.reports import posterior_report
-from fitting.reports.sweep_report import numbers, own_numbers, own_rows
+from fitting.reports.sweep_report import ends_of_interval, numbers, own_numbers, own_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -46,6 +47,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
                 "ratios": e[1 : n + 1].tolist(),
                 "relaxation_times": e[n + 1 :].tolist(),
             },
+            INTERVAL: ends_of_interval(fit.details),
             "interval_quantile_95": u.quantile,
             "correlation": u.correlation.tolist(),
             "correlation_names": list(u.names),

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitting.fits.families import limits
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.time_tests import thinned
 from fitting.fits.together import Share, Together
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
-from fitting.reports.sweep_report import numbers, own_numbers, spectrum_rows
+from fitting.reports.sweep_report import ends_of_interval, numbers, own_numbers, spectrum_rows
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
@@ -50,6 +51,7 @@ def write(out: Path, found: Together) -> Content:
             "ratios": found.model.ratios.tolist(),
             "relaxation_times": found.model.relaxation_times.tolist(),
             "standard_errors": _by_name(u.standard_errors, n) | limits.limit_errors(u, found.model, found.parameters),
+            INTERVAL: ends_of_interval(found.details or {}),
             "interval_quantile_95": u.quantile,
             "correlation": u.correlation.tolist(),
             "correlation_names": list(u.names),

@@ -16,6 +16,7 @@ from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
 from fitting.fits.honesty.alike_answers import with_alike_noise
+from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
@@ -170,7 +171,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     """
     prony = time_tests.fit(test, modes)
     if model == "prony":
-        return with_alike_noise(prony)
+        return _with_long_times_of(with_alike_noise(prony), test)
     tried = [prony] if model == "auto" else []
     tried += fractional_in_time(test, prony.model) if model in ("fractional", "auto") else []
     tried += [spectrum_of_tests.spectrum_in_time(test, prony.model)] if model in ("spectrum", "auto") else []
@@ -179,7 +180,12 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     rows = _compared_models(tried, time_tests.criterion, test)
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
-    return with_alike_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
+    whole = with_alike_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
+    return _with_long_times_of(whole, test)
+
+
+def _with_long_times_of(fit: TimeFit, test: TimeTest) -> TimeFit:
+    return with_interval(fit, [test], [fit.uncertainty.noise])
 
 
 AFit = TypeVar("AFit", TimeFit, Together)
@@ -246,7 +252,8 @@ def choose_together(
     """The model of the lowest criterion for several tests; arguments as in `choose_in_time` and `together.fit`."""
     prony = together.fit(tests, modes, progress)
     fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
-    return fit._replace(warnings=(*fit.warnings, *common_factor.told(fit)))
+    fit = fit._replace(warnings=(*fit.warnings, *common_factor.told(fit)))
+    return with_interval(fit, fit.tests, [s.noise for s in fit.shares])
 
 
 def _best_of_models(tests: list[Measured], model: str, prony: Together, progress: Callable[[str], None]) -> Together:

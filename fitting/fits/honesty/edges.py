@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 
 from fitting.fits import viscoelastic
+from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
 from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
@@ -41,7 +42,21 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
     changes = sensitivity(fit, sweep)
     details["band_sensitivity"] = changes
     sentences = (*warnings, *told, *_moved_most(fit, changes))
-    return fit._replace(details=details, warnings=viscoelastic.by_importance(sentences))
+    whole = _with_long_times(fit._replace(details=details, warnings=sentences), sweep)
+    return whole._replace(warnings=viscoelastic.by_importance(whole.warnings))
+
+
+def _with_long_times(fit: Fit, sweep: Sweep) -> Fit:
+    """The interval of the equilibrium modulus, if the unknowns of the fit are those of Prony modes alone."""
+    if fit.parameters is not None or len(fit.solution.u) != 2 * fit.modes + (fit.kind.name != FLUID.name):
+        return fit
+    fluid = fit.kind.name == FLUID.name
+    natural = generalised_maxwell.natural_fluid if fluid else generalised_maxwell.natural
+    own = natural(np.asarray(fit.solution.u))
+    # Numbers of a compressed sample are those of the data times a factor.
+    of = "shear_modulus" if fluid else "equilibrium_modulus"
+    factor = float(getattr(fit.model, of) / max(float(getattr(own, of)), 1e-300))
+    return with_interval(fit, [sweep], [fit.uncertainty.noise], factor) if factor > 0 else fit
 
 
 def _nearest(fit: Fit, sweep: Sweep, misfit: float) -> str:

@@ -7,6 +7,7 @@ is not among them: the numbers describe the measured curve, not the material.
 import numpy as np
 
 from fitting.fits.honesty import edges
+from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.viscoelastic import Fit
 
@@ -27,7 +28,7 @@ def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
     The share of the band's ends is the larger of the two changes; the square of the standard error is subtracted from
-    its square.
+    its square. The share of long times is that of the farther end of `long_times.equilibrium_interval`.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -45,6 +46,12 @@ def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
     for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
         if moved is not None and fit.parameters is None:
             out[source] = _of_modes(fit, moved)
+    interval = fit.details.get(INTERVAL)
+    if interval and interval["wider_than_standard_error"] and "equilibrium_modulus" in known:
+        value, error = known["equilibrium_modulus"]
+        half = max(value - interval["low"], interval["high"] - value) / fit.uncertainty.quantile
+        beyond = float(np.sqrt(max(0.0, half**2 - error**2)))
+        out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": beyond}
     return out
 
 

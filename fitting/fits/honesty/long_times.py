@@ -1,0 +1,197 @@
+"""What a test leaves open of the equilibrium modulus: parts of the material may relax after its end.
+
+The standard error is that of a straight line through the minimum, for the modes that were chosen. A mode whose time is
+near the end of the test, or beyond it, is hardly told from the equilibrium modulus. So the equilibrium modulus is held,
+and all else is fitted again, with times up to `BEYOND` times the longest one that the test resolves (a profile
+likelihood). If one more mode follows the data much more closely, the interval is that of the model with this mode.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import scipy.special
+
+from fitting.fits import time_tests, together
+from fitting.fits.time_tests import TimeFit
+from fitting.fits.together import Measured, Together
+from fitting.fits.viscoelastic import SHORT, Fit, Kind
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.methods.host import Array, arrays_of
+from fitting.methods.least_squares import Solution, from_starts
+from fitting.methods.uncertainty import equilibrium_error
+
+#: Longest and shortest relaxation time, over the ends of what the test resolves.
+BEYOND = 10.0
+#: Fall of the sum of squares, over the noise's variance, from which one more mode is needed.
+CLOSER = 10.0
+#: Times of this mode at the start, over the longest that the test resolves.
+SLOW = (0.3, 1.0, 3.0)
+#: Bisections of each end, and iterations of each fit.
+BISECTIONS, ITERATIONS = 6, 60
+#: Distance of the farther end that is told, over that of the 95 % interval of the standard error, and over the number.
+WIDER, LARGE = 2.0, 0.05
+
+
+class Interval(NamedTuple):
+    """The 95 % interval of an equilibrium modulus."""
+
+    low: float  # [Pa]
+    high: float
+    longest: float  # relaxation time [s] up to which materials are considered
+    modes: int  # of the model
+
+
+class _Family(NamedTuple):
+    """Prony modes with a given equilibrium modulus, as functions of logs of strengths and bounded times."""
+
+    evaluate: Callable[[float, np.ndarray], Solution]
+    ends: tuple[float, float]  # logs of the shortest and the longest time
+
+    def unknowns(self, strengths: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """u (2 N,) of strengths [Pa] and times [s]."""
+        part = (np.log(times) - self.ends[0]) / (self.ends[1] - self.ends[0])
+        return np.concatenate([np.log(strengths), scipy.special.logit(np.clip(part, 1e-3, 1 - 1e-3))])
+
+
+def equilibrium_interval(
+    tests: Sequence[Measured], noises: Sequence[float], model: Maxwell, error: float, independent: float = 1.0
+) -> Interval | None:
+    """The 95 % interval of the equilibrium modulus of Prony modes; None if no fit succeeded.
+
+    Args:
+        tests: that were fitted, one or more.
+        noises: factors on their scales, known or from the fit.
+        model: the modes that were chosen.
+        error: standard error [Pa] of the equilibrium modulus; it may be infinite.
+        independent: part of the residuals that are independent.
+    """
+    low, high = together.resolved_by(tests)
+    family = _family(tests, noises, (low / BEYOND, high * BEYOND))
+    rest = float(model.shear_modulus * (1 - np.sum(model.ratios)))
+    whole = float(model.shear_modulus)
+    rest = rest if rest > 1e-9 * whole else 0.0
+    strengths = np.maximum(np.asarray(model.shear_modulus * model.ratios), 1e-6 * whole)
+    times = np.asarray(model.relaxation_times)
+    found = family.evaluate(rest, family.unknowns(strengths, times)[None])
+    best = _with_one_more(family, (rest or 0.3 * whole, strengths, times), high, found)
+    least, (modulus, found) = 2 * float(best[1].cost), best
+    if not np.isfinite(least):
+        return None
+    freedom = max(1.0, len(found.residuals) - len(found.u) - 1)
+    spread = max(1.0, least / freedom)
+    quantile = float(scipy.special.stdtrit(freedom, 0.975))
+    limit = least + quantile**2 * spread / independent
+    first = min(quantile * error, 0.1 * whole) if error > 0 else 0.01 * whole
+    ends = [_end(family, modulus, found, limit, sign * first, whole) for sign in (-1, 1)]
+    return Interval(min(ends[0], rest), max(ends[1], rest), high * BEYOND, len(found.u) // 2)
+
+
+def _family(tests: Sequence[Measured], noises: Sequence[float], times: tuple[float, float]) -> _Family:
+    ends = (float(np.log(times[0])), float(np.log(times[1])))
+    parts = [together.reported_numbers(test) for test in tests]
+    data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noises, strict=True)]
+    names = list(map(together.name_of, tests))
+
+    def evaluate(modulus: float, starts: np.ndarray) -> Solution:
+        def maxwell(u: Array) -> Maxwell:
+            xp, n = arrays_of(u), u.shape[-1] // 2
+            strengths = xp.exp(u[..., :n])
+            whole = modulus + strengths.sum(axis=-1)
+            times = xp.exp(ends[0] + (ends[1] - ends[0]) / (1 + xp.exp(-u[..., n:])))
+            return Maxwell(whole, strengths / whole[..., None], times)
+
+        def at(u: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
+            return together.tests_evaluated(names, Kind("prony", maxwell), u, data)
+
+        return from_starts(at, starts, max_iterations=ITERATIONS)
+
+    return _Family(evaluate, ends)
+
+
+def _with_one_more(
+    family: _Family, model: tuple[float, np.ndarray, np.ndarray], longest: float, found: Solution
+) -> tuple[float, Solution]:
+    """The equilibrium modulus and the fit at the minimum, of one more slow mode if the data need it."""
+    rest, strengths, times = model
+    noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
+    best = (rest, found)
+    for part in (0.8, 0.5, 0.2, 0.0):  # of the equilibrium modulus that is left; the rest relaxes slowly
+        more = np.append(strengths, (1 - part) * rest)
+        starts = np.stack([family.unknowns(more, np.append(times, k * longest)) for k in SLOW])
+        trial = family.evaluate(part * rest, starts)
+        if float(trial.cost) < float(best[1].cost) - 0.5 * CLOSER * noise:
+            best = (part * rest, trial)
+    return best
+
+
+def _end(family: _Family, modulus: float, found: Solution, limit: float, step: float, whole: float) -> float:
+    """The farthest equilibrium modulus on one side whose fit reaches the limit of the sum of squares."""
+    u, inside, outside = np.asarray(found.u), modulus, None
+    while outside is None:
+        trial = max(0.0, inside + step)
+        again = family.evaluate(trial, u[None])
+        if not 2 * float(again.cost) <= limit:
+            outside = trial
+        elif trial == 0.0 or trial > 10 * whole:
+            return trial
+        else:
+            inside, step, u = trial, 2 * step, np.asarray(again.u)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (inside + outside)
+        again = family.evaluate(middle, u[None])
+        if 2 * float(again.cost) <= limit:
+            inside, u = middle, np.asarray(again.u)
+        else:
+            outside = middle
+    return outside
+
+
+#: Key of the interval in the details of a fit.
+INTERVAL = "equilibrium_modulus_interval_95"
+AFit = TypeVar("AFit", Fit, TimeFit, Together)
+
+
+def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float], factor: float = 1.0) -> AFit:
+    """The fit of Prony modes with the interval of its equilibrium modulus, and a warning if this is much wider than the
+    standard error says. Other models are returned as they are.
+
+    Args:
+        fit: of these tests.
+        tests, noises: as in `equilibrium_interval`.
+        factor: equilibrium modulus of the fit over that of the data (of a compressed sample).
+    """
+    if fit.parameters is not None or not fit.converged:
+        return fit
+    model = fit.model._replace(shear_modulus=np.asarray(fit.model.shear_modulus) / factor)
+    error = equilibrium_error(fit.uncertainty)
+    details = fit.details or {}
+    points = sum(len(together.reported_numbers(test)[1]) for test in tests)
+    independent = details.get(time_tests.INDEPENDENT, points) / points
+    found = equilibrium_interval(tests, noises, model, error / factor, independent)
+    if found is None:
+        return fit
+    low, high = factor * found.low, factor * found.high
+    rest = max(0.0, float(fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))))
+    told = _told_interval((low, rest, high), fit.uncertainty.quantile * error, found, float(fit.model.shear_modulus))
+    numbers = {"low": low, "high": high, "longest_relaxation_time": found.longest, "modes": found.modes}
+    details = details | {INTERVAL: numbers | {"wider_than_standard_error": bool(told)}}
+    return fit._replace(details=details, warnings=(*fit.warnings, *told))
+
+
+def _told_interval(ends: tuple[float, float, float], half: float, found: Interval, whole: float) -> list[str]:
+    low, rest, high = ends
+    where = f"if parts of the material relax in up to {found.longest:.3g} s"
+    if rest <= 1e-9 * whole:
+        if high < LARGE * whole:
+            return []
+        return [
+            f"a solid follows the data as well as the fluid: {where}, its equilibrium modulus is 0 to {high:.3g} Pa "
+            "(95 %); a longer test decides"
+        ]
+    if max(rest - low, high - rest) <= max(WIDER * half, LARGE * rest):
+        return []
+    return [
+        f"{SHORT}: {where}, the equilibrium modulus is {low:.3g} to {high:.3g} Pa (95 %); {rest:.4g} ± "
+        f"{half / 2:.2g} Pa is that of the modes that were chosen"
+    ]
