@@ -151,6 +151,26 @@ def test_the_closed_form_takes_the_inertia_of_the_sample_off(tmp_path, capsys):
     )
 
 
+def test_points_that_the_inertia_of_the_sample_bends_are_kept_if_it_is_known(tmp_path, capsys):
+    """They were left out as the mark of the instrument before the inertia of the sample was taken off."""
+    hertz = np.logspace(-1.7, 1.5, 33)
+    tau, part, rng = np.array([0.02, 0.4, 8.0]), np.array([0.3, 0.25, 0.2]), np.random.default_rng(0)
+    iwt = 2j * np.pi * hertz[:, None] * tau
+    G = 2000 * (0.25 + (part * iwt / (1 + iwt)).sum(axis=1))
+    seen = sample_inertia.shown(G, 2 * np.pi * hertz, 1060.0, 0.006)
+    noise = 1 + 0.005 * rng.normal(size=(2, 33))
+    rows = np.column_stack([hertz, seen.real * noise[0], seen.imag * noise[1]])
+    head = "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", rows, "%.12g", ",", header=head, comments="")
+    command = [str(tmp_path / "s.csv"), "--method", "closed-form", "--height", "0.006", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert "which is the mark of the instrument" in capsys.readouterr().err
+    assert main([*command, "--density", "1060"]) == 0
+    told = capsys.readouterr().err
+    assert "mark of the instrument" not in told and "the inertia of the sample, 6 mm high" in told
+    assert np.isclose(json.loads((tmp_path / "fit.json").read_text())["shear_modulus"], 2000, rtol=0.02)
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_unusable_input_exits_2_with_one_sentence(name, tmp_path, capsys):
     text, options, sentence = BAD[name]

@@ -160,13 +160,13 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
         assert main(command) == 130
     scene.write_text(SCENE.replace("770.0", "700.0"))
     assert main([*command, "--resume"]) == 2
-    assert "of another run (its scene differ)" in capsys.readouterr().err
+    assert "of another run (not the same scene)" in capsys.readouterr().err
     scene.write_text(SCENE)
     load = scene_file.load_scene
     with monkeypatch.context() as patch:  # the same text, but a file that it names has changed
         patch.setattr(scene_file, "load_scene", lambda file: lj.with_parameters(load(file), {"body.density": 1000.0}))
         assert main([*command, "--resume"]) == 2
-    assert "of another run (its numbers differ)" in capsys.readouterr().err
+    assert "of another run (not the same numbers)" in capsys.readouterr().err
     assert main(["simulate", str(scene), "--every", "0"]) == 2
     assert "--every 0 must be above 0" in capsys.readouterr().err
 

@@ -29,11 +29,11 @@ def test_what_is_put_is_got(name, value):
     [
         ("0.nu", "no: did you mean mu?"),
         ("0.volumetric", "no: use one of mu, bulk"),
-        ("1.mu.2", "no: '2' leads nowhere"),
-        ("2.mu", "no: '2' leads nowhere"),
-        ("mu", "no: 'mu' leads nowhere"),
+        ("1.mu.2", "no: '2' leads nowhere: it has places 0 to 1"),
+        ("2.mu", "no: '2' leads nowhere: it has places 0 to 1"),
+        ("mu", "no: 'mu' leads nowhere: it has places 0 to 1"),
         ("0.mu.0", "no: '0' leads nowhere"),
-        ("", "no: '' leads nowhere"),
+        ("", "no: '' leads nowhere: it has places 0 to 1"),
     ],
 )
 def test_names_that_lead_nowhere_are_refused(name, sentence):

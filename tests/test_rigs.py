@@ -290,6 +290,10 @@ def test_a_free_height_serves_as_a_test():
         (lambda: glued.tension(-R, H, 0.1, [0.1]), "radius"),
         (lambda: glued.indentation(R, H, 0.02, 0.1, [1e-3]), "punch"),
         (lambda: glued.indentation(R, H, 1e-5, 0.1, [1e-3]), "punch"),
+        (lambda: glued.indentation(R, H, 0.4 * R, 0.1, [2 * H]), "depths reach"),
+        (lambda: glued.creep(R, H, 0.1, 0, 10.0), "steps = 0"),
+        (lambda: glued.creep(R, H, 0.1, 2.5, 10.0), "steps = 2.5"),
+        (lambda: glued.creep(R, H, 0.1, 3, np.nan), "stress = nan"),
         (lambda: glued.tension(R, H, 0.1, [0.1], cell_size=-1.0), "cell_size = -1"),
     ],
 )

@@ -329,11 +329,11 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
     assert "in use by another process" in capsys.readouterr().err
     (files / "rows.csv").write_text(TABLE.replace("700", "701"))
     assert main(command(files, "--resume")) == 2
-    assert "another sweep (its parameters differ)" in capsys.readouterr().err
+    assert "another sweep (not the same parameters)" in capsys.readouterr().err
     (files / "rows.csv").write_text(TABLE)
     (files / "scene.toml").write_text(SCENE.replace("2200", "2300"))
     assert main(command(files, "--resume")) == 2
-    assert "another sweep (its scene differ)" in capsys.readouterr().err
+    assert "another sweep (not the same scene)" in capsys.readouterr().err
     (files / "scene.toml").write_text(SCENE)
     assert main(command(files, "--resume")) == 0  # and nothing was lost
     assert main(command(files)) == 2

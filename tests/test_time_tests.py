@@ -455,3 +455,20 @@ def test_a_column_without_a_number_is_refused_in_one_sentence(tmp_path):
     (tmp_path / "n.csv").write_text("time_s,relaxation_modulus_Pa\n" + "\n".join(f"{k},nan" for k in range(9)) + "\n")
     with pytest.raises(InputError, match="every row has an empty cell or one that is not finite"):
         read_time_test(tmp_path / "n.csv", "relaxation")
+
+
+def test_small_units_are_read_and_unknown_ones_are_named(tmp_path):
+    """uN and nm were "no header names …"."""
+    t = np.linspace(0.0, 2.0, 21)
+    rows = [(x, 1e-4 * min(x, 1.0), 0.02 * min(x, 1.0)) for x in t]
+    read = {}
+    for force, displacement, factor in (("N", "m", (1.0, 1.0)), ("uN", "nm", (1e6, 1e9)), ("xN", "m", (1.0, 1.0))):
+        lines = [f"{x:.9g},{d * factor[1]:.9g},{f * factor[0]:.9g}" for x, d, f in rows]
+        head = f"time_s,displacement_{displacement},force_{force}"
+        (tmp_path / "t.csv").write_text("\n".join([head, *lines]) + "\n")
+        if force == "xN":
+            with pytest.raises(InputError, match="unit 'xN' of force is not known; use N, mN, uN"):
+                read_time_test(tmp_path / "t.csv", "relaxation", Sample(0.01, 0.005))
+        else:
+            read[force] = read_time_test(tmp_path / "t.csv", "relaxation", Sample(0.01, 0.005))
+    assert np.allclose(read["uN"].answer, read["N"].answer) and np.allclose(read["uN"].driven, read["N"].driven)

@@ -52,7 +52,6 @@ def write_cards(out: Path, model: "Maxwell") -> None:
 
 def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
     """Read a sweep without the points that the instrument spoils; with --max-frequency all points below it are kept."""
-    from fitting.methods import kramers_kronig
     from fitting.readers import rheometer
 
     try:
@@ -64,7 +63,32 @@ def usable_sweep(options: argparse.Namespace, path: Path) -> "Sweep":
         raise InputError(f"{path} holds no frequency sweep: give it to `python -m fitting {other}`") from None
     sweep = rheometer.within(sweep, options.min_frequency, options.max_frequency)
     sweep = rheometer.without_inertia(sweep, options.radius, options.height)
-    return sweep if options.max_frequency else kramers_kronig.without_instrument(sweep)
+    return sweep if options.max_frequency else without_instrument_or_sample(options, sweep)
+
+
+def without_instrument_or_sample(options: argparse.Namespace, sweep: "Sweep") -> "Sweep":
+    """The sweep without the points that show the instrument. A known inertia of the sample is not taken for it; it
+    stays in the moduli."""
+    import numpy as np
+
+    from fitting.fits import sample_inertia
+    from fitting.methods import kramers_kronig
+    from fitting.readers.rheometer import some
+
+    density = getattr(options, "density", None)
+    if density is None or options.height is None:
+        return kramers_kronig.without_instrument(sweep)
+    try:
+        bare = sample_inertia.taken_off(sweep, density, options.height)
+    except InputError:  # told with its remedy where the inertia is taken off
+        return kramers_kronig.without_instrument(sweep)
+    kept = kramers_kronig.without_instrument(bare)
+    told = tuple(note for note in kept.notes if note not in bare.notes)
+    good = np.isin(sweep.angular_frequency, kept.angular_frequency)
+    grey = np.column_stack([sweep.angular_frequency, sweep.storage, sweep.loss])[~good]
+    grey = grey if sweep.grey is None else np.concatenate([sweep.grey, grey])
+    whole = some(sweep, good)
+    return whole._replace(grey=grey if len(grey) else None, notes=(*whole.notes, *told))
 
 
 def _other_command(path: Path) -> str | None:

@@ -60,7 +60,6 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
     Another sweep is cut to the band that the user names, and points that the instrument spoils are left out, as in the
     first sweep. A `whole` sweep is only predicted, so it is not cut.
     """
-    from fitting.methods import kramers_kronig
     from fitting.readers import rheometer, time_tests
     from fitting.waves import dispersion
 
@@ -83,5 +82,5 @@ def read_any(options: argparse.Namespace, path: Path, whole: bool = False) -> "M
         sweep = sweep if whole else rheometer.within(sweep, options.min_frequency, options.max_frequency)
         sweep = rheometer.without_inertia(sweep, options.radius, options.height)
         named = options.max_frequency and not whole
-        return sweep if named else kramers_kronig.without_instrument(sweep)
+        return sweep if named else shared_options.without_instrument_or_sample(options, sweep)
     return time_tests.read_time_test(path, time_tests.kind_of(path), time_tests.Sample(options.radius, options.height))

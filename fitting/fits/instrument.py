@@ -276,7 +276,7 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
     """The part `precompression` of fit.json, for a fit in closed form or through the simulation."""
     law, strain = laws.typical(simulation.law), simulation.precompression
     G, glued = float(np.asarray(law.shear_modulus())), fit.method != "closed-form"
-    factors = compression.shares(law, strain)
+    factors, kept = compression.shares(law, strain), compression.incompressible(law, strain)
     force = fit.details["force_of_law_N"] if glued else compression.smooth_force(law, strain, simulation.radius)
     G0, rest = float(fit.model.shear_modulus), float(fit.model.equilibrium_modulus)
     unknown = glued and "force_of_law_mesh_bias_N" not in fit.details
@@ -286,6 +286,7 @@ def compression_numbers(fit: Fit, simulation: simulated_rheometer.Simulation) ->
         "plates": "glued" if glued else "smooth",
         "law": simulation.law,
         "bulk_over_shear_modulus": float(np.asarray(law.bulk_modulus())) / G,
+        "modulus_if_incompressible": None if kept is None else factors.relaxing / kept,
         "smooth_factor_of_relaxing_moduli": factors.relaxing,
         "smooth_factor_of_equilibrium_modulus": factors.equilibrium,
         "axial_force_N": force * rest / G,

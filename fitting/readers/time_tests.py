@@ -1,55 +1,15 @@
-"""Relaxation and creep from files: time with modulus, compliance, strain and stress, or other pairs of columns.
-
-Files have the forms of sweeps: plain CSV, TRIOS and RheoCompass text, units in the header or below it.
-"""
+"""Relaxation and creep from files: time with modulus, compliance, strain and stress, or other pairs of columns."""
 
 import os
-import re
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.scattering_load import without_scatter
-from fitting.readers.tables.text_tables import EMPTY, decimal_sign, means_nothing, split_line, text_of, to_number
-from fitting.readers.units import TIME_TEST_UNITS
+from fitting.readers.tables.time_columns import FORMS, read_columns
 from liverjax.core.errors import InputError
 
-#: Words that begin a heading, and the quantity; the longer ones come first.
-WORDS = (
-    ("relaxation modulus", "modulus"),
-    ("shear modulus", "modulus"),
-    ("modulus", "modulus"),
-    ("g(t)", "modulus"),
-    ("creep compliance", "compliance"),
-    ("compliance", "compliance"),
-    ("j(t)", "compliance"),
-    ("shear strain", "strain"),
-    ("strain", "strain"),
-    ("shear stress", "stress"),
-    ("stress", "stress"),
-    ("torque", "torque"),
-    ("angle", "angle"),
-    ("deflection angle", "angle"),
-    ("axial force", "force"),
-    ("force", "force"),
-    ("displacement", "displacement"),
-    ("step time", "time"),
-    ("time", "time"),
-)
-#: Quantities that a file must have in addition to the time, best first.
-FORMS = (
-    ("strain", "stress"),
-    ("angle", "torque"),
-    ("displacement", "force"),
-    ("modulus",),
-    ("compliance",),
-)
-
-
-#: TRIOS writes two times, since the test began and since the experiment began. The time of the test is used.
-OWN_TIME = "step time"
 #: A load at the first row below this part of the largest load counts as rest: its effect on answers is as small.
 AT_REST = 0.01
 
@@ -155,27 +115,6 @@ def read_time_test(
     return _checked(TimeTest(kind, time, driven, answer, time > 0, str(path), tuple(notes)), start)
 
 
-def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns of a test by quantity, in SI units, at rising times from 0 s or later; then notes.
-
-    Raises:
-        InputError: one sentence naming file, column or line, value and remedy.
-    """
-    columns, notes = _columns_in_time(str(path), text_of(Path(path), "a relaxation or creep test").splitlines())
-    time = columns["time"]
-    if not len(time):
-        raise InputError(f"{path}: every row has an empty cell or one that is not finite; give numbers")
-    if len(time) > 2 and np.all(np.diff(time) < 0):
-        raise InputError(
-            f"{path}: the rows run backwards, from {time[0]:g} s to {time[-1]:g} s; turn their order round"
-        )
-    if np.any(np.diff(time) <= 0) or time[0] < 0:
-        k = int(np.argmax(np.diff(time) <= 0)) + 1
-        order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
-        raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
-    return columns, notes
-
-
 def of_columns(
     kind: str,
     time: np.ndarray,
@@ -244,132 +183,6 @@ def kind_of(path: str | os.PathLike) -> str:
 
 def _own_table(kind: str) -> str:
     return "modulus" if kind == "relaxation" else "compliance"
-
-
-def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The columns, in SI units, of the first table that has time and an answer; then notes."""
-    for k, line in enumerate(lines):
-        delimiter, cells = split_line(line.lstrip("# "))
-        found = _heading(cells)
-        if "time" in found and any(set(f) <= set(found) for f in FORMS):
-            rows, units, left_out = _rows_in_time(path, lines, k + 1, delimiter, found)
-            columns, notes = _in_si(path, found, np.array(rows), units)
-            return columns, [*_told_of_times(cells), *notes, *left_out, *_told_of_tables(lines[k + 1 :])]
-    first = next((line.strip() for line in lines if line.strip()), "")[:80]
-    raise InputError(
-        f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, strain and stress_Pa, "
-        f"angle_rad and torque_N.m, or displacement_m and force_N (the first line is {first!r}); add that header"
-    )
-
-
-def _told_of_tables(below: list[str]) -> list[str]:
-    """A note if further tables of tests are below the first one."""
-    more = sum(map(_begins_a_table, below))
-    if not more:
-        return []
-    return [f"the file holds {more + 1} tables of a test: the first is read; give each a file of its own"]
-
-
-def _begins_a_table(line: str) -> bool:
-    found = _heading(split_line(line.lstrip("# "))[1])
-    return "time" in found and any(set(f) <= set(found) for f in FORMS)
-
-
-def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
-    """Quantity -> place and unit of the first cell that names it; a step time comes before other times."""
-    found: dict[str, tuple[int, str | None]] = {}
-    for k, cell in sorted(enumerate(cells), key=lambda each: not _is_own_time(each[1])):
-        text = cell.strip().strip('"')
-        bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", text) if not text.lower().endswith("(t)") else None
-        unit = bracket.group(1) if bracket else None
-        name = (text[: bracket.start()] if bracket else text).replace("_", " ").strip()
-        for word, quantity in WORDS:
-            if name.lower().startswith(word):
-                rest = name[len(word) :].strip()
-                if rest and not _known_column(quantity, rest):
-                    break  # "strain rate", "stress (step)"
-                found.setdefault(quantity, (k, unit or rest or None))
-                break
-    return found
-
-
-def _is_own_time(cell: str) -> bool:
-    return cell.strip('" ').replace("_", " ").lower().startswith(OWN_TIME)
-
-
-def _told_of_times(cells: list[str]) -> list[str]:
-    """A note if the header has two times."""
-    if not any(map(_is_own_time, cells)) or not any("time" in _heading([c]) and not _is_own_time(c) for c in cells):
-        return []
-    return ["the times are those of the column Step time; the column Time counts from another beginning"]
-
-
-def _plain_heading(unit: str) -> str:
-    return unit.replace("µ", "u").replace("μ", "u").replace("·", ".").replace("⋅", ".").strip('[]() "')
-
-
-def _known_column(quantity: str, unit: str) -> bool:
-    return _plain_heading(unit) in TIME_TEST_UNITS[quantity]
-
-
-def _rows_in_time(path, lines, k, delimiter, found):
-    """Numbers below the header, the units of a unit line, and notes. An empty cell is NaN."""
-    kept, numbers, units, notes = [], [], {}, []
-    needed = {q: place for q, (place, _) in found.items()}
-    while k < len(lines):
-        line = lines[k]
-        k += 1
-        _, cells = split_line(line, delimiter)
-        own = [cells[p] if p < len(cells) else "" for p in needed.values()]
-        if not means_nothing(own):
-            kept.append(own)
-            numbers.append(k)
-            continue
-        named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
-        if not kept and named:  # unknown units are kept here, and refused later
-            units = {q: cells[p].strip('[]() "') for q, p in needed.items() if p < len(cells) and cells[p].strip()}
-        elif kept and any(c.strip().lower() not in EMPTY for c in own) and not line.lstrip().startswith("#"):
-            if not _rows_follow(lines[k:], delimiter, list(needed.values())):
-                break
-            notes.append(f"line {k}, {line.strip()[:40]!r}, has no numbers and is left out")
-    sign = decimal_sign(cell for own in kept for cell in own)
-    rows = [[to_number(cell, delimiter, sign) for cell in own] for own in kept]
-    for number, row in zip(numbers, rows, strict=True):
-        if any(v is None for v in row):
-            shown = lines[number - 1].strip()[:40]
-            raise InputError(f"{path}: line {number}: {shown!r} has a cell that is no number; correct or remove it")
-    if len(rows) < 4:
-        raise InputError(f"{path}: {len(rows)} rows of numbers are below the header; give four or more")
-    return rows, units, notes
-
-
-def _rows_follow(below: list[str], delimiter: str, places: list[int]) -> bool:
-    """Whether numbers of the same table follow."""
-    for line in below:
-        if _begins_a_table(line):
-            return False
-        cells = split_line(line, delimiter)[1]
-        if not means_nothing([cells[p] if p < len(cells) else "" for p in places]) and line.strip():
-            return True
-    return False
-
-
-def _in_si(path, found, rows, units):
-    notes, columns = [], {}
-    for j, (quantity, (_, unit)) in enumerate(found.items()):
-        unit = units.get(quantity) or unit
-        if unit is None:
-            unit = next(iter(TIME_TEST_UNITS[quantity]))
-            notes.append(f"the column of {quantity} states no unit; {unit} is taken")
-        if not _known_column(quantity, unit):
-            raise InputError(
-                f"{path}: unit {unit!r} of {quantity} is not known; use {', '.join(TIME_TEST_UNITS[quantity])}"
-            )
-        columns[quantity] = rows[:, j] * TIME_TEST_UNITS[quantity][_plain_heading(unit)]
-    good = np.all(np.isfinite(rows), axis=1)
-    if not good.all():
-        notes.append(f"{(~good).sum()} of {len(good)} rows are left out: a cell in them is empty or not finite")
-    return {q: v[good] for q, v in columns.items()}, notes
 
 
 def _as_a_step(path, time, modulus, ramp):

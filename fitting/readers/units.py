@@ -35,10 +35,10 @@ TIME_TEST_UNITS = {
     "compliance": {"1/Pa": 1.0} | _PER_PA,
     "strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},
     "stress": {"Pa": 1.0} | MODULUS_UNITS,
-    "torque": {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm": 1e-6},
+    "torque": _TORQUE,
     "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
-    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
-    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
+    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "kN": 1e3},
+    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2},
 }
 #: Units of indentation curves.
 INDENTATION_UNITS = {

@@ -196,14 +196,16 @@ def _of_map(drawn: WaveMap) -> Content:
 def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     told, each = _sign(organ, found), found.whole if found.parts is None else found.parts
     told += _of_scales(organ, found)
+    any_coarse = False
     order = components.order_sentence(organ.field)
     if order is not None:
         told.insert(0, order)
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
             continue
-        told += _of_residuals(hertz, each, f, "regions" if found.parts else "moduli")
-        told += _of_voxel_size(hertz, found, f)
+        coarse = _of_voxel_size(hertz, found, f)
+        told += coarse + _of_residuals(hertz, each, f, "regions" if found.parts else "moduli", bool(coarse))
+        any_coarse |= bool(coarse)
         told += _of_long_waves(hertz, found, f)
     if found.parts is not None and found.labels is not None:
         few = ~(found.parts.standard_errors.real < np.abs(found.parts.modulus)).all(axis=0)
@@ -219,7 +221,8 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     # The mean of n squares scatters by the root of 2/n; the noise that divides them is an estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
-            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: edges sharper than the map, a ratio "
+            f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: "
+            f"{'coarse voxels (mesh_bias), ' if any_coarse else ''}edges sharper than the map, a ratio "
             "of the moduli at several frequencies that is not the same everywhere, or a body that does not move like a "
             "viscous solid; its deviations are too small then, so compare it with regions and with one frequency alone"
         )
@@ -271,19 +274,24 @@ def _modulus_named(found: Found, r: int) -> str:
     return f"the modulus of region {found.labels[r]}"
 
 
-def _of_residuals(hertz: float, each: Regions, f: int, uniform: str) -> list[str]:
-    """Sentences on residuals that are too large, or alike in neighbouring voxels."""
+def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: bool) -> list[str]:
+    """Sentences on residuals that are too large, or alike in neighbouring voxels.
+
+    `coarse`: the size of the voxels changes a modulus by more than its error. Then it comes first among the causes.
+    """
     told, ratio = [], each.chi2[f] / each.components
     alike = f < len(each.correlations) and each.correlations[f].seen
     if alike:
         told.append(
             f"{hertz:g} Hz: neighbouring voxels share their residuals (correlation {each.correlations[f].beyond:.2g} "
-            "above that of independent noise): the data are smoothed, or the organ is less uniform than its "
+            f"above that of independent noise): {'the voxels are coarse (mesh_bias), ' if coarse else ''}the data are "
+            "smoothed, or the organ is less uniform than its "
             f"{uniform}; standard errors are enlarged {each.noise_factor[f].max():.3g} times, those of a map are not"
         )
     if ratio > WRONG:
         told.append(
-            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: unless the data are smoothed, the "
+            f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: unless the data are smoothed"
+            f"{' or the voxels coarse' if coarse else ''}, the "
             "moduli may be wrong by more than their errors; look for voxels that were not measured, and at the labels"
         )
     elif ratio > TOO_FAR and not alike:

@@ -68,6 +68,21 @@ def shares(law: Law, strain: float) -> Shares:
     return Shares(relaxing, relaxing + a**4 * s / G)
 
 
+def incompressible(law: Law, strain: float) -> float | None:
+    """`Shares.relaxing` of the same law if the sample keeps its volume: s is then that of the law without U(J).
+
+    None for a law that has no part without volume.
+    """
+    _refuse_directions(law)
+    axial, own = 1 - strain, law.isochoric_part()
+    if own is None or strain == 0:
+        return None
+    a = 1 / np.sqrt(axial)
+    side, _, s = _cauchy(own, a, axial)
+    s -= side  # the pressure that leaves the side free of force
+    return float(a**6 * s / (axial**2 - a**2) / float(np.asarray(law.shear_modulus())))
+
+
 def side_stretch(law: Law, strain: float) -> float:
     """Stretch along the radius of a cylinder that is compressed by `strain` between smooth plates."""
     _refuse_directions(law)

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fitting.readers.time_tests import TimeTest, from_rest, of_columns, read_columns
+from fitting.readers.tables.time_columns import read_columns
+from fitting.readers.time_tests import TimeTest, from_rest, of_columns
 from fitting.rigs import glued, thin_layer
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError

@@ -154,14 +154,20 @@ def indentation(
 ) -> Rig:
     """A glued flat punch of radius `punch` [m] pressed into a cylinder by `depths` (T,) [m]; its force is read.
 
+    A negative depth pulls.
+
     Args:
         radius, height, dt, cell_size: as in `tension`; a ring of nodes is at the punch's edge.
 
     Raises:
-        InputError: as in `tension`; a punch wider than the sample, or far narrower.
+        InputError: as in `tension`; a punch wider than the sample, or far narrower; depths beyond the sample.
     """
     depths = _finite_history("depths", depths)
     cells = _cells(radius, height, dt, cell_size)
+    if depths.max() >= 0.9 * height:
+        raise InputError(
+            f"depths reach {depths.max():g} m of a height of {height:g} m: keep them below {0.9 * height:g} m"
+        )
     if not NARROWEST * radius <= punch <= (1 - NARROWEST) * radius:
         raise InputError(
             f"punch = {punch:g} m must be between {NARROWEST:g} and {1 - NARROWEST:g} of the radius {radius:g}: change "
@@ -179,7 +185,14 @@ def creep(
     """A cylinder under a constant pull `stress` [Pa] on its top from time 0 on; the top's mean displacement is read.
 
     The pull grows during the first step, as it does in a rheometer. The mean is taken over the area.
+
+    Raises:
+        InputError: as in `tension`; no steps, or a stress that is not finite.
     """
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+        raise InputError(f"steps = {steps!r} must be a whole number, 1 or more")
+    if not np.isfinite(stress):
+        raise InputError(f"stress = {stress!r} must be finite: give the pull in Pa")
     cells = _cells(radius, height, dt, cell_size)
     rim = cells.rim * min(radius, height)
     sample = _sample({radius: rim}, {0.0: rim, height: height}, cells)

@@ -83,7 +83,7 @@ def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
     several = isinstance(thing, tuple) or np.ndim(thing)
     if word.isdigit() and several and int(word) < len(thing):
         return [int(word)], rest
-    raise InputError(f"{refusal}: {word!r} leads nowhere")
+    raise InputError(f"{refusal}: {_nowhere(word, len(thing) if several else 0)}")
 
 
 def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
@@ -101,4 +101,11 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, li
             known += dict.fromkeys(part.section for part in getattr(thing, field.name))
         elif unnamed and (word.isdigit() or not isinstance(getattr(thing, field.name), tuple)):
             return [field.name], path
-    raise InputError(f"{refusal}: {hint(word, known) if known else f'{word!r} leads nowhere'}")
+    if known:
+        raise InputError(f"{refusal}: {hint(word, known)}")
+    places = next((len(getattr(thing, f.name)) for f in fields if isinstance(getattr(thing, f.name), tuple)), 0)
+    raise InputError(f"{refusal}: {_nowhere(word, places)}")
+
+
+def _nowhere(word: str, places: int) -> str:
+    return f"{word!r} leads nowhere" + (f": it has places 0 to {places - 1}" if places else "")

@@ -102,7 +102,8 @@ def same(identity: Mapping[str, object], file: Path) -> None:
     for key, value in json.loads(file.read_text()).items():
         if identity.get(key) != value:
             raise InputError(
-                f"{file.parent} holds parts of another {file.stem} (its {key} differ): name another --out, or remove it"
+                f"{file.parent} holds parts of another {file.stem} (not the same {key}): name another --out, or remove "
+                "it"
             )
 
 

@@ -20,6 +20,7 @@ from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
 from fitting.methods.uncertainty import equilibrium_error
+from liverjax.core.struct import Content
 
 #: Longest and shortest relaxation time, over the ends of what the test resolves.
 BEYOND = 10.0
@@ -165,7 +166,7 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
         return fit
     model = fit.model._replace(shear_modulus=np.asarray(fit.model.shear_modulus) / factor)
     error = equilibrium_error(fit.uncertainty)
-    details = fit.details or {}
+    details: Content = fit.details or {}
     points = sum(len(together.reported_numbers(test)[1]) for test in tests)
     independent = details.get(time_tests.INDEPENDENT, points) / points
     found = equilibrium_interval(tests, noises, model, error / factor, independent)
@@ -173,14 +174,18 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
         return fit
     low, high = factor * found.low, factor * found.high
     rest = max(0.0, float(fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))))
-    told = _told_interval((low, rest, high), fit.uncertainty.quantile * error, found, float(fit.model.shear_modulus))
+    errors, whole = (error, fit.uncertainty.quantile * error), float(fit.model.shear_modulus)
+    told: list[str] = _told_interval((low, rest, high), errors, found, whole)
     numbers = {"low": low, "high": high, "longest_relaxation_time": found.longest, "modes": found.modes}
     details = details | {INTERVAL: numbers | {"wider_than_standard_error": bool(told)}}
     return fit._replace(details=details, warnings=(*fit.warnings, *told))
 
 
-def _told_interval(ends: tuple[float, float, float], half: float, found: Interval, whole: float) -> list[str]:
-    low, rest, high = ends
+def _told_interval(
+    ends: tuple[float, float, float], errors: tuple[float, float], found: Interval, whole: float
+) -> list[str]:
+    """A sentence if the `ends` (low, value, high) are farther away than the standard error and its 95 % half width."""
+    (low, rest, high), (error, half) = ends, errors
     where = f"if parts of the material relax in up to {found.longest:.3g} s"
     if rest <= 1e-9 * whole:
         if high < LARGE * whole:
@@ -193,5 +198,5 @@ def _told_interval(ends: tuple[float, float, float], half: float, found: Interva
         return []
     return [
         f"{SHORT}: {where}, the equilibrium modulus is {low:.3g} to {high:.3g} Pa (95 %); {rest:.4g} ± "
-        f"{half / 2:.2g} Pa is that of the modes that were chosen"
+        f"{error:.2g} Pa is that of the modes that were chosen"
     ]
