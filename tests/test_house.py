@@ -22,9 +22,9 @@ TREES = {_module(file): ast.parse(file.read_text()) for file in FILES}
 
 
 def _imported(tree: ast.Module) -> set[str]:
-    """Modules of the project that are imported when a module is (not inside its functions)."""
+    """Modules of the project that a module imports, for its types too, but not those inside its functions."""
     found = set()
-    for node in tree.body:
+    for node in (*tree.body, *(n for own in tree.body if isinstance(own, ast.If) for n in own.body)):
         if isinstance(node, ast.ImportFrom) and node.module:
             names = {f"{node.module}.{a.name}" for a in node.names}
             # `from liverjax import mesh` asks for the module, not for all that the package offers.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from liverjax.laws.base import autodiff_derivatives
+from liverjax.laws.derivatives import autodiff_derivatives
 from liverjax.tensors.matrices import Invariants
 
 pytestmark = pytest.mark.quick_to_compile

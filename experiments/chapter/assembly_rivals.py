@@ -73,7 +73,7 @@ def standard(mesh: TetMesh, law: Any, x: jax.Array, write: bool = False) -> tupl
     """Standard finite elements: B^T D B and D_a . S D_b, with C^-1 in S and D (Zienkiewicz and Taylor 2000)."""
     keep = _kept(write)
     F = keep(deformation_gradient(mesh, x))
-    axes = green_terms.material_axes(law, F[0][0])
+    axes = law.material_axes(F[0][0])
     turned = law.fibre is not None
     FA = matmul(F, axes) if turned else F
     D = [matvec(transpose(axes), d) if turned else d for d in _shape_vectors(mesh)]

@@ -17,8 +17,10 @@ import jax.numpy as jnp
 from liverjax.core.struct import Number
 from liverjax.laws.base import Law
 from liverjax.laws.derivatives import accumulate
+from liverjax.laws.energies import fibre_invariants
 from liverjax.laws.terms import green_terms, invariant_terms
 from liverjax.laws.terms.invariant_terms import Scalars
+from liverjax.tensors.directions import components
 from liverjax.tensors.matrices import (
     Matrix,
     Vector,
@@ -103,9 +105,9 @@ def blocks(
     metric = None if S is None else projected(S)
     for weight, law in parts:
         slopes, curvatures = law.energy_derivatives(law.measures(F))
-        fibres = invariant_terms.fibre_invariants(law.summands())
+        fibres = fibre_invariants(law.summands())
         for key, part in fibres.items():
-            a = green_terms.components(part.fibre, F[0][0])
+            a = components(part.fibre, F[0][0])
             added.append(_fibre(weight * slopes[key], weight * curvatures.get((key, key), 0.0), a, F, D, pairs))
         _gather(first, weight, {k: v for k, v in slopes.items() if k not in fibres})
         _gather(second, weight, {k: v for k, v in curvatures.items() if not set(k) & set(fibres)})

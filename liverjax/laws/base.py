@@ -20,76 +20,19 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Content, Number, Numbers, param, replace, static, struct
-from liverjax.laws.derivatives import First, Second, accumulate, autodiff_derivatives, reduced, split_derivatives
+from liverjax.core.struct import Number, param, replace, static, struct
+from liverjax.laws.derivatives import accumulate
+from liverjax.laws.energies import Energies, fibre_invariants
 from liverjax.laws.terms import invariant_terms
-from liverjax.laws.terms.green_terms import components, material_axes
-from liverjax.laws.terms.invariant_terms import fibre_invariants
 from liverjax.laws.volumetric import volumetric
 from liverjax.tensors.matrices import (
-    Invariants,
-    Matrix,
-    determinant,
-    dot,
-    green_strain,
-    invariants,
-    matmul,
-    matvec,
     pack,
     unpack,
 )
-from liverjax.tensors.principal import power_sum, stretches
 
 
-class Law:
+class Law(Energies):
     """A hyperelastic law: energy per reference volume [Pa]. The module's docstring says which methods to override."""
-
-    invariants: ClassVar[tuple[str, ...]] = ("I1", "J")
-    #: Every law is a struct, so `dataclasses.replace` works on it.
-    __dataclass_fields__: ClassVar[Content]
-    #: The energies of a law; None: it has none of that kind.
-    isochoric_energy: Any = None
-    stretch_energy: Any = None
-    green_energy: Any = None
-    #: Their derivatives by hand; None: by automatic differentiation.
-    isochoric_derivatives: Any = None
-    stretch_derivatives: Any = None
-    green_derivatives: Any = None
-    #: The powers of a `stretch_energy`.
-    exponents: Any
-    #: Fields of the volumetric energy U(J), and of directions; None: the law has none.
-    bulk: Number | None = None
-    volumetric: str
-    fibre: Numbers | None = None
-    sheet: Numbers
-    #: Which elements have which law (`liverjax.tensors.subsets.Subsets`); None: one law everywhere.
-    subsets: Any = None
-
-    # -- what a law states -------------------------------------------------------------------------------------------
-
-    def strain_energy(self, I: Invariants) -> Any:
-        """Energy density [Pa] at the invariants that the law names."""
-        W = 0.0
-        if self.isochoric_energy is not None:
-            W = W + self.isochoric_energy(*reduced(I))
-        if self.stretch_energy is not None:
-            W = W + self.stretch_energy(*(power_sum(I.stretches, a) for a in self.exponents()))
-        if self.green_energy is not None:
-            W = W + self.green_energy(I.E)
-        U = self.volumetric_part()
-        return W if U is None else W + U.strain_energy(I)
-
-    def energy_derivatives(self, I: Invariants) -> tuple[First, Second]:
-        """dW/dI_a and d2W/dI_a dI_b of scalar invariants; a missing key is a structural zero and costs nothing."""
-        if type(self).strain_energy is not Law.strain_energy:
-            return autodiff_derivatives(self, I)
-        first, second = split_derivatives(self, I) if self.isochoric_energy is not None else ({}, {})
-        U = self.volumetric_part()
-        if U is not None:
-            slope, curvature = U.energy_derivatives(I)
-            accumulate(first, "J", slope["J"])
-            accumulate(second, ("J", "J"), curvature["J", "J"])
-        return first, second
 
     def shear_modulus(self) -> Any:
         """Ground-state shear modulus [Pa]."""
@@ -97,7 +40,7 @@ class Law:
 
     def bulk_modulus(self) -> Any:
         """Ground-state bulk modulus [Pa]: `bulk`, if all other energies of the law are isochoric."""
-        if type(self).strain_energy is not Law.strain_energy or self.green_energy is not None:
+        if type(self).strain_energy is not Energies.strain_energy or self.green_energy is not None:
             raise InputError(
                 f"law {type(self).__name__} states no ground-state bulk modulus: define bulk_modulus(self)"
             )
@@ -107,18 +50,6 @@ class Law:
         """Raise `InputError` if the values of two fields contradict each other."""
 
     # -- what a law is made of ----------------------------------------------------------------------------------------
-
-    def summands(self) -> tuple["Law", ...]:
-        """The laws that add up to this one: itself, unless it is a sum."""
-        return (self,)
-
-    def pieces(self) -> tuple["Law", ...]:
-        """The laws of the parts of the body: itself, unless regions have laws of other kinds."""
-        return (self,)
-
-    def piece(self, k: int) -> "Law":
-        """The law of part k of the body, with the numbers of its elements."""
-        return self
 
     def each(self, change: Callable[["Law"], "Law"]) -> "Law":
         """Apply `change` to the law of every part of the body."""
@@ -143,18 +74,6 @@ class Law:
         return replace(self, bulk=None) if apart else self
 
     # -- what a law can then do --------------------------------------------------------------------------------------
-
-    def measures(self, F: Matrix) -> Invariants:
-        """The arguments of `strain_energy` at the tuple matrix F."""
-        I = invariants(self.invariants, F)
-        if "I4" in self.invariants:
-            Fa = matvec(F, components(self.fibre, F[0][0]))
-            I = I._replace(I4=dot(Fa, Fa))
-        if self.green_energy is not None:
-            I = I._replace(E=green_strain(matmul(F, material_axes(self, F[0][0]))))
-        if self.stretch_energy is not None:
-            I = I._replace(stretches=stretches(F))
-        return I if self.bulk is None else I._replace(J=determinant(F))
 
     def energy(self, F: jax.Array) -> jax.Array:
         """Strain energy density [Pa], shape (...), of deformation gradients (..., 3, 3)."""

@@ -5,13 +5,14 @@ roundoff at a cost that does not grow with the number of products. `liverjax.law
 products.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from liverjax.core.struct import Number, T
 from liverjax.laws import products
+from liverjax.laws.energies import Energies
 from liverjax.tensors.matrices import (
     IDENTITY,
     Matrix,
@@ -30,9 +31,6 @@ from liverjax.tensors.matrices import (
     stored,
     transpose,
 )
-
-if TYPE_CHECKING:
-    from liverjax.laws.base import Law
 
 
 class _Term(NamedTuple):
@@ -75,7 +73,7 @@ class _At(NamedTuple):
     groups: list  # (terms, phi', phi'')
 
 
-def _state_at(law: "Law", F: Matrix) -> _At:
+def _state_at(law: Energies, F: Matrix) -> _At:
     C, I = right_cauchy_green(F), invariants(("I1", "I2", "J"), F)
     B = tuple(tuple((I.I1 if r == c else 0.0) - C[r][c] for c in range(3)) for r in range(3))
     groups = []
@@ -94,7 +92,7 @@ def _stress_of_product(t: _Term, s: _At) -> Matrix:
     return add_matrices(scale_matrix(2 * t.g1, IDENTITY), scale_matrix(2 * t.g2, s.B))
 
 
-def first_piola(law: "Law", F: Matrix) -> Matrix:
+def first_piola(law: Energies, F: Matrix) -> Matrix:
     """sum_k phi' (h' g cof F + h F S^k) [Pa]."""
     s = _state_at(law, F)
     total = scale_matrix(0.0, F)
@@ -120,7 +118,7 @@ class Layout(NamedTuple):
 
 
 def blocks(
-    law: "Law",
+    law: Energies,
     F: Matrix,
     D: list[Vector],
     pairs: tuple,

@@ -1,11 +1,11 @@
 """Hand-derived stress and stiffness of laws w(E) of Green's strain in the axes of the material."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from liverjax.core.errors import InputError
+from liverjax.laws.energies import Energies
 from liverjax.tensors.material_axes import (
     SIX,
     anisotropic,
@@ -17,13 +17,9 @@ from liverjax.tensors.material_axes import (
     symmetric,
 )
 from liverjax.tensors.matrices import (
-    IDENTITY,
     Matrix,
     Vector,
-    add,
     add_matrices,
-    cross,
-    dot,
     green_strain,
     matmul,
     matvec,
@@ -31,11 +27,7 @@ from liverjax.tensors.matrices import (
     scale,
     stored,
     transpose,
-    unit,
 )
-
-if TYPE_CHECKING:
-    from liverjax.laws.base import Law
 
 
 class GreenModuli(NamedTuple):
@@ -46,33 +38,15 @@ class GreenModuli(NamedTuple):
     curvature: jax.Array
 
 
-def components(direction: Any, like: Any) -> Vector:
-    """A direction (3,), or one per element (E, 3), as the components of a unit vector in the precision of `like`."""
-    direction = jnp.asarray(direction, jnp.result_type(like))
-    shape, elements = direction.shape, jnp.shape(like)
-    if shape[-1:] != (3,) or (len(shape) > 1 and elements and shape[-2] != elements[-1]):
-        raise InputError(f"a direction has shape {shape}: give (3,) or one row of 3 per element, {(*elements, 3)}")
-    return unit(tuple(direction[..., i] for i in range(3)))
-
-
-def material_axes(law: "Law", like: Any) -> Matrix:
-    """Columns fibre, sheet (made orthogonal to it) and normal; the coordinate axes if the law has no fibre."""
-    if law.fibre is None:
-        return IDENTITY
-    f, s = components(law.fibre, like), components(law.sheet, like)
-    s = unit(add(s, scale(-dot(f, s), f)))
-    return transpose((f, s, cross(f, s)))
-
-
-def stress(law: "Law", F: Matrix) -> Matrix:
+def stress(law: Energies, F: Matrix) -> Matrix:
     """Second Piola-Kirchhoff stress [Pa] of w alone."""
-    A = material_axes(law, F[0][0])
+    A = law.material_axes(F[0][0])
     return rotated(_stress_of_strain(law, green_strain(matmul(F, A))), A)
 
 
-def blocks(law: "Law", F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
+def blocks(law: Energies, F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
-    A = material_axes(law, F[0][0])
+    A = law.material_axes(F[0][0])
     FA = matmul(F, A)
     E, turned = green_strain(FA), [matvec(transpose(A), d) for d in D]
     if law.green_derivatives is None:
@@ -89,7 +63,7 @@ def blocks(law: "Law", F: Matrix, D: list[Vector], pairs: tuple) -> list[Matrix]
     ]
 
 
-def _stress_of_strain(law: "Law", E: Matrix) -> Matrix:
+def _stress_of_strain(law: Energies, E: Matrix) -> Matrix:
     if law.green_derivatives is not None:
         return law.green_derivatives(E)[0]
     return symmetric(tuple(_slopes(lambda six: law.green_energy(symmetric(six)), six_of(E))))
@@ -105,7 +79,7 @@ def _slopes(function: Any, six: tuple) -> list:
     return result
 
 
-def _autodiff_moduli(law: "Law", E: Matrix) -> list[list]:
+def _autodiff_moduli(law: Energies, E: Matrix) -> list[list]:
     six = six_of(E)
     return [
         _slopes(lambda six, a=a: _slopes(lambda six: law.green_energy(symmetric(six)), six)[a], six) for a in range(6)

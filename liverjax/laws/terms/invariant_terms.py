@@ -7,12 +7,14 @@ Chapter, section 4.1.2, contracted: with J as one more invariant and v_a,i = dI_
 No matrix is inverted. Energies of stretches and of Green's strain add their stress to S and their moduli to the blocks.
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from liverjax.laws.energies import Energies, fibre_invariants
 from liverjax.laws.terms import green_terms, stretch_terms
+from liverjax.tensors.directions import components
 from liverjax.tensors.matrices import (
     Matrix,
     Vector,
@@ -32,9 +34,6 @@ from liverjax.tensors.matrices import (
 )
 from liverjax.tensors.principal import principal
 from liverjax.tensors.subsets import Subsets, in_subset, put_together
-
-if TYPE_CHECKING:
-    from liverjax.laws.base import Law
 
 
 class Stress(NamedTuple):
@@ -75,7 +74,7 @@ class Pieces(NamedTuple):
     cof: Matrix
 
 
-def state(law: "Law", F: Matrix) -> State | Pieces:
+def state(law: Energies, F: Matrix) -> State | Pieces:
     """The invariants and derivatives of the law (`liverjax.laws.base.Law`) at F."""
     if law.subsets is not None:
         own = (_state_of_law(law.piece(k), in_subset(law.subsets, k, F)) for k in range(len(law.pieces())))
@@ -83,7 +82,7 @@ def state(law: "Law", F: Matrix) -> State | Pieces:
     return _state_of_law(law, F)
 
 
-def _state_of_law(law: "Law", F: Matrix) -> State:
+def _state_of_law(law: Energies, F: Matrix) -> State:
     return _state(Scalars(*law.energy_derivatives(law.measures(F))), F, law.summands())
 
 
@@ -98,16 +97,9 @@ def _state(scalars: Scalars, F: Matrix, laws: tuple) -> State:
     cof = cofactor(F)
     C = right_cauchy_green(F) if "I2" in first else None
     I1 = None if C is None else C[0][0] + C[1][1] + C[2][2]
-    fibres = {key: green_terms.components(part.fibre, F[0][0]) for key, part in fibre_invariants(laws).items()}
+    fibres = {key: components(part.fibre, F[0][0]) for key, part in fibre_invariants(laws).items()}
     frame = principal(F) if any(part.stretch_energy is not None for part in laws) else None
     return State(laws, F, C, cof, I1, dot(F[0], cof[0]), first, second, fibres, frame)
-
-
-def fibre_invariants(laws: tuple) -> dict[str, Any]:
-    """Name of each invariant a . C a in a sum of laws -> its law; every law has its own fibre a."""
-    if len(laws) == 1:
-        return {"I4": laws[0]} if "I4" in laws[0].invariants else {}
-    return {f"I4.{k}": law for k, law in enumerate(laws) if "I4" in law.invariants}
 
 
 def stress(s: State | Pieces) -> Stress:
@@ -175,7 +167,7 @@ def second_piola(F: Matrix, resultant: Stress) -> Matrix:
     return tuple(tuple(entry(min(i, j), max(i, j)) for j in range(3)) for i in range(3))
 
 
-def first_piola(law: "Law", F: Matrix) -> Matrix:
+def first_piola(law: Energies, F: Matrix) -> Matrix:
     """First Piola-Kirchhoff stress [Pa] of a tuple matrix F."""
     s = state(law, F)
     return piola(F, s.cof, stress(s))

@@ -12,13 +12,14 @@ Values come from these formulas. Their derivatives come from the energy expanded
 """
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from liverjax.core.struct import Number
+from liverjax.laws.energies import Energies
 from liverjax.tensors.material_axes import (
     PAIRS,
     SIX,
@@ -31,9 +32,6 @@ from liverjax.tensors.material_axes import (
 )
 from liverjax.tensors.matrices import Matrix, Vector, add, determinant, dot, matmul, stored, transpose
 from liverjax.tensors.principal import change, expanded_power_sum, principal, sinh_ratio
-
-if TYPE_CHECKING:
-    from liverjax.laws.base import Law
 
 #: Logarithms of the principal stretches and their axes (`liverjax.tensors.principal`): constants of differentiation.
 Frame = tuple[Vector, Matrix]
@@ -53,7 +51,7 @@ class Principal(NamedTuple):
     tau: list  # dw / d ln lambda_m
 
 
-def stretch_slopes(law: "Law", X: tuple) -> tuple[tuple, dict]:
+def stretch_slopes(law: Energies, X: tuple) -> tuple[tuple, dict]:
     """dw/dX_k and {(k, l): d2w/dX_k dX_l}: by hand where the law has them, else by scalar automatic differentiation."""
     if law.stretch_derivatives is not None:
         return law.stretch_derivatives(*X)
@@ -67,7 +65,7 @@ def stretch_slopes(law: "Law", X: tuple) -> tuple[tuple, dict]:
     return tuple(slope(k)(*X) for k in range(n)), second
 
 
-def _at_stretches(law: "Law", F: Matrix, frame: Frame) -> Principal:
+def _at_stretches(law: Energies, F: Matrix, frame: Frame) -> Principal:
     logs, axes = frame
     mean_log = jnp.log(determinant(F)) / 3  # NaN for J < 0
     d = [e - mean_log for e in logs]
@@ -104,24 +102,24 @@ def _principal_moduli(s: Principal) -> tuple[Matrix, Vector]:
 # -- stress and moduli -------------------------------------------------------------------------------------------------
 
 
-def stress(law: "Law", F: Matrix, frame: Frame) -> Matrix:
+def stress(law: Energies, F: Matrix, frame: Frame) -> Matrix:
     """Second Piola-Kirchhoff stress [Pa] of w alone (no volumetric part), with `frame` = `principal(F)`."""
     return symmetric(_stress(_arrays(law, F), F, frame))
 
 
-def moduli(law: "Law", F: Matrix, frame: Frame) -> list[list]:
+def moduli(law: Energies, F: Matrix, frame: Frame) -> list[list]:
     """dS/dE [Pa] of w alone, 6 x 6 components in the coordinate axes, with `frame` = `principal(F)`."""
     return _square(_moduli_of_axes(_arrays(law, F), F, frame))
 
 
-def blocks(law: "Law", F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
+def blocks(law: Energies, F: Matrix, frame: Frame, D: list[Vector], pairs: tuple) -> list[Matrix]:
     """Material part of d2w/dx_i dx_j for pairs of indices into the shape vectors D."""
     C = stored(moduli(law, F, frame))
     half = stored([half_contracted(C, d) for d in D])
     return [pushed(F, anisotropic(half[j], D[i])) for i, j in pairs]
 
 
-def _arrays(law: "Law", F: Matrix) -> jax.Array:
+def _arrays(law: Energies, F: Matrix) -> jax.Array:
     """The law with its parameters in the precision of F, since whole numbers have no derivative."""
     return jax.tree.map(lambda v: jnp.asarray(v, jnp.result_type(F[0][0])), law)
 
@@ -138,13 +136,13 @@ def _square(upper: tuple) -> list[list]:
 # function if only a linear argument were unknown (forward over reverse mode).
 
 
-def stress_at_constant(law: "Law", F: Matrix) -> Matrix:
+def stress_at_constant(law: Energies, F: Matrix) -> Matrix:
     """`stress` for an F that is data. Its axes do not move, so plain differentiation by parameters is right."""
     return symmetric(_stress.fun(_arrays(law, F), F, principal(F)))
 
 
 @jax.custom_jvp
-def _stress(law: "Law", F: Matrix, frame: Frame) -> tuple:
+def _stress(law: Energies, F: Matrix, frame: Frame) -> tuple:
     s = _at_stretches(law, F, frame)
     diagonal = tuple(t * c for t, c in zip(s.tau, s.inverse, strict=True))
     scaled_axes = tuple(tuple(n * d for n, d in zip(row, diagonal, strict=True)) for row in s.axes)
@@ -167,7 +165,7 @@ def _(primals, tangents):
 
 
 @jax.custom_jvp
-def _moduli_of_axes(law: "Law", F: Matrix, frame: Frame) -> tuple:
+def _moduli_of_axes(law: Energies, F: Matrix, frame: Frame) -> tuple:
     s = _at_stretches(law, F, frame)
     normal, shear = _principal_moduli(s)
     n = transpose(s.axes)
@@ -207,7 +205,7 @@ def _vanishes(t: Number) -> bool:
 # -- the same from the expanded energy, slower, to be differentiated --------------------------------------------------
 
 
-def _expanded_energy(law: "Law", logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
+def _expanded_energy(law: Energies, logs: Vector, axes: Matrix, log_J0: Number, Y: tuple) -> jax.Array:
     """w of C = diag(lambda^2) + N^T Y N in frozen principal axes N."""
     X = six_of(rotated(symmetric(Y), transpose(axes)))
     relative = [x * jnp.exp(-logs[i] - logs[j]) for x, (i, j) in zip(X, SIX, strict=True)]
@@ -216,7 +214,7 @@ def _expanded_energy(law: "Law", logs: Vector, axes: Matrix, log_J0: Number, Y: 
     return law.stretch_energy(*(expanded_power_sum(a, logs, X, log_J) for a in law.exponents()))
 
 
-def _energy_of_change(law: "Law", F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
+def _energy_of_change(law: Energies, F: Matrix, frame: Frame, orders: int) -> tuple[Any, tuple]:
     """The energy as a function of a change Y of C, and Y itself: zero, but differentiable `orders` times by F."""
     logs, axes = frame
     log_J0 = jax.lax.stop_gradient(jnp.log(determinant(F)))
@@ -233,12 +231,12 @@ def _strain_derivatives(function: Any, Y: tuple) -> jax.Array:
     return jax.vmap(along)(jnp.diag(jnp.array([2.0, 2.0, 2.0, 1.0, 1.0, 1.0], jnp.result_type(Y[0]))))
 
 
-def _expanded_stress(law: "Law", F: Matrix, frame: Frame) -> tuple:
+def _expanded_stress(law: Energies, F: Matrix, frame: Frame) -> tuple:
     energy, Y = _energy_of_change(law, F, frame, 2)
     return tuple(_strain_derivatives(energy, Y))
 
 
-def _expanded_moduli(law: "Law", F: Matrix, frame: Frame) -> tuple:
+def _expanded_moduli(law: Energies, F: Matrix, frame: Frame) -> tuple:
     energy, Y = _energy_of_change(law, F, frame, 1)
     C = _strain_derivatives(lambda Y: _strain_derivatives(energy, Y), Y)
     return tuple(C[a, b] for a, b in _UPPER)
