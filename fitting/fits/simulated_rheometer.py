@@ -11,7 +11,7 @@ import numpy as np
 
 from fitting.fits import sample_inertia
 from fitting.fits.honesty.long_times import INTERVAL
-from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, BestPoint, Fit, Kind, by_importance, fit_at, timed
+from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, SHORT, BestPoint, Fit, Kind, by_importance, fit_at, timed
 from fitting.methods import uncertainty
 from fitting.methods.estimate import Estimate, mesh_bias, with_shared_errors
 from fitting.methods.generalised_maxwell import Maxwell
@@ -161,9 +161,9 @@ OF_THE_DATA = (
     "half decade",
     "structured misfit",
     "poses as",
+    SHORT,
+    "a solid follows the data as well",
 )
-
-
 KEPT = (
     "conversion",
     "spectrum",
