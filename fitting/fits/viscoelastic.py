@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.methods import generalised_maxwell, host, uncertainty
-from fitting.methods.estimate import Estimate
+from fitting.methods.estimate import Estimate, errors_and_correlation, with_slope
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
+from fitting.methods.noise.uneven_noise import grouped_root
 from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
 from liverjax.core.errors import InputError
@@ -169,6 +170,9 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     if kind.values is not None:
         rows = (2 * len(storage), sweep.noise_given, kind.effective)
         own = uncertainty.estimated(kind.names, kind.values, found, *rows)
+    if not sweep.noise_given and kind.effective is None and len(found.residuals) == 2 * len(storage):
+        spread = _of_two_noises(spread, partial(uncertainty.parameter_vector, maxwell=kind.maxwell), found)
+        own = None if own is None or kind.values is None else _of_two_noises(own, kind.values, found)
     sentences = _misfit(sweep, storage, loss, kind)
     sentences += tuple(uncertainty.cautions(sweep, spread, kind.name) if own is None else ())
     converged = bool(found.converged)
@@ -180,6 +184,17 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     model = Maxwell(spread.values[0], spread.values[1 : modes + 1], spread.values[modes + 1 :])
     details = details | {"iterations": int(found.iterations), "gradient": float(found.gradient)}
     return Fit(at.method, model, found, spread, converged, storage, loss, sentences, *seconds, details, kind, own)
+
+
+def _of_two_noises(estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution) -> Estimate:
+    """The estimate with the errors of G' and G'' that have noise of their own, if their residuals show it."""
+    J, r = np.asarray(found.jacobian), np.asarray(found.residuals)
+    root = grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, with_slope(natural_of, found.u)[1])
+    if root is None:
+        return estimate
+    errors, correlation = errors_and_correlation(root)
+    errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
+    return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
 
 
 #: N modes without an equilibrium modulus: their ratios add up to one.

@@ -69,7 +69,7 @@ def estimated(
         r = r[:components]
     freedom = components - (len(u) if effective is None else effective)
     noise = noise_factor(r, freedom, deviations_given)
-    values, to_natural = _with_slope(natural_of, found.u)
+    values, to_natural = with_slope(natural_of, found.u)
     root, _ = spread(jacobian, noise, to_natural)
     errors, correlation = errors_and_correlation(root)
     # At a bound (a ratio of 0 or 1, a time of 0) the parametrisation has no slope: the error is unknown, not zero.
@@ -89,7 +89,7 @@ def estimated(
     )
 
 
-def _with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
+def with_slope(natural_of: Callable[[jax.Array], jax.Array], u: host.Array) -> tuple[np.ndarray, np.ndarray]:
     """The reported numbers (P,) and their derivative by u. If u is a NumPy array, nothing is compiled."""
     if isinstance(u, np.ndarray):
         with np.errstate(over="ignore", invalid="ignore"):  # the errors show that a fit diverged
@@ -166,7 +166,7 @@ def mesh_bias(found: Solution, natural_of: Callable[[jax.Array], jax.Array], mis
     It is of first order. It is accurate if the meshes' errors are below a quarter and the numbers are not nearly
     dependent. Subtract it once to correct.
     """
-    J, (_, to_natural) = np.asarray(found.jacobian), _with_slope(natural_of, found.u)
+    J, (_, to_natural) = np.asarray(found.jacobian), with_slope(natural_of, found.u)
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(missing))):
         return np.full(len(to_natural), np.nan)
     return to_natural @ (np.linalg.pinv(J) @ missing)

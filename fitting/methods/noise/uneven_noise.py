@@ -2,6 +2,7 @@
 
 import numpy as np
 import scipy.linalg
+import scipy.special
 
 #: Smallest noise, over the largest, of noise in proportion to a size.
 _LEAST = 1e-6
@@ -48,3 +49,34 @@ def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarr
     except np.linalg.LinAlgError:
         return none
     return slope @ (np.linalg.pinv(J) * np.sqrt(level * growing)) if better > equal else none
+
+
+#: Chance below which two groups of residuals have noise of their own; smallest condition of J at which it is tried.
+_CHANCE, _CONDITION = 1e-3, 1e-8
+
+
+def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.ndarray) -> np.ndarray | None:
+    """Square root (P, n) of the covariance of P numbers if two groups of residuals, G' and G'' say, have noise of their
+    own; None if they differ no more than by chance, or if some combination of u is hardly determined.
+
+    Args:
+        J, r, slope: as in `uneven_root`.
+        second: which residuals are of the second group (n,).
+    """
+    size = np.linalg.norm(J, axis=0)
+    if not (np.all(np.isfinite(J)) and np.all(size > 0)):
+        return None
+    values = np.linalg.svd(J / size, compute_uv=False)
+    if values[-1] < _CONDITION * values[0]:
+        return None
+    inverse = np.linalg.pinv(J / size) / size[:, None]
+    leverage = np.einsum("kn,nk->n", inverse, J)
+    freedom, square = (np.array([v[~second].sum(), v[second].sum()]) for v in (1 - leverage, r**2))
+    if not (np.all(freedom > 1) and np.all(square > 0)):
+        return None
+    variance = square / freedom
+    large, small = int(np.argmax(variance)), int(np.argmin(variance))
+    chance = scipy.special.fdtrc(freedom[large], freedom[small], variance[large] / variance[small])
+    if large == small or 2 * chance > _CHANCE:
+        return None
+    return slope @ (inverse * np.sqrt(variance)[second.astype(int)])
