@@ -8,7 +8,8 @@ import scipy.optimize
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.base import Step
+from liverjax.physics.contact.obstacle import Obstacle, contact_force, largest_depth
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.scenes.scene_file import scene_from
 
@@ -177,3 +178,51 @@ def test_a_light_force_is_balanced_to_the_roundoff_of_positions():
         found = lj.obstacle_forces(own, result).force[0, -1, 2]
         # Hardness times the roundoff of positions: some 1e4 N/m and 2e-18 m here.
         assert abs(float(found) / force - 1) < 1e-6
+
+
+def test_derivatives_where_a_surface_just_touches():
+    """A minimum has half the derivative at 0, all or none where the distance is rounded: 45 times too large in a run."""
+    mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
+    top = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]))
+    place = {"position": jnp.array([0.0, 0.0, SIDE]), "axis": jnp.array([0.0, 0.0, -1.0])}
+    flat = Obstacle(triangles=top, shape="plane", stiffness=1e6, **place)
+
+    def force(depth):
+        return jnp.sum(contact_force(flat, mesh, mesh.points, jnp.array([0.0, 0.0, -1.0]) * depth)[:, 2])
+
+    for derivative in (jax.grad, jax.jacfwd):
+        at_touch, pressed, apart = (float(derivative(force)(v)) for v in (0.0, 1e-9, -1e-6))
+        assert at_touch == pytest.approx(pressed, rel=1e-9)
+        assert at_touch == pytest.approx(1e6 * SIDE**2, rel=1e-9) and apart == 0
+
+    def deepest(depth):
+        return largest_depth(flat, mesh, mesh.points, jnp.array([0.0, 0.0, -1.0]) * depth)
+
+    assert float(jax.grad(deepest)(0.0)) == pytest.approx(1.0, rel=1e-12) and float(jax.grad(deepest)(-1e-6)) == 0
+
+
+@pytest.mark.parametrize("shape", ["plane", "sphere"])
+def test_the_travel_of_a_pressed_obstacle_has_second_derivatives(shape):
+    """One Newton step from the place gives first derivatives only; the second were 12 times too large for a sphere."""
+    scene = cube(
+        lambda top: (
+            plane(top, force=jnp.array([0.0, 0.0, -0.1]), stiffness=1e6)
+            if shape == "plane"
+            else sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -0.1]), stiffness=1e8)
+        )
+    )
+    x = scene.mesh.points
+    (own,) = scene.physics
+    acting = own.freeze(None, Step(scene.mesh, x, 1, 1, None, False, None, None))
+
+    def travel(load):
+        return replace(acting, load=jnp.stack([jnp.zeros(()), load])).travel(acting.points(x), 1.0)
+
+    v, h = 0.1, 1e-3
+    first, second = jax.jit(jax.jacfwd(travel)), jax.jit(jax.jacfwd(jax.jacfwd(travel)))
+    away = [float(first(v + k * h)) for k in (-2, -1, 1, 2)]
+    exact = (8 * (away[2] - away[1]) - (away[3] - away[0])) / (12 * h)
+    # Fourth order in h / v, and the roundoff of the first derivative over h.
+    assert float(second(v)) == pytest.approx(exact, rel=1e-5, abs=1e-9 * abs(away[0]) / h)
+    if shape == "plane":  # at no load the plane just touches: 1 / (sum of the stiffness of its points)
+        assert float(first(0.0)) == pytest.approx(away[0], rel=1e-9)

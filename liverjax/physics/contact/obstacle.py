@@ -221,8 +221,16 @@ class Touching(NodalForce):
 def contact_force(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Gradient of the energy (V, 3) [N] at positions x (V, 3): the force of the nodes on the obstacle, `moved` (3,)."""
     d = _distances(obstacle, mesh, x, moved)
-    push = weighted_stiffness(obstacle, mesh) * jnp.minimum(d.value, 0.0)  # (Q, m), negative
+    depth = depths(d, touching_distance(obstacle, mesh))
+    push = weighted_stiffness(obstacle, mesh) * depth  # (Q, m), negative
     return shared_out(obstacle, mesh, x, jnp.stack([push * n for n in d.normal]))
+
+
+def depths(d: Distance, near: jax.Array) -> jax.Array:
+    """Distances (Q, m) [m] of points inside, 0 of others. Points nearer than `near` (m,) count as pressed, as in the
+    stiffness: a minimum would have half the derivative at a point that just touches."""
+    pressed = d.value - jax.lax.stop_gradient(jnp.maximum(d.value, 0.0))
+    return jnp.where(d.value <= near[None], pressed, 0.0)
 
 
 def shared_out(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, pushes: jax.Array) -> jax.Array:
@@ -240,7 +248,8 @@ def between_nodes(mesh: TetMesh, H: jax.Array) -> jax.Array:
 
 def largest_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array) -> jax.Array:
     """Largest depth () [m] of the surface at positions x (V, 3) in the obstacle; 0 where it is outside."""
-    return jnp.maximum(-jnp.min(_distances(obstacle, mesh, x, moved).value), 0.0)
+    deepest = -jnp.min(_distances(obstacle, mesh, x, moved).value)
+    return jnp.where(deepest >= 0, deepest, 0.0)  # not a maximum, which has half the derivative at a point that touches
 
 
 @jax.jit  # compiled, since checks of a sweep compute it for each row
@@ -284,7 +293,12 @@ def _distances(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Array
 
 def just_touching(obstacle: Obstacle, mesh: TetMesh, d: Distance) -> jax.Array:
     """Whether points (Q, m) are inside, or so near that they count as touching."""
-    return d.value <= _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))[None]
+    return d.value <= touching_distance(obstacle, mesh)[None]
+
+
+def touching_distance(obstacle: Obstacle, mesh: TetMesh) -> jax.Array:
+    """Distance (m,) [m] that counts as touching."""
+    return _TOUCHING * jnp.sqrt(_triangle_areas(obstacle, mesh))
 
 
 #: Fewest and most points along the edge of a triangle at which a depth between the points of contact is looked for.

@@ -25,10 +25,12 @@ from liverjax.physics.contact.obstacle import (
     Obstacle,
     Touching,
     contact_points,
+    depths,
     distances,
     point_functions,
     shared_out,
     three_numbers,
+    touching_distance,
     touching_nodes,
     weighted_stiffness,
 )
@@ -104,7 +106,8 @@ class PressedObstacle(Obstacle):
         """Size () [N] of the force at the end of step k; step 0 is the beginning of the run."""
         whole = jnp.linalg.norm(jnp.asarray(self.force, float))
         factor = k / steps if self.history is None else history.value_at(1.0, k * dt, self.times, self.history)
-        return jnp.maximum(whole * factor, 0.0)
+        # Not a maximum: it would have half the derivative at a factor of 0.
+        return jnp.where(factor >= 0, whole * factor, 0.0)
 
     def displacement(self, k: Number, steps: int, dt: Number) -> jax.Array:
         """Zero: no motion is prescribed."""
@@ -127,6 +130,7 @@ class PressedObstacle(Obstacle):
             nodes=touching_nodes(self, step.mesh),
             functions=point_functions(step.mesh, dtype),
             hardness=weighted_stiffness(self, step.mesh),
+            near=touching_distance(self, step.mesh),
         )
 
     def advance(self, memory: jax.Array, acting: "Pressing", end: End) -> jax.Array:
@@ -152,6 +156,8 @@ class Pressing(Touching):
     functions: jax.Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
 
+    near: Any = param("m", "distance that counts as touching (m,)", default=None)
+
     def points(self, x: jax.Array) -> jax.Array:
         """Points of contact (3, Q, m) at positions x (V, 3)."""
         return jnp.einsum("aq,ami->iqm", self.functions, x[self.nodes])
@@ -161,17 +167,19 @@ class Pressing(Touching):
         return self.travel(self.points(x), s) * self.direction
 
     def travel(self, at: jax.Array, s: Number) -> jax.Array:
-        """Travel () [m] at which the contact balances the force; NaN if there is none. It has first derivatives."""
+        """Travel () [m] at which the contact balances the force; NaN if there is none."""
         load = self.load[0] + s * (self.load[1] - self.load[0])
         found = self._found(*jax.lax.stop_gradient((at, load)))
-        held, slope, _ = self._resistance(at, found)
-        # One more step of Newton: it changes nothing but the derivative.
-        return found + (load - held) / jnp.where(slope > 0, slope, 1.0)
+        # Steps of Newton from the place change nothing but its derivatives: one gives the first, two the second.
+        for _ in range(2):
+            held, slope, _ = self._resistance(at, found)
+            found = found + (load - held) / jnp.where(slope > 0, slope, 1.0)
+        return found
 
     def _resistance(self, at: jax.Array, travel: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """dE/dt [N] and its slope [N/m] at a travel, and the least distance [m]."""
         d = distances(self.obstacle, at, travel * self.direction)
-        depth, inside = jnp.minimum(d.value, 0.0), (d.value < 0).astype(at.dtype)
+        depth, inside = depths(d, self.near), (d.value <= self.near[None]).astype(at.dtype)
         along = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
         bent = sum(self.direction[i] * d.bent[i][j] * self.direction[j] for i in range(3) for j in range(3))
         slope = self.hardness * (inside * along * along + depth * bent)
@@ -217,7 +225,8 @@ class Pressing(Touching):
         the stiffness of the contact."""
         at = self.points(x)
         d = distances(self.obstacle, at, self.travel(at, s) * self.direction)
-        along = self.hardness * (d.value < 0) * sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
+        towards = sum(n * t for n, t in zip(d.normal, self.direction, strict=True))
+        along = self.hardness * (d.value <= self.near[None]) * towards
         pushes = jnp.stack([along * n for n in d.normal])
         if not definite:
             depth = self.hardness * jnp.minimum(d.value, 0.0)

@@ -98,4 +98,4 @@ def _own_volumes(scene: Scene) -> None:
                 f"{name} needs a law whose energy is a shear part and a volumetric part, unlike {type(law).__name__}"
             )
     if scene.viscosity is not None and scene.viscosity.part != "isochoric":
-        raise InputError(f"{name} needs [viscosity] part = 'isochoric': volumes do not relax there")
+        raise InputError(f"{name} needs part = 'isochoric' of [viscosity] or [springpots]: volumes do not relax there")
