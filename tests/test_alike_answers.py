@@ -77,3 +77,18 @@ def test_a_spectrum_keeps_its_own_errors():
     time, rng = np.geomspace(0.1, 600, 100), np.random.default_rng(2)
     fit = choose_in_time(_relaxation(time, 0.01 * _autoregression(rng, len(time), 0.9)), "spectrum")
     assert with_alike_noise(fit) is fit and INDEPENDENT not in fit.details
+
+
+def test_noise_of_constant_size_is_neither_shared_nor_in_proportion():
+    """Small beside early answers, large beside late ones: it was taken for an order, with errors 25 times off."""
+    time, values, errors = np.geomspace(0.1, 300, 100), [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        test = _relaxation(time, np.zeros(100))
+        noisy = test.answer + np.where(test.used, 1e-4 * G0 * rng.normal(size=len(test.answer)), 0.0)
+        fit = with_alike_noise(time_tests.fit(test._replace(answer=noisy), modes=2))
+        assert INDEPENDENT not in fit.details
+        values.append(fit.uncertainty.values)
+        errors.append(fit.uncertainty.standard_errors)
+    ratio = np.median(errors, axis=0) / np.std(values, axis=0)
+    assert np.all((ratio > 0.6) & (ratio < 1.7)), ratio  # the scatter of 12 draws is known to 21 %

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitting.methods.noise.alike_noise import alike_noise
+from fitting.methods.noise.alike_noise import alike_noise, along_rows
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -116,3 +116,28 @@ def test_as_many_residuals_as_unknowns_that_they_show():
     places, group = np.tile(rng.normal(size=(3, 3)), (30, 1)), np.repeat(np.arange(30), 3)
     J = rng.normal(size=(90, 36))
     assert alike_noise(places, group, fitted(rng.normal(size=90), J)[1], J) is None
+
+
+def test_two_series_that_drift_are_seen_and_white_ones_are_not():
+    """Two curves of 30 points, by a modulus and an exponent; noise of the stretch is in the derivatives too."""
+    x = np.linspace(0.02, 0.5, 30)
+    seen = {"white": 0, "drift": 0, "stretch": 0}
+    for seed in range(20):
+        for kind in seen:
+            rng = np.random.default_rng(seed)
+            at = np.concatenate([x, x]) + (0.003 * rng.normal(size=60) if kind == "stretch" else 0.0)
+            J = np.stack([at, at**3 * np.repeat([1.0, 2.0], 30)], axis=1)
+            noise = rng.normal(size=60)
+            if kind == "drift":
+                for k in range(1, 60):
+                    noise[k] = noise[k] if k == 30 else 0.95 * noise[k - 1] + 0.3 * noise[k]
+            if kind == "stretch":  # the stress of the true stretch, at the stretch that was read
+                noise = (np.stack([np.tile(x, 2), np.tile(x, 2) ** 3 * np.repeat([1.0, 2.0], 30)], axis=1) - J) @ [
+                    50,
+                    200,
+                ]
+                noise += 0.05 * rng.normal(size=60)
+            r = fitted(noise, J)[1]
+            found = along_rows([30, 30], r, J, float(np.sqrt(r @ r / 58)), np.linalg.pinv(J))
+            seen[kind] += found is not None
+    assert seen["white"] <= 1 and seen["stretch"] <= 1 and seen["drift"] >= 16, seen

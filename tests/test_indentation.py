@@ -78,6 +78,29 @@ def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
     assert np.mean(held) > 0.88, np.mean(held)
 
 
+def test_noise_of_the_depth_is_no_shared_noise():
+    """The derivatives are computed at the noisy depths: their scatter is that of the residuals: no order."""
+    depth, layer = np.linspace(0.0, 7e-4, 200), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
+    force = hertz(depth - START)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        noisy = force + 1e-3 * force.max() * rng.normal(size=200)
+        found = fit_contact(depth + 5e-6 * rng.normal(size=200), noisy, layer.force)
+        assert found.independent is None and found.standard_errors[0] < 0.03 * E
+
+
+def test_adhesion_is_named(tmp_path, capsys):
+    """A pull of 5 % of the largest force after contact: it enlarged the noise that it was compared with."""
+    depth = np.linspace(0.0, 7e-4, 200)
+    force = hertz(depth - START)
+    force += force.max() * np.where(depth > START, -0.05, 0.0)
+    force += 0.003 * force.max() * np.random.default_rng(0).normal(size=200)
+    np.savetxt(tmp_path / "c.csv", np.column_stack([depth, force]), "%.9g", ",", header="depth_m,force_N", comments="")
+    command = ["indentation", str(tmp_path / "c.csv"), "--radius", str(R), "--thickness", "1", "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert "this is adhesion" in capsys.readouterr().err
+
+
 def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
     back = DEPTH[-2::-1]
     depth = np.concatenate([DEPTH, back])

@@ -181,7 +181,7 @@ def test_a_light_force_is_balanced_to_the_roundoff_of_positions():
 
 
 def test_derivatives_where_a_surface_just_touches():
-    """A minimum has half the derivative at 0, all or none where the distance is rounded: 45 times too large in a run."""
+    """A minimum has half the derivative at 0, all or none where the distance is rounded: 45 times too large."""
     mesh = lj.shapes.box((SIDE, SIDE, SIDE), (2, 2, 2))
     top = jnp.asarray(lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_max"]))
     place = {"position": jnp.array([0.0, 0.0, SIDE]), "axis": jnp.array([0.0, 0.0, -1.0])}

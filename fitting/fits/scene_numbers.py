@@ -13,6 +13,7 @@ import liverjax as lj
 from fitting.methods.estimate import Estimate, bias_sentences, errors_and_correlation, estimated, mesh_bias
 from fitting.methods.least_squares import Solution, levenberg_marquardt_host
 from fitting.methods.noise.alike_noise import alike_noise
+from fitting.methods.noise.uneven_noise import uneven_root
 from fitting.readers.displacements import Displacements, weighted_differences
 from liverjax.core import status
 from liverjax.core.errors import InputError
@@ -103,10 +104,15 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
         return estimate
     r, J = np.asarray(found.residuals), np.asarray(found.jacobian)
     seen = np.concatenate([np.isfinite(d.sd).ravel() for d in problem.data])
+    slope = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u)))
+    # Components may have noise of other sizes than stated: along the depth, say, or where the motion is large.
+    uneven = np.linalg.norm(uneven_root(J[seen], r[seen], slope), axis=1)
+    errors = np.maximum(estimate.standard_errors, uneven)
+    estimate = estimate._replace(standard_errors=errors if _many(J, seen) else estimate.standard_errors)
     alike = alike_noise(*_places_and_groups(problem, seen), r[seen], J[seen])
     if alike is None:
         return estimate
-    root = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u))) @ alike.root
+    root = slope @ alike.root
     errors, correlation = errors_and_correlation(root)
     larger = float(np.max(errors / estimate.standard_errors))
     if larger < 1:
@@ -118,6 +124,15 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     )
     errors = np.maximum(errors, estimate.standard_errors)
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
+
+
+#: Components for each number from which their own residuals say what noise they have.
+_MANY = 20
+
+
+def _many(J: np.ndarray, seen: np.ndarray) -> bool:
+    """Whether there are so many residuals that they say something of the noise of each."""
+    return bool(np.count_nonzero(seen) >= _MANY * J.shape[1])
 
 
 def _places_and_groups(problem: Problem, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

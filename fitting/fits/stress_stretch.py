@@ -13,6 +13,7 @@ import scipy.stats
 from fitting.methods.estimate import errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers.curves import Curve
 from liverjax import laws
@@ -286,17 +287,10 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
     slope = np.asarray(jax.jacfwd(candidate.values)(jnp.asarray(u), scale))
     # A parameter at its limit has no error; the errors of the others are those of the law at that limit.
     known = np.array([name not in limits for name in candidate.names])
-    half, s = spread(J[:n, known], noise, slope[np.ix_(known, known)])
-    errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
-    its_errors, its_correlation = errors_and_correlation(half)
     own_slope = slope[np.ix_(known, known)]
-    fitted = np.concatenate([c.stress / c.scale for c in curves]) + misfit
-    growing = growing_root(J[:n, known], misfit, fitted, own_slope)
-    for root in (uneven_root(J[:n, known], misfit, own_slope), growing):
-        uneven = errors_and_correlation(root)
-        if np.any(uneven[0] > _UNEVEN * its_errors):
-            its_correlation = uneven[1]
-        its_errors = np.maximum(its_errors, uneven[0])
+    half, s = spread(J[:n, known], noise, own_slope)
+    errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
+    its_errors, its_correlation, alike = _errors_of_law(curves, (J[:n, known], misfit, noise), own_slope, half)
     if n > p:
         errors[known] = its_errors
     if np.all(np.isfinite(half)):
@@ -327,7 +321,40 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
         compile_time=times[1],
         limits=limits,
     )
-    return result._replace(warnings=_warnings(result, curves, s, bool(np.any(r[n:] < 0))))
+    told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
+    if alike is not None:
+        told.append(
+            "neighbouring points of a curve share their residuals: the instrument drifts or a test has a factor or an "
+            f"offset of its own, or the law misses something; {n} points measure as much as {alike.independent:.0f} of "
+            "independent noise, and the standard errors are those of such noise"
+        )
+    return result._replace(warnings=told)
+
+
+def _errors_of_law(
+    curves: list[Curve], residuals: tuple[np.ndarray, np.ndarray, float], slope: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Alike | None]:
+    """Errors and correlation, whatever noise is in the residuals, and the noise that neighbouring points share.
+
+    Args:
+        curves: that were fitted.
+        residuals: derivatives J (n, p), misfit (n,) and its standard deviation.
+        slope: derivatives of the parameters by the unknowns (P, p).
+        half: square root of the covariance for equal, independent noise.
+    """
+    J, misfit, noise = residuals
+    errors, correlation = errors_and_correlation(half)
+    fitted = np.concatenate([c.stress / c.scale for c in curves]) + misfit
+    roots = [uneven_root(J, misfit, slope), growing_root(J, misfit, fitted, slope)]
+    alike = along_rows([len(c.stress) for c in curves], misfit, J, noise, np.linalg.pinv(J)) if J.size else None
+    if alike is not None:
+        roots.append(slope @ alike.root)
+    for root in roots:
+        uneven = errors_and_correlation(root)
+        if np.any(uneven[0] > _UNEVEN * errors):
+            correlation = uneven[1]
+        errors = np.maximum(errors, uneven[0])
+    return errors, correlation, alike
 
 
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:

@@ -13,7 +13,7 @@ import scipy.optimize
 import scipy.special
 
 from fitting.methods.estimate import errors_and_correlation
-from fitting.methods.noise.alike_noise import Alike, alike_noise
+from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
@@ -93,11 +93,8 @@ def fit_contact(
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
     """Errors of all unknowns, the correlation of the first two, and the noise that neighbours share."""
     equal = noise * np.linalg.pinv(J)
-    roots, alike = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))], None
-    if noise > 0 and np.all(np.isfinite(J)):
-        # The points were measured one after another: noise is shared by points of near numbers.
-        places = np.arange(len(J))[:, None] * np.array([1.0, 0.0, 0.0])
-        alike = alike_noise(places, np.zeros(len(J)), residuals / noise, J / noise)
+    roots = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))]
+    alike = along_rows([len(J)], residuals, J, noise, np.linalg.pinv(J))
     if alike is not None:
         roots.append(alike.root)
     errors, correlations = zip(*(errors_and_correlation(root) for root in roots), strict=True)

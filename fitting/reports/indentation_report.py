@@ -9,6 +9,7 @@ import numpy as np
 from fitting.methods.contact_point import ContactFit
 from fitting.methods.kramers_kronig import runs_probability
 from fitting.readers.indentation_curves import IndentationCurve
+from fitting.readers.noise_of_series import noise_of_series
 from fitting.reports.sweep_report import numbers
 from fitting.rigs.thin_layer import Indenter, half_space
 from liverjax.core.plotting import BLUE, GREY, pyplot, save
@@ -106,7 +107,8 @@ def indentation_warnings(
             f"neighbouring points share their noise, or the model misses something: {len(fit.residuals)} points "
             f"measure as much as {fit.independent:.0f} of independent noise; standard errors are those of such noise"
         )
-    if curve.force.min() < -5 * fit.noise:
+    # The residuals contain the adhesion itself, the scatter of neighbours does not.
+    if curve.force.min() < -5 * noise_of_series(curve.force):
         told.append("forces are negative: this is adhesion, which the model does not have")
     return told
 

@@ -58,7 +58,7 @@ class Energies:
             accumulate(second, ("J", "J"), curvature["J", "J"])
         return first, second
 
-    def volumetric_part(self) -> Any:
+    def volumetric_part(self) -> "Energies | None":
         """U(J) as a law of its own; `None` if the law has no U(J)."""
         return None
 

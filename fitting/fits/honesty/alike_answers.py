@@ -9,7 +9,8 @@ import numpy as np
 from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
-from fitting.methods.noise.alike_noise import Alike, alike_noise
+from fitting.methods.noise.alike_noise import alike_noise
+from fitting.methods.noise.uneven_noise import probability_of_sizes
 
 
 def with_alike_noise(fit: TimeFit) -> TimeFit:
@@ -24,20 +25,23 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
         return fit  # a spectrum has errors of its prior, not of noise alone
     if not fit.uncertainty.noise > 0:
         return fit
-    # The residuals are divided by the measured answers, whose noise would look like an order in J: by the fitted ones.
-    lower = fit.scales**2 - fit.measured**2
-    size = fit.uncertainty.noise * np.sqrt(np.maximum(fit.fitted**2 + lower, 1e-300)) / fit.scales
+    size, constant = _sizes(fit, r, J)
+    inverse = np.linalg.pinv(J) * size
     r, J = r / size, J / size[:, None]
     group, axis = np.zeros(len(r)), np.array([1.0, 0.0, 0.0])
     lines = (fit.time[:, None] * axis, np.arange(len(r))[:, None] * axis)
-    found = [a for a in (alike_noise(places, group, r, J) for places in lines) if a is not None]
-    if not found:
+    found = [a for a in (alike_noise(places, group, r, J, inverse) for places in lines) if a is not None]
+    if not found and not constant:
         return fit
-    alike = max(found, key=lambda a: a.gain)
     u, own = np.asarray(fit.solution.u), fit.parameters
-    modes = _of_such_noise(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, alike)
+    if not found:
+        modes = _of_such_noise(fit.uncertainty, _modes_of(fit), u, inverse)
+        own = own if own is None or fit.kind.values is None else _of_such_noise(own, fit.kind.values, u, inverse)
+        return fit._replace(uncertainty=modes, parameters=own)
+    alike = max(found, key=lambda a: a.gain)
+    modes = _of_such_noise(fit.uncertainty, _modes_of(fit), u, alike.root, alike.independent)
     if own is not None and fit.kind.values is not None:
-        own = _of_such_noise(own, fit.kind.values, u, alike)
+        own = _of_such_noise(own, fit.kind.values, u, alike.root, alike.independent)
     sentence = (
         f"neighbouring answers share their noise, or the model misses something: {len(r)} answers measure as much as "
         f"{alike.independent:.0f} of independent noise; the standard errors are those of such noise"
@@ -46,9 +50,33 @@ def with_alike_noise(fit: TimeFit) -> TimeFit:
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, sentence), details=details)
 
 
-def _of_such_noise(estimate: Estimate, natural_of: Callable, u: np.ndarray, alike: Alike) -> Estimate:
-    root = host.with_jacobian(natural_of, u)[1] @ alike.root
+def _modes_of(fit: TimeFit) -> Callable:
+    return partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell)
+
+
+#: Gain in the logarithm of the probability from which the noise counts as one of constant size.
+_CONSTANT = 3.0
+
+
+def _sizes(fit: TimeFit, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Deviations of the residuals r (m,), and whether the noise of the answers is of constant size, not in proportion
+    to them: whichever the residuals make more probable."""
+    # The residuals are divided by the measured answers, whose noise would look like an order in J: by the fitted ones.
+    lower = fit.scales**2 - fit.measured**2
+    relative = np.sqrt(np.maximum(fit.fitted**2 + lower, 1e-300)) / fit.scales
+    constant = np.median(fit.scales) / fit.scales
+    (one, level), (other, its_level) = (probability_of_sizes(J, r, size) for size in (relative, constant))
+    is_constant = other > one + _CONSTANT
+    return (its_level * constant if is_constant else level * relative), bool(is_constant)
+
+
+def _of_such_noise(
+    estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray, independent: float | None = None
+) -> Estimate:
+    """The estimate with the errors of a square root (p, k) of the covariance of u."""
+    root = host.with_jacobian(natural_of, u)[1] @ root
     errors, correlation = errors_and_correlation(root)
-    freedom = max(1.0, alike.independent - (estimate.components - estimate.freedom))
-    larger = np.maximum(errors, estimate.standard_errors)
-    return estimate._replace(root=root, standard_errors=larger, correlation=correlation, freedom=freedom)
+    errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
+    taken = estimate.components - estimate.freedom
+    freedom = estimate.freedom if independent is None else max(1.0, independent - taken)
+    return estimate._replace(root=root, standard_errors=errors, correlation=correlation, freedom=freedom)

@@ -2,10 +2,11 @@
 
 Registration and image correlation smooth, so neighbours share their noise, and fewer independent numbers are measured
 than there are points. The covariance of two components of the same direction, instant and scene is taken to be s^2 (a
-k(d / l) + (1 - a) [same row]), with d the distance of their points and k the Matérn function of order 3/2. Length l,
-part a and level s are those that make the residuals most probable (restricted maximum likelihood: Patterson and
-Thompson 1971), because a fit takes the part of the noise that looks like its parameters out of the residuals. The
-numbers remain those of the fit. Their covariance is J^+ C (J^+)^T instead of s^2 J^+ (J^+)^T.
+k(d / l) + (1 - a) [same row]), with d the distance of their points and k the Matérn function of order 3/2 (noise that
+was smoothed) or 1/2 (noise that drifts). Order, length l, part a and level s are those that make the residuals most
+probable (restricted maximum likelihood: Patterson and Thompson 1971), because a fit takes the part of the noise that
+looks like its parameters out of the residuals. The numbers remain those of the fit. Their covariance is J^+ C (J^+)^T
+instead of s^2 J^+ (J^+)^T.
 """
 
 import itertools
@@ -13,12 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.signal
 import scipy.spatial
 
 from liverjax.solvers.blas import one_blas_thread
 
 #: Parts a that are tried, and how many lengths between a third of the distance of neighbours and the body's size.
 PARTS, LENGTHS = (0.3, 0.6, 0.9, 0.99), 8
+#: Orders of Matérn's function: noise that was smoothed, noise that drifts.
+ORDERS = ("3/2", "1/2")
 #: Groups whose probability is computed, and points of each: as many near each other as scattered over the body.
 FEW, MOST = 12, 400
 #: Gain in the logarithm of the probability from which noise counts as alike: chance reaches it once in a thousand.
@@ -42,9 +46,12 @@ class Alike(NamedTuple):
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
     gain: float  # in the logarithm of the probability, over independent noise
     independent: float  # residuals of independent noise that would measure as much
+    order: str = "3/2"  # of the Matérn function
 
 
-def alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray) -> Alike | None:
+def alike_noise(
+    places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray, inverse: np.ndarray | None = None
+) -> Alike | None:
     """The noise that neighbours share; None if they share none that is more than chance.
 
     Args:
@@ -52,12 +59,15 @@ def alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndar
         group: residuals of different numbers (n,) share no noise: other directions, instants, scenes.
         r: residuals (n,) of a fit, over the stated deviations.
         J: their derivatives (n, p), of full rank.
+        inverse: derivatives of the unknowns by r (p, n); default J^+.
     """
     with one_blas_thread():  # the matrices are small
-        return _alike_noise(places, group, r, J)
+        return _alike_noise(places, group, r, J, np.linalg.pinv(J) if inverse is None else inverse)
 
 
-def _alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray) -> Alike | None:
+def _alike_noise(
+    places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.ndarray, inverse: np.ndarray
+) -> Alike | None:
     groups = [np.flatnonzero(group == g) for g in np.unique(group)]
     some = np.unique(np.linspace(0, len(groups) - 1, FEW).round().astype(int))
     chosen = [_subset(places[groups[k]], groups[k]) for k in some]
@@ -74,17 +84,36 @@ def _alike_noise(places: np.ndarray, group: np.ndarray, r: np.ndarray, J: np.nda
     limit = OUTLIER * 1.4826 * float(np.median(np.abs(r)))
     clipped = np.clip(r, -limit, limit) if limit > 0 else r
     data = [(clipped[own], J[np.ix_(own, shown)]) for own in chosen]
-    alone, _ = _probability_at(data, far, 1.0, 0.0)
-    tried = [(*_probability_at(data, far, l, a), l, a) for l, a in itertools.product(lengths, PARTS)]
-    best, level, length, part = max(tried)
+    alone, _ = _probability_at(data, far, "3/2", 1.0, 0.0)
+    choices = itertools.product(ORDERS, lengths, PARTS)
+    tried = [(*_probability_at(data, far, order, l, a), order, l, a) for order, l, a in choices]
+    best, level, order, length, part = max(tried)
     # Not larger: nor is it if both are -inf. The level says less: it is small for noise smoother than the function.
     if not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
         return None
-    inverse = np.linalg.pinv(J)
-    parts = [_of_unknowns(places[own], length, part, inverse[:, own]) for own in groups]
+    parts = [_of_unknowns(places[own], (order, length, part), inverse[:, own]) for own in groups]
     values, vectors = np.linalg.eigh(sum(middle for middle, _ in parts))
     root = max(1.0, level) * vectors * np.sqrt(np.maximum(values, 0.0))
-    return Alike(float(length), part, max(1.0, level), root, best - alone, sum(count for _, count in parts))
+    return Alike(float(length), part, max(1.0, level), root, best - alone, sum(count for _, count in parts), order)
+
+
+def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
+    """`alike_noise` of series that were measured one after another; lengths are in rows.
+
+    Args:
+        counts: rows of each series, which share no noise.
+        r, J: residuals (n,) and their derivatives (n, p).
+        deviation: of a residual.
+        inverse: derivatives of the unknowns by r (p, n).
+    """
+    if not (deviation > 0 and np.all(np.isfinite(J))):
+        return None
+    places = np.concatenate([np.arange(n) for n in counts])[:, None] * np.array([1.0, 0.0, 0.0])
+    # Noise of what is given (depth, stretch) is in J and in the residuals, and would look like an order: J is smoothed.
+    parts = np.split(J, np.cumsum(counts)[:-1])
+    smooth = [scipy.signal.savgol_filter(p, max(3, len(p) // 10 | 1), 1, axis=0) if len(p) > 3 else p for p in parts]
+    group = np.repeat(np.arange(len(counts)), counts)
+    return alike_noise(places, group, r / deviation, np.concatenate(smooth) / deviation, inverse * deviation)
 
 
 def _to_neighbours(distance: np.ndarray) -> float:
@@ -104,18 +133,20 @@ def _subset(places: np.ndarray, own: np.ndarray) -> np.ndarray:
     return own[np.concatenate([near, rng.choice(rest, MOST - len(near), replace=False)])]
 
 
-def _matern(distance: np.ndarray, length: float) -> np.ndarray:
-    """Matérn's function of order 3/2."""
+def _matern(distance: np.ndarray, order: str, length: float) -> np.ndarray:
+    """Matérn's function of order 3/2 or 1/2."""
+    if order == "1/2":
+        return np.exp(-distance / length)
     x = np.sqrt(3) * distance / length
     return (1 + x) * np.exp(-x)
 
 
-def _probability_at(data: list, far: list[np.ndarray], length: float, part: float) -> tuple[float, float]:
+def _probability_at(data: list, far: list[np.ndarray], order: str, length: float, part: float) -> tuple[float, float]:
     """Logarithm of the restricted likelihood, up to a constant, and the level s that it takes."""
     p = data[0][1].shape[1]
     determinant, squares, b, A = 0.0, 0.0, np.zeros(p), np.zeros((p, p))
     for (r, J), distance in zip(data, far, strict=True):
-        L = np.linalg.cholesky(part * _matern(distance, length) + (1 - part) * np.eye(len(r)))
+        L = np.linalg.cholesky(part * _matern(distance, order, length) + (1 - part) * np.eye(len(r)))
         white = scipy.linalg.solve_triangular(L, np.column_stack([r, J]), lower=True, check_finite=False)
         determinant += 2 * float(np.sum(np.log(np.diagonal(L))))
         squares += float(white[:, 0] @ white[:, 0])
@@ -127,11 +158,15 @@ def _probability_at(data: list, far: list[np.ndarray], length: float, part: floa
     return (value if sign > 0 else -np.inf), float(np.sqrt(left / freedom))
 
 
-def _of_unknowns(places: np.ndarray, length: float, part: float, inverse: np.ndarray) -> tuple[np.ndarray, float]:
-    """J^+ C (J^+)^T (p, p) of one group, a few rows of C at a time, and its n^2 / sum(C) independent residuals."""
+def _of_unknowns(places: np.ndarray, shape: tuple[str, float, float], inverse: np.ndarray) -> tuple[np.ndarray, float]:
+    """J^+ C (J^+)^T (p, p) of one group, a few rows of C at a time, and its n^2 / sum(C) independent residuals.
+
+    `shape`: order, length and part.
+    """
+    order, length, part = shape
     total, sum_of_C = (1 - part) * inverse @ inverse.T, (1 - part) * len(places)
     for a in range(0, len(places), ROWS):
-        C = _matern(scipy.spatial.distance.cdist(places[a : a + ROWS], places), length)
+        C = _matern(scipy.spatial.distance.cdist(places[a : a + ROWS], places), order, length)
         total = total + part * inverse[:, a : a + ROWS] @ C @ inverse.T
         sum_of_C += part * float(C.sum())
     return total, len(places) ** 2 / sum_of_C

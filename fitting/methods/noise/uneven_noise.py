@@ -35,20 +35,20 @@ def growing_root(J: np.ndarray, r: np.ndarray, size: np.ndarray, slope: np.ndarr
     (n, p), largest, none = J.shape, np.abs(size).max(initial=0.0), np.zeros((len(slope), len(r)))
     if not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and p and n > p + 1 and largest > 0):
         return none
+    growing = np.maximum(np.abs(size) / largest, _LEAST)
+    (equal, _), (better, level) = (probability_of_sizes(J, r, own) for own in (np.ones(n), growing))
+    return slope @ (np.linalg.pinv(J) * level * growing) if better > equal else none
+
+
+def probability_of_sizes(J: np.ndarray, r: np.ndarray, size: np.ndarray) -> tuple[float, float]:
+    """Restricted likelihood of independent noise with deviations in proportion to `size` (n,), and their factor."""
     beside = scipy.linalg.null_space(J.T)
-    left = beside.T @ r
-
-    def probability(variance: np.ndarray) -> tuple[float, float]:
-        L = np.linalg.cholesky(beside.T @ (variance[:, None] * beside))
-        level = float(np.mean(scipy.linalg.solve_triangular(L, left, lower=True) ** 2))
-        return -float(np.sum(np.log(np.diagonal(L)))) - 0.5 * len(left) * np.log(max(level, 1e-300)), level
-
-    growing = np.maximum(np.abs(size) / largest, _LEAST) ** 2
     try:
-        (equal, _), (better, level) = probability(np.ones(n)), probability(growing)
+        L = np.linalg.cholesky(beside.T @ (size[:, None] ** 2 * beside))
     except np.linalg.LinAlgError:
-        return none
-    return slope @ (np.linalg.pinv(J) * np.sqrt(level * growing)) if better > equal else none
+        return -np.inf, 1.0
+    level = float(np.sqrt(np.mean(scipy.linalg.solve_triangular(L, beside.T @ r, lower=True) ** 2)))
+    return -float(np.sum(np.log(np.diagonal(L)))) - len(L) * np.log(max(level, 1e-300)), level
 
 
 #: Chance below which two groups of residuals have noise of their own; smallest condition of J at which it is tried.

@@ -155,7 +155,6 @@ class Pressing(Touching):
     nodes: jax.Array | None = param("1", "nodes of the triangles (n, m)", default=None)
     functions: jax.Array | None = param("1", "functions of a triangle's nodes at its points (n, Q)", default=None)
     hardness: Any = param("N/m", "stiffness times area of every point (Q, m)", default=None)
-
     near: Any = param("m", "distance that counts as touching (m,)", default=None)
 
     def points(self, x: jax.Array) -> jax.Array:
