@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
+from fitting.fits.viscoelastic import EXACT
 from fitting.methods.estimate import errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
@@ -346,7 +347,9 @@ def _errors_of_law(
     errors, correlation = errors_and_correlation(half)
     fitted = np.concatenate([c.stress / c.scale for c in curves]) + misfit
     roots = [uneven_root(J, misfit, slope), growing_root(J, misfit, fitted, slope)]
-    alike = along_rows([len(c.stress) for c in curves], misfit, J, noise, np.linalg.pinv(J)) if J.size else None
+    alike = None
+    if J.size and noise > EXACT:  # else the residuals are roundoff
+        alike = along_rows([len(c.stress) for c in curves], misfit, J, noise, np.linalg.pinv(J))
     if alike is not None:
         roots.append(slope @ alike.root)
     for root in roots:

@@ -17,6 +17,8 @@ from fitting.methods.noise.alike_noise import Alike, along_rows
 from fitting.methods.noise.uneven_noise import uneven_root
 
 _GRID = 200
+#: Relative noise below which residuals are roundoff.
+_NOISELESS = 1e-7
 
 
 class ContactFit(NamedTuple):
@@ -94,7 +96,9 @@ def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> 
     """Errors of all unknowns, the correlation of the first two, and the noise that neighbours share."""
     equal = noise * np.linalg.pinv(J)
     roots = [equal, uneven_root(J, residuals, np.eye(J.shape[1]))]
-    alike = along_rows([len(J)], residuals, J, noise, np.linalg.pinv(J))
+    alike = None
+    if noise > _NOISELESS * np.abs(J[:, 0]).max():  # of the fitted force
+        alike = along_rows([len(J)], residuals, J, noise, np.linalg.pinv(J))
     if alike is not None:
         roots.append(alike.root)
     errors, correlations = zip(*(errors_and_correlation(root) for root in roots), strict=True)
