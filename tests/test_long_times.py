@@ -109,3 +109,16 @@ def test_the_share_of_long_times_is_in_the_total_error(tmp_path, capsys):
     assert SHORT in told.err and "relaxation after the test" in told.out
     rest, total = content["equilibrium_modulus"], content["total_errors"]["equilibrium_modulus"]
     assert abs(rest - REST) < 2 * total and content[INTERVAL][0] <= REST
+
+
+def test_a_fluid_that_has_relaxed_is_not_told_to_be_a_solid(tmp_path, capsys):
+    """No modulus is left at the end of the record: 0 to 30 % of G0 was said of it once, from a start never fitted."""
+    time, rng = np.logspace(-2, 2.5, 90), np.random.default_rng(0)
+    G = G0 * (0.6 * np.exp(-time / 0.1) + 0.4 * np.exp(-time / 20)) + rng.normal(size=90)
+    rows = "\n".join(f"{t:.8g},{g:.8g}" for t, g in zip(time, G, strict=True))
+    (tmp_path / "r.csv").write_text(f"time_s,relaxation_modulus_Pa\n{rows}\n")
+    assert main(["relaxation", str(tmp_path / "r.csv"), "--out", str(tmp_path)]) == 0
+    content, said = json.loads((tmp_path / "fit.json").read_text()), capsys.readouterr().err
+    assert content["model"] == "prony_fluid" and "a solid follows" not in said
+    low, high = content[INTERVAL]
+    assert low == 0 and high < 0.01 * G0

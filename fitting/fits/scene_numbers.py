@@ -107,19 +107,22 @@ def _of_alike_noise(problem: Problem, natural_of: Callable, found: Solution, est
     slope = np.asarray(jax.jacfwd(natural_of)(jnp.asarray(found.u)))
     # Components may have noise of other sizes than stated: along the depth, say, or where the motion is large.
     uneven = np.linalg.norm(uneven_root(J[seen], r[seen], slope), axis=1)
-    errors = np.maximum(estimate.standard_errors, uneven)
-    estimate = estimate._replace(standard_errors=errors if _many(J, seen) else estimate.standard_errors)
+    if _many(J, seen):
+        larger = np.maximum(uneven / estimate.standard_errors, 1.0)
+        estimate = estimate._replace(
+            root=larger[:, None] * estimate.root, standard_errors=larger * estimate.standard_errors
+        )
     alike = alike_noise(*_places_and_groups(problem, seen), r[seen], J[seen])
     if alike is None:
         return estimate
     root = slope @ alike.root
     errors, correlation = errors_and_correlation(root)
-    larger = float(np.max(errors / estimate.standard_errors))
-    if larger < 1:
+    most = float(np.max(errors / estimate.standard_errors))
+    if most < 1:
         return estimate
     warnings.warn(
         f"residuals of points within {alike.length:.2g} m are alike: the noise was smoothed, or the scene misses "
-        f"something. The standard errors are those of such noise, up to {larger:.2g} times those of independent noise",
+        f"something. The standard errors are those of such noise, up to {most:.2g} times those of independent noise",
         stacklevel=3,
     )
     errors = np.maximum(errors, estimate.standard_errors)

@@ -61,7 +61,7 @@ def internal_force(mesh: TetMesh, law: Law, x: jax.Array) -> jax.Array:
     return nodal_force(mesh, first_piola(mesh.at_points(law), deformation_gradient(mesh, x)))
 
 
-def first_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
+def linear_force(mesh: TetMesh, law: Law, motion: jax.Array) -> jax.Array:
     """Derivative of `internal_force` along a motion (V, 3) [m] of the reference shape, (V, 3) [N].
 
     The gradient and the sum at nodes are linear in the motion; only the stress has to be differentiated.

@@ -142,7 +142,7 @@ def force_sizes(scene: Scene) -> Sizes:
     rounded = rounded * jax.random.rademacher(jax.random.key(0), mesh.points.shape, dtype)
 
     def size(motion: jax.Array) -> jax.Array:
-        return jnp.linalg.norm(mjed.first_force(mesh, law, motion))
+        return jnp.linalg.norm(mjed.linear_force(mesh, law, motion))
 
     # One loop for both: a third of the program that two products with a linearised force take.
     unit_strain, roundoff = jax.lax.map(size, jnp.stack([along, rounded]))

@@ -28,6 +28,8 @@ BEYOND = 10.0
 CLOSER = 10.0
 #: Times of this mode at the start, over the longest that the test resolves.
 SLOW = (0.3, 1.0, 3.0)
+#: Strength of this mode at the start in a fluid, over G0.
+SLOW_PART = 0.1
 #: Bisections of each end, and iterations of each fit.
 BISECTIONS, ITERATIONS = 6, 60
 #: Distance of the farther end that is told, over that of the 95 % interval of the standard error, and over the number.
@@ -75,7 +77,7 @@ def equilibrium_interval(
     strengths = np.maximum(np.asarray(model.shear_modulus * model.ratios), 1e-6 * whole)
     times = np.asarray(model.relaxation_times)
     found = family.evaluate(rest, family.unknowns(strengths, times)[None])
-    best = _with_one_more(family, (rest or 0.3 * whole, strengths, times), high, found)
+    best = _with_one_more(family, (rest, strengths, times), high, found)
     least, (modulus, found) = 2 * float(best[1].cost), best
     if not np.isfinite(least):
         return None
@@ -117,8 +119,9 @@ def _with_one_more(
     rest, strengths, times = model
     noise = max(1.0, 2 * float(found.cost) / max(1, len(found.residuals) - len(found.u) - 1))
     best = (rest, found)
+    slow = rest or SLOW_PART * float(np.sum(strengths))  # a fluid leaves nothing of which a part could relax
     for part in (0.8, 0.5, 0.2, 0.0):  # of the equilibrium modulus that is left; the rest relaxes slowly
-        more = np.append(strengths, (1 - part) * rest)
+        more = np.append(strengths, (1 - part) * slow)
         starts = np.stack([family.unknowns(more, np.append(times, k * longest)) for k in SLOW])
         trial = family.evaluate(part * rest, starts)
         if float(trial.cost) < float(best[1].cost) - 0.5 * CLOSER * noise:

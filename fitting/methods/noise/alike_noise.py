@@ -46,7 +46,6 @@ class Alike(NamedTuple):
     root: np.ndarray  # (p, p) square root of the covariance of the unknowns
     gain: float  # in the logarithm of the probability, over independent noise
     independent: float  # residuals of independent noise that would measure as much
-    order: str = "3/2"  # of the Matérn function
 
 
 def alike_noise(
@@ -94,7 +93,7 @@ def _alike_noise(
     parts = [_of_unknowns(places[own], (order, length, part), inverse[:, own]) for own in groups]
     values, vectors = np.linalg.eigh(sum(middle for middle, _ in parts))
     root = max(1.0, level) * vectors * np.sqrt(np.maximum(values, 0.0))
-    return Alike(float(length), part, max(1.0, level), root, best - alone, sum(count for _, count in parts), order)
+    return Alike(float(length), part, max(1.0, level), root, best - alone, sum(count for _, count in parts))
 
 
 def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
