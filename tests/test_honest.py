@@ -141,11 +141,19 @@ def test_structured_residuals_are_called_so():
     assert numbers["storage_modulus"]["runs"] == 2 and numbers["loss_modulus"]["probability"] > 0.01
 
 
-def two_modes(noise: float, omega: np.ndarray = OMEGA) -> Sweep:
+def two_modes(noise: float, omega: np.ndarray = OMEGA, seed: int = 0) -> Sweep:
     x = 1j * omega[:, None] * np.array([1.0, 0.05])
     G = 300 + (np.array([200.0, 300.0]) * x / (1 + x)).sum(axis=1)
-    factor = 1 + noise * np.random.default_rng(0).standard_normal((2, len(omega)))
-    return Sweep(omega, G.real * factor[0], G.imag * factor[1])
+    return Sweep(omega, *noisy(G, noise, seed))
+
+
+def noisy(G: np.ndarray, noise: float, seed: int = 0) -> np.ndarray:
+    factor = 1 + noise * np.random.default_rng(seed).standard_normal((2, len(G)))
+    return np.stack([G.real, G.imag]) * factor
+
+
+def honest_modes(s: Sweep, modes: int):
+    return edges.honest(viscoelastic.closed_form(s, modes), s, generalised_maxwell.spectrum(s))
 
 
 def test_changes_are_those_of_a_fit_to_the_points_left():
@@ -166,6 +174,35 @@ def test_exact_data_are_moved_by_no_end():
     for changes in f.details["band_sensitivity"].values():
         assert max(abs(c) for c in changes.values()) < 1e-6 * 800
     assert not edges.moved(f) and not any("half decade" in w or "structured" in w for w in f.warnings)
+
+
+def test_noise_alone_is_not_told_to_be_an_end_and_a_wrong_model_is():
+    right = [honest_modes(two_modes(0.02, seed=k), 2) for k in range(12)]
+    told = [any("half decade moves" in w for w in f.warnings) for f in right]
+    assert sum(told) <= 2  # one of twenty is expected; half of them were told before
+    # The changes have the scatter that is predicted, where noise moves a number much (chi^2 of 12 numbers: 4 to 23).
+    moved = (("first", "equilibrium_modulus"), ("last", "shear_modulus"), ("last", "relaxation_times[1]"))
+    for end, name in moved:
+        part = f"without_{end}_half_decade"
+        change, by_noise = ([f.details[k][part][name] for f in right] for k in ("band_sensitivity", "band_scatter"))
+        assert 4 < np.sum(np.square(change) / np.square(by_noise)) < 23, (part, name)
+    assert all(
+        total_error.error_shares(f)["band"][n] == 0
+        for f, t in zip(right, told, strict=True)
+        if not t
+        for n in edges.values(f)
+    )
+    G = 300 + 100 * (1j * OMEGA) ** 0.4
+    f = honest_modes(Sweep(OMEGA, *noisy(G, 0.02)), 3)
+    assert any("half decade moves" in w for w in f.warnings) and "shear_modulus" in edges.moved(f)
+
+
+def test_what_a_model_misses_is_no_noise_that_explains_a_change():
+    """Smooth residuals of 6 % as noise would explain a change of G0 by 8 %."""
+    G = 300 + 100 * (1j * OMEGA) ** 0.4
+    f = honest_modes(Sweep(OMEGA, *noisy(G, 1e-3)), 2)
+    assert np.mean(f.relative_errors(Sweep(OMEGA, G.real, G.imag))) > 0.03
+    assert {"shear_modulus", "equilibrium_modulus"} <= edges.moved(f)
 
 
 @pytest.mark.slow

@@ -169,6 +169,7 @@ KEPT = (
     "spectrum",
     "models_compared",
     "band_sensitivity",
+    "band_scatter",
     "consistency",
     "instrument",
     "gap_error",

@@ -5,13 +5,13 @@ from functools import partial
 import numpy as np
 
 from fitting.fits import viscoelastic
+from fitting.fits.honesty import chance_of_ends
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
 from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
 from fitting.methods.least_squares import from_starts
 from fitting.readers.rheometer import Sweep, some
-from liverjax.core.struct import Content
 
 HALF_DECADE = float(np.sqrt(10))
 #: Name of the check of the data in its sentences, and names of the two repeated fits in the report.
@@ -39,10 +39,13 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
     if found.far and any(w.startswith(MISSES) for w in warnings):
         told = [w for w in told if KRAMERS_KRONIG not in w]
         warnings = [w for w in warnings if not w.startswith(MISSES)] + [_nearest(fit, sweep, found.misfit)]
-    changes = sensitivity(fit, sweep)
-    details["band_sensitivity"] = changes
-    sentences = (*warnings, *told, *_moved_most(fit, changes))
-    whole = _with_long_times(fit._replace(details=details, warnings=sentences), sweep)
+    details["band_sensitivity"] = sensitivity(fit, sweep)
+    details["band_scatter"] = {
+        part: chance_of_ends.moved_by_noise(fit, sweep, k) for part, k in _points_left(sweep).items()
+    }
+    fit = fit._replace(details=details)
+    sentences = (*warnings, *told, *_moved_most(fit))
+    whole = _with_long_times(fit._replace(warnings=sentences), sweep)
     return whole._replace(warnings=viscoelastic.by_importance(whole.warnings))
 
 
@@ -74,9 +77,14 @@ def sensitivity(fit: Fit, sweep: Sweep) -> dict[str, dict[str, float] | None]:
 
     The entry is None if too few points are left. For a spectrum, only the equilibrium modulus is compared.
     """
+    return {part: _change(fit, sweep, kept) for part, kept in _points_left(sweep).items()}
+
+
+def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
+    """Which points (n,) are left without the first and without the last half decade."""
     omega = sweep.angular_frequency
     kept = (omega > omega[0] * HALF_DECADE * (1 + 1e-9), omega < omega[-1] / HALF_DECADE * (1 - 1e-9))
-    return {part: _change(fit, sweep, k) for part, k in zip(PARTS, kept, strict=True)}
+    return dict(zip(PARTS, kept, strict=True))
 
 
 def values(fit: Fit) -> dict[str, tuple[float, float]]:
@@ -94,13 +102,22 @@ def values(fit: Fit) -> dict[str, tuple[float, float]]:
 
 
 def moved(fit: Fit) -> set[str]:
-    """Names of the parameters that change by more than their standard error without one of the half decades."""
-    out = set()
-    for part in PARTS:
-        for name, change in (fit.details.get("band_sensitivity", {}).get(part) or {}).items():
-            value, error = values(fit)[name]
-            if abs(change) > error and abs(change) > 1e-6 * abs(value):
-                out.add(name)
+    """Names of the parameters that the ends of the band decide (`decided_by`)."""
+    return {name for part in PARTS for name in decided_by(fit, part)}
+
+
+def decided_by(fit: Fit, part: str) -> dict[str, float]:
+    """Parameters that change without one of the `PARTS`, by more than their standard error and by more than noise
+    explains: the change over the larger of the two.
+    """
+    changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
+    by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
+    far, out = chance_of_ends.farthest_by_chance(fit, len(changes)), {}
+    for name, change in changes.items():
+        value, error = known[name]
+        allowed = max(error, far * by_noise.get(name, 0.0))
+        if abs(change) > allowed and abs(change) > 1e-6 * abs(value):
+            out[name] = abs(change) / max(allowed, 1e-300)
     return out
 
 
@@ -139,20 +156,20 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     return {name: new[name] - value for name, value in old.items()}
 
 
-def _moved_most(fit: Fit, changes: Content) -> list[str]:
+def _moved_most(fit: Fit) -> list[str]:
     """A sentence for each end, with the three numbers that it moves most."""
     known, told = values(fit), []
     for part, end in zip(PARTS, ("first", "last"), strict=True):
-        rows = [(n, d, *known[n]) for n, d in (changes[part] or {}).items()]
-        rows = [r for r in rows if abs(r[1]) > r[3] and abs(r[1]) > 1e-6 * abs(r[2])]
-        rows.sort(key=lambda r: -abs(r[1]) / max(r[3], 1e-300))
+        beyond = decided_by(fit, part)
+        names = sorted(beyond, key=lambda name: -beyond[name])
+        rows = [(name, fit.details["band_sensitivity"][part][name], known[name][0]) for name in names]
         if rows:
-            listed = ", ".join(f"{n} by {100 * d / v:+.2g} %" if v else f"{n} by {d:+.2g}" for n, d, v, _ in rows[:3])
+            listed = ", ".join(f"{n} by {100 * d / v:+.2g} %" if v else f"{n} by {d:+.2g}" for n, d, v in rows[:3])
             rest = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
             told.append(f"leaving out the {end} half decade moves {listed}{rest}")
     if not told:
         return []
     return [
-        f"{'; '.join(told)}: more than their standard errors, so the ends of the band decide them: take the total "
-        "errors, or measure a wider band"
+        f"{'; '.join(told)}: more than their standard errors and more than noise explains, so the ends of the band "
+        "decide them: take the total errors, or measure a wider band"
     ]

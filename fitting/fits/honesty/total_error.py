@@ -27,8 +27,9 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
 def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
-    The share of the band's ends is the larger of the two changes; the square of the standard error is subtracted from
-    its square. The share of long times is that of the farther end of `long_times.equilibrium_interval`.
+    The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
+    the square of what noise causes is subtracted from its square. The share of long times is that of the farther end
+    of `long_times.equilibrium_interval`.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -39,9 +40,10 @@ def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
         "geometry": {n: relative * abs(v) if n in moduli else 0.0 for n, (v, _) in known.items()},
         "band": dict.fromkeys(known, 0.0),
     }
-    for changes in (fit.details.get("band_sensitivity") or {}).values():
-        for name, change in (changes or {}).items():
-            beyond = np.sqrt(max(0.0, change**2 - noise[name] ** 2)) if np.isfinite(noise[name]) else 0.0
+    for part in edges.PARTS:
+        for name in edges.decided_by(fit, part):
+            change, scatter = (fit.details[key][part][name] for key in ("band_sensitivity", "band_scatter"))
+            beyond = np.sqrt(max(0.0, change**2 - max(noise[name], scatter) ** 2))
             out["band"][name] = max(out["band"][name], float(beyond))
     for source, moved in (("mesh", fit.uncertainty.mesh_bias), ("time_step", fit.uncertainty.time_step_bias)):
         if moved is not None and fit.parameters is None:

@@ -56,21 +56,27 @@ _CHANCE, _CONDITION = 1e-3, 1e-8
 
 
 def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.ndarray) -> np.ndarray | None:
-    """Square root (P, n) of the covariance of P numbers if two groups of residuals, G' and G'' say, have noise of their
-    own; None if they differ no more than by chance, or if some combination of u is hardly determined.
+    """Square root (P, n) of the covariance of P numbers with the noise of `grouped_sizes`; None if that is None.
 
     Args:
         J, r, slope: as in `uneven_root`.
         second: which residuals are of the second group (n,).
     """
-    size = np.linalg.norm(J, axis=0)
-    if not (np.all(np.isfinite(J)) and np.all(size > 0)):
+    sizes, scale = grouped_sizes(J, r, second), np.linalg.norm(J, axis=0)
+    return None if sizes is None else slope @ (np.linalg.pinv(J / scale) / scale[:, None] * sizes)
+
+
+def grouped_sizes(J: np.ndarray, r: np.ndarray, second: np.ndarray) -> np.ndarray | None:
+    """Deviations (n,) of two groups of residuals, G' and G'' say, that have noise of their own; None if they differ no
+    more than by chance, or if some combination of u is hardly determined. Arguments as in `grouped_root`.
+    """
+    scale = np.linalg.norm(J, axis=0)
+    if not (np.all(np.isfinite(J)) and np.all(scale > 0)):
         return None
-    values = np.linalg.svd(J / size, compute_uv=False)
+    values = np.linalg.svd(J / scale, compute_uv=False)
     if values[-1] < _CONDITION * values[0]:
         return None
-    inverse = np.linalg.pinv(J / size) / size[:, None]
-    leverage = np.einsum("kn,nk->n", inverse, J)
+    leverage = np.einsum("kn,nk->n", np.linalg.pinv(J / scale), J / scale)
     freedom, square = (np.array([v[~second].sum(), v[second].sum()]) for v in (1 - leverage, r**2))
     if not (np.all(freedom > 1) and np.all(square > 0)):
         return None
@@ -79,4 +85,4 @@ def grouped_root(J: np.ndarray, r: np.ndarray, second: np.ndarray, slope: np.nda
     chance = scipy.special.fdtrc(freedom[large], freedom[small], variance[large] / variance[small])
     if large == small or 2 * chance > _CHANCE:
         return None
-    return slope @ (inverse * np.sqrt(variance)[second.astype(int)])
+    return np.sqrt(variance)[second.astype(int)]

@@ -1,0 +1,83 @@
+"""How far noise alone moves the numbers of a fit when points at an end of the band are left out."""
+
+from functools import partial
+
+import numpy as np
+import scipy.special
+
+from fitting.fits.viscoelastic import FLUID, Fit
+from fitting.methods import uncertainty
+from fitting.methods.estimate import with_slope
+from fitting.methods.noise.uneven_noise import grouped_sizes
+from fitting.readers import frequency_sweep
+from fitting.readers.rheometer import Sweep
+
+#: Chance that noise alone moves one of the numbers of a fit far enough to be told.
+CHANCE = 0.05
+#: Where points scatter about a smooth curve by less than this part of the residuals, the model causes the residuals.
+SMOOTH = 0.5
+
+
+def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
+    """Standard deviation by noise alone of the change of each number of `edges.values`, if only the points `kept` (n,)
+    are fitted; to the first order of the noise.
+
+    Both fits share the points that are kept: the change has the variance of the difference, not of the new fit.
+    """
+    J, names, slope = np.asarray(fit.solution.jacobian), *_slopes_of_reported(fit)
+    points = 2 * len(kept)
+    if not (np.all(np.isfinite(J)) and len(J) >= points and len(kept) == len(fit.storage)):
+        return dict.fromkeys(names, 0.0)
+    rows = np.concatenate([kept, kept, np.ones(len(J) - points, bool)])  # rows of a prior stay
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    change = -np.linalg.pinv(J / scale)
+    change[:, rows] += np.linalg.pinv(J[rows] / scale)
+    change = (slope / scale) @ change[:, :points] * _noise_of_residuals(fit, sweep, J[:points])
+    return dict(zip(names, np.linalg.norm(change, axis=1).tolist(), strict=True))
+
+
+def farthest_by_chance(fit: Fit, numbers: int) -> float:
+    """Quantile of Student's t that the largest of the changes at two ends exceeds by chance in `CHANCE` of fits.
+
+    Args:
+        fit: whose residuals give the noise.
+        numbers: how many numbers are compared at each end.
+    """
+    return float(scipy.special.stdtrit(max(1.0, fit.uncertainty.freedom), 1 - CHANCE / (4 * max(1, numbers))))
+
+
+def _slopes_of_reported(fit: Fit) -> tuple[list[str], np.ndarray]:
+    """Names of the numbers and their derivatives by u (P, p), of a compressed sample too."""
+    u = np.asarray(fit.solution.u)
+    if fit.parameters is not None:
+        assert fit.kind.values is not None
+        natural, slope = with_slope(fit.kind.values, u)
+        own = _as_reported(slope, natural, fit.parameters.values)
+        free = [k for k, name in enumerate(fit.kind.names) if not name.startswith("strengths[")]
+        return [fit.kind.names[k] for k in free], own[free]
+    natural, slope = with_slope(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)
+    own, names = _as_reported(slope, natural, fit.uncertainty.values), list(fit.uncertainty.names)
+    if fit.kind.name == FLUID.name:
+        return names, own
+    ratios = slice(1, fit.modes + 1)
+    rest = own[0] * (1 - fit.uncertainty.values[ratios].sum()) - fit.uncertainty.values[0] * own[ratios].sum(axis=0)
+    return [*names, "equilibrium_modulus"], np.vstack([own, rest])
+
+
+def _as_reported(slope: np.ndarray, natural: np.ndarray, reported: np.ndarray) -> np.ndarray:
+    """Slopes (P, p) of the reported numbers: those of the fit times a factor, if the sample was compressed."""
+    return slope * np.divide(reported, natural, out=np.ones_like(natural), where=natural != 0)[:, None]
+
+
+def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
+    """Noise of each residual (2n,), over its scale; residuals that are smooth from point to point are no noise."""
+    r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
+    own = None if fit.kind.effective is not None else grouped_sizes(J, r, np.arange(2 * n) >= n)
+    sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own
+    if len(np.unique(sweep.angular_frequency)) < n:
+        return sizes
+    columns = ((sweep.storage, slice(0, n)), (sweep.loss, slice(n, 2 * n)))
+    for (modulus, rows), deviation in zip(columns, sweep.deviations, strict=True):
+        seen = frequency_sweep.scatter(sweep.angular_frequency, modulus) * modulus / deviation
+        sizes[rows] = np.where(seen < SMOOTH * sizes[rows], seen, sizes[rows])
+    return sizes
