@@ -203,7 +203,9 @@ FLUID = Kind("prony_fluid", generalised_maxwell.natural_fluid)
 
 def _misfit(sweep: Sweep, storage: np.ndarray, loss: np.ndarray, kind: Kind) -> tuple[str, ...]:
     """A sentence with the worst point, if the model does not follow the data."""
-    e = np.abs(np.concatenate([storage / sweep.storage, loss / sweep.loss]) - 1)
+    # A loss that scatters with the phase is as good, in percent of itself, as it is large: compare it with |G*|.
+    size = np.hypot(sweep.storage, sweep.loss) if sweep.sd_estimated else sweep.loss
+    e = np.abs(np.concatenate([storage / sweep.storage - 1, (loss - sweep.loss) / size]))
     if e.mean() < 0.05 and e.max() < 0.3:
         return ()
     worst, n = int(np.argmax(e)), len(storage)

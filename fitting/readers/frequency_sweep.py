@@ -33,6 +33,7 @@ class Sweep(NamedTuple):
     friction: np.ndarray | None = None  # (n,) [Pa] change of G'' by one standard deviation of the bearing's friction
     friction_error: float = 0.0  # this deviation [N m s]
     grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out that show the instrument
+    sd_estimated: bool = False  # the deviations are weights, from the scatter of the points themselves
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -45,7 +46,7 @@ class Sweep(NamedTuple):
     @property
     def noise_given(self) -> bool:
         """Whether deviations are given and are the noise of each point, not the spread between samples."""
-        if self.storage_sd is None:
+        if self.storage_sd is None or self.sd_estimated:
             return False
         return self.relative_deviation < LARGE or not self.point_scatter < self.relative_deviation / SHARED
 
@@ -110,17 +111,23 @@ def scatter(omega: np.ndarray, modulus: np.ndarray) -> float:
     x, y = np.log(omega), np.log(modulus)
     if len(x) < 6:
         return math.inf
-    return min(_distance_from_polynomials(x, y, m) for m in NEIGHBOURS if len(x) >= m + 2)
+    return distance_from_smooth(x, y)
 
 
-def _distance_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> float:
-    """Robust standard deviation of y (n,) from the polynomials of degree m - 2 through m neighbours."""
+def distance_from_smooth(x: np.ndarray, y: np.ndarray) -> float:
+    """Robust standard deviation of y (n,) about a smooth curve over x (n,), ascending; n is 6 or more."""
+    left = (distances_from_polynomials(x, y, m) for m in NEIGHBOURS if len(x) >= m + 2)
+    return min(float(np.median(np.abs(each)) / 0.6745) for each in left)
+
+
+def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarray:
+    """Distances of y (n,) from the polynomials of degree m - 2 through m neighbours, scaled to unit variance."""
     left = []
     for k in range(len(x) - m + 1):
         own = x[k : k + m] - x[k]
         _, _, Vt = np.linalg.svd(np.vander(own, m - 1, increasing=True).T)
-        left.append(Vt[-1] @ y[k : k + m])  # scaled to unit variance
-    return float(np.median(np.abs(left)) / 0.6745)
+        left.append(Vt[-1] @ y[k : k + m])
+    return np.array(left)
 
 
 def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:

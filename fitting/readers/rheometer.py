@@ -15,6 +15,7 @@ from fitting.readers.frequency_sweep import FEWEST, Sweep
 from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
+from fitting.readers.scattering_phase import weighed_by_scatter
 from fitting.readers.tables.complex_moduli import MODULI, column_in_si, fault_of, storage_and_loss, to_shear
 from fitting.readers.tables.sweep_columns import Column, is_tensile
 from fitting.readers.tables.sweep_headings import known_unit
@@ -48,7 +49,7 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
     """
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     chosen, notes = choose_table(str(path), tables, table)
-    found = _sweep(str(path), tables[chosen], notes)
+    found = weighed_by_scatter(_sweep(str(path), tables[chosen], notes))
     return found._replace(notes=(*found.notes, *_what_differs(found)))
 
 
@@ -84,6 +85,18 @@ def _usable(path: str, table: Table, values: dict[int, np.ndarray]) -> tuple[np.
     return good, [f"{len(faults)} of {len(good)} points {verb} left out as unusable: {told}"]
 
 
+def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -> list[str]:
+    """A note if several points are left out because their loss is not above zero."""
+    column, loss = next((first[q] for q in ("loss", "tangent", "phase") if q in first), (None, np.ones(len(good))))
+    count = int(np.sum(~good & (loss <= 0)))
+    if column is None or count < 2:
+        return []
+    return [
+        f"{count} points are left out because {column.name} is not above zero there: those that remain are too high on "
+        "average; if noise is the cause, average repeated sweeps before you fit"
+    ]
+
+
 def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     written = np.asarray(table.rows)
     first: dict[str, tuple[Column, np.ndarray]] = {}
@@ -97,7 +110,7 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     for j, column in enumerate(table.columns):
         if j not in columns and known_unit(column.quantity.removesuffix("_sd"), column.unit):
             _check_agreement(path, first, column, written[:, j], good)
-    notes += left_out
+    notes += [*left_out, *_below_zero(first, good)]
     values = {q: v[good] for q, (_, v) in first.items()}
     omega = values["frequency"]
     if len(np.unique(omega)) < 2:
