@@ -14,7 +14,7 @@ import time
 import numpy as np
 
 from experiments.common import either, plt, save
-from fitting.methods.contact_point import fit_contact
+from fitting.methods.contact_point import fit_with_offset
 from fitting.rigs.thin_layer import Indenter, Layer, dimitriadis
 from liverjax.core.plotting import COLOURS
 
@@ -55,7 +55,7 @@ def fits() -> list[dict]:
         force = MODULUS * layer.force(depth - start)
         begin, found = time.perf_counter(), []
         for _ in range(CURVES):
-            found.append(fit_contact(depth, force + NOISE * force.max() * rng.normal(size=len(depth)), layer.force))
+            found.append(fit_with_offset(depth, force + NOISE * force.max() * rng.normal(size=len(depth)), layer.force))
         seconds = (time.perf_counter() - begin) / CURVES
         row = {"thickness": ratio, "curves": CURVES, "seconds": seconds}
         for k, (name, true) in enumerate((("modulus", MODULUS), ("contact_point", start))):

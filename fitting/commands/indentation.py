@@ -53,7 +53,7 @@ def _notes_on_shape(options: argparse.Namespace) -> list[str]:
 
 def run(options: argparse.Namespace) -> int:
     """Fit the curve; exit code 1 if the modulus is not positive."""
-    from fitting.methods.contact_point import fit_contact, fit_without_tilt
+    from fitting.methods.contact_point import fit_with_offset, fit_without_tilt
     from fitting.readers.indentation_curves import read_indentation
     from fitting.reports import indentation_report
     from fitting.rigs.thin_layer import Indenter, Layer
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     for note in (*_notes_on_shape(options), *curve.notes):
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
-    found = fit_contact(curve.depth, curve.force, layer.force)
+    found = fit_with_offset(curve.depth, curve.force, layer.force)
     level = fit_without_tilt(curve.depth, curve.force, layer.force, found)
     content = indentation_report.write(options.out, curve, rig, found, level)
     print(indentation_report.table(rig, found, content))

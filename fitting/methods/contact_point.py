@@ -32,6 +32,8 @@ class ContactFit(NamedTuple):
     noise: float  # standard deviation of the force [N]
     residuals: np.ndarray  # (n,) [N]
     before: int  # points before contact
+    offset: float = 0.0  # force of the sensor without contact [N]
+    offset_error: float = 0.0
     tilt: float = 0.0  # rise of the base line over all depths [N]
     tilt_error: float = 0.0
     independent: float | None = None  # points of independent noise that measure as much; None: all
@@ -40,11 +42,16 @@ class ContactFit(NamedTuple):
     def quantile(self) -> float:
         """Quantile of Student's t for a 95 % interval."""
         points = len(self.residuals) if self.independent is None else self.independent
-        return float(scipy.special.stdtrit(max(1.0, points - (4 if self.tilt_error else 2)), 0.975))
+        unknowns = 2 + (self.offset_error > 0) + (self.tilt_error > 0)
+        return float(scipy.special.stdtrit(max(1.0, points - unknowns), 0.975))
+
+
+#: Force without contact, with 0, 1 and 2 unknowns.
+BASES = ("zero", "constant", "line")
 
 
 def fit_contact(
-    depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], tilted: bool = False
+    depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], base: str = "zero"
 ) -> ContactFit:
     """Fit modulus and contact point by least squares of the force.
 
@@ -52,10 +59,10 @@ def fit_contact(
         depth: (n,) [m].
         force: (n,) [N].
         unit_force: depths after contact (n,) [m], negative before -> force per unit modulus (n,) [N/Pa].
-        tilted: a straight line is added to the force: the base line of a sensor that drifts.
+        base: force without contact: "zero", "constant" (the sensor's offset is unknown) or "line" (it drifts).
     """
     span = float(np.ptp(depth))
-    line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : 2 if tilted else 0]
+    line = np.stack([np.ones(len(depth)), (depth - depth.mean()) / span], axis=1)[:, : BASES.index(base)]
 
     def linear(start: float) -> tuple[np.ndarray, np.ndarray]:
         f = unit_force(depth - start)
@@ -86,10 +93,12 @@ def fit_contact(
     noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
     sizes, correlation, alike = _errors_of_any_noise(J, residuals, noise)
     independent = None if alike is None else alike.independent
-    tilt = (float(numbers[2]), float(sizes[3] * np.abs(force).max())) if tilted else (0.0, 0.0)
+    # Offset and tilt with their errors; 0 where the base has none.
+    known = [float(v) for pair in zip(numbers[1:], sizes[2:] * np.abs(force).max(), strict=True) for v in pair]
+    known += [0.0] * (4 - len(known))
     before = int(np.sum(depth <= start))
     errors = sizes[:2] * np.array([E, span])
-    return ContactFit(E, start, errors, correlation, noise, residuals, before, *tilt, independent)
+    return ContactFit(E, start, errors, correlation, noise, residuals, before, *known, independent)
 
 
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
@@ -112,6 +121,31 @@ _FREE, _FEWEST = 0.7, 8
 _SEEN, _CLEAR = 2.0, 4.0
 
 
+def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray]) -> ContactFit:
+    """The fit of `fit_contact`; where enough points are before contact, with the offset of the sensor as an unknown.
+
+    No sensor's zero is exact, and an error of it moves the contact point by more than the noise does. Without these
+    points offset and contact point cannot be told apart, and the zero is taken as it is.
+    """
+    plain, free = (fit_contact(depth, force, unit_force, base) for base in BASES[:2])
+    if free.before < _FEWEST or not free.modulus > 0:
+        return plain
+    # A large offset passes for force in contact, and the plain fit has no points before contact. Then the offset must
+    # explain more than another shape would, and the force must not rise before contact.
+    better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
+    slope, error = _rise(depth[depth <= free.contact_point], force[depth <= free.contact_point])
+    flat = abs(slope) < _SEEN * error
+    return free if plain.before >= _FEWEST or (better and flat) else plain
+
+
+def _rise(depth: np.ndarray, force: np.ndarray) -> tuple[float, float]:
+    """Slope of a straight line through points [N/m], and its standard error."""
+    x, y = depth - depth.mean(), force - force.mean()
+    square = max(float(x @ x), 1e-300)
+    slope = float(x @ y / square)
+    return slope, float(np.sqrt(np.sum((y - slope * x) ** 2) / max(len(x) - 2, 1) / square))
+
+
 def fit_without_tilt(
     depth: np.ndarray, force: np.ndarray, unit_force: Callable[[np.ndarray], np.ndarray], plain: ContactFit
 ) -> ContactFit | None:
@@ -124,9 +158,7 @@ def fit_without_tilt(
     free = depth < depth.min() + _FREE * (plain.contact_point - depth.min())
     if free.sum() < _FEWEST or not np.ptp(depth[free]) > 0:
         return None
-    x, y = depth[free] - depth[free].mean(), force[free] - force[free].mean()
-    slope = float(x @ y / (x @ x))
-    noise = float(np.sqrt(np.sum((y - slope * x) ** 2) / (len(x) - 2)))
-    level = fit_contact(depth, force, unit_force, tilted=True)
-    seen = abs(slope) * np.sqrt(x @ x) > _SEEN * noise and slope * level.tilt > 0
+    slope, error = _rise(depth[free], force[free])
+    level = fit_contact(depth, force, unit_force, "line")
+    seen = abs(slope) > _SEEN * error and slope * level.tilt > 0
     return level if seen and abs(level.tilt) > _CLEAR * level.tilt_error else None

@@ -49,10 +49,12 @@ def write(
             "independent_points": fit.independent,
             "mean_relative_error": float(np.mean(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
             "max_relative_error": float(np.max(np.abs(fit.residuals)) / np.max(np.abs(curve.force))),
-            "half_space_young_modulus": float(alone @ curve.force / max(float(alone @ alone), 1e-300)),
+            "half_space_young_modulus": float(alone @ (curve.force - fit.offset) / max(float(alone @ alone), 1e-300)),
             "poisson": rig.poisson,
             "thickness": rig.thickness,
             "points_before_contact": fit.before,
+            "force_offset_N": fit.offset if fit.offset_error else None,
+            "force_offset_standard_error_N": fit.offset_error if fit.offset_error else None,
             "without_tilt": None if level is None else _of_level(level),
             "warnings": indentation_warnings(curve, rig, fit, level),
             "data": curve.source,
@@ -115,13 +117,16 @@ def indentation_warnings(
 
 def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
     """Modulus and contact point ± standard error."""
-    e = content["standard_errors"]
+    e, offset = content["standard_errors"], []
+    if fit.offset_error:
+        offset = [f"F0  {fit.offset:11.5g} ± {fit.offset_error:<9.2g} N, the force before contact"]
     return "\n".join(
         [
             f"{rig.shape} on a bonded layer of {1e3 * rig.thickness:g} mm, Poisson's ratio {rig.poisson:g}",
             f"E   {fit.modulus:11.5g} ± {e['young_modulus']:<9.2g} Pa",
             f"G   {content['shear_modulus']:11.5g} ± {e['shear_modulus']:<9.2g} Pa",
             f"d0  {fit.contact_point:11.5g} ± {e['contact_point']:<9.2g} m",
+            *offset,
             f"a half-space would have E = {content['half_space_young_modulus']:.5g} Pa; no friction, no adhesion",
         ]
     )
