@@ -153,7 +153,7 @@ def test_what_no_law_follows_is_said(tmp_path, tanned):
         (("strain_%", "strein"), "has a column strain"),
         (("strain_%", "strain_mm"), "has a column strain"),
         (("\n1.0,", "\n2.0,"), None),
-        (("storage_modulus_Pa", "storage_modulus_psi"), "psi"),
+        (("storage_modulus_Pa", "storage_modulus_bar"), "bar"),
     ],
 )
 def test_files_that_are_no_strain_sweep_get_a_sentence(tmp_path, tanned, change, words):

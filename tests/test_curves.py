@@ -472,10 +472,28 @@ def test_components_and_named_tests_are_the_same_data(tmp_path):
     assert np.allclose(found[2].F[:, 0, 0], 1.1) and found[2].component == (0, 1)
 
 
+def test_the_same_file_twice_is_refused(tmp_path, capsys):
+    rows = "".join(f"uniaxial,{1 + 0.1 * k},{k}\n" for k in range(6))
+    files = [tmp_path / name for name in ("a.csv", "b.csv")]
+    for file in files:
+        file.write_text("test,stretch,nominal_stress_Pa\n" + rows)
+    assert main(["curves", "neo_hookean", *map(str, files), "--out", str(tmp_path)]) == 2
+    assert "it is the same measurement as" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1", "utf-8-sig"])
+def test_curves_of_any_encoding_are_read_below_their_title(encoding, tmp_path):
+    rows = "".join(f"uniaxial,{1 + 0.1 * k},{k}\n" for k in range(6))
+    text = f"Versuch an Gewebe für Müller\n\ntest,stretch,nominal_stress_kPa\n{rows}"
+    (tmp_path / "c.csv").write_bytes(text.encode(encoding))
+    (found,), notes = curves.read_curves([tmp_path / "c.csv"])
+    assert np.allclose(found.stress, 1e3 * np.arange(6)) and not notes
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "holds no rows"),
+        ("", "is empty"),
         ("a,b\n1,2\n", "has columns a, b"),
         ("test,stretch,nominal_stress_kPa\nbending,1,2\n", "'bending' is not known"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,x\nuniaxial,2,3\nuniaxial,3,3\n", "'x' is not a number"),
@@ -483,6 +501,7 @@ def test_components_and_named_tests_are_the_same_data(tmp_path):
         ("test,stretch,nominal_stress_kPa\nuniaxial,-1,1\nuniaxial,2,3\nuniaxial,3,3\n", "not possible"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,1\nuniaxial,2,3\n", "at least 3"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,2,1\nuniaxial,6,3\nuniaxial,9,4\n", "do not begin near 1"),
+        ("test,shear,nominal_stress_Pa\n" + "".join(f"simple_shear,{k},{k}\n" for k in (0, 10, 30)), "2 % as 0.02"),
         ("test,stretch,force_N\nuniaxial,1,1\n", "no column nominal_stress_Pa"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,0.9,1\nuniaxial,1.1,-1\nuniaxial,1.2,-2\n", "point against"),
     ],

@@ -129,6 +129,12 @@ FILES = {
     "matlab": "% omega G' G''\n" + rows("wsl", " "),
     "markdown": "| f [Hz] | G' [Pa] | G'' [Pa] |\n|---|---|---|\n"
     + "".join(f"| {line} |\n" for line in rows("fsl", " | ").splitlines()),
+    "tension": "Frequency (Hz),Storage modulus E' (Pa),Loss modulus (E'') (Pa)\n"
+    + "".join(f"{f:.9g},{3 * s:.9g},{3 * v:.9g}\n" for f, s, v in zip(HERTZ, G.real, G.imag, strict=True)),
+    "bending": "Winkelfrequenz [rad·s⁻¹];Flexural storage modulus [psi];Tan δ\n"
+    + "".join(f"{w:.9g};{3 * s / 6894.757293168:.9g};{t:.9g}\n" for w, s, t in zip(OMEGA, G.real, TAN, strict=True)),
+    "spanish": "Frecuencia (kHz);Módulo de almacenamiento (Pa);Módulo de pérdida (Pa)\n"
+    + "".join(f"{f / 1e3:.9g};{s:.9g};{v:.9g}\n" for f, s, v in zip(HERTZ, G.real, G.imag, strict=True)),
     "dma": "Frequency\tE'\tTan δ\nHz\tMPa\t\n"
     + "".join(f"{f:.9g}\t{3e-6 * s:.9g}\t{t:.9g}\n" for f, s, t in zip(HERTZ, G.real, TAN, strict=True)),
 }
@@ -147,6 +153,22 @@ def test_it_is_read_as_it_is(name, tmp_path):
     # Numbers were written with seven digits behind the point: the smallest, 0.016 Hz, to 3e-6.
     assert np.allclose(found.angular_frequency, OMEGA, rtol=1e-5)
     assert np.allclose(found.storage, G.real, rtol=1e-5) and np.allclose(found.loss, G.imag, rtol=1e-5)
+
+
+def test_deviations_without_a_name_and_doubtful_thousands_are_told(tmp_path):
+    (tmp_path / "a.csv").write_text(
+        "f (Hz),G' (Pa),SD,G'' (Pa),±\n" + "".join(f"{k},900,9,80,1\n" for k in range(1, 5))
+    )
+    found = read_sweep(tmp_path / "a.csv")
+    assert found.storage_sd is None and any("'SD', '±' are not used" in note for note in found.notes)
+    (tmp_path / "a.csv").write_text(
+        "f (Hz);G' (Pa);G'' (Pa)\n" + "".join(f"{k};410,382;110,{k}00\n" for k in range(1, 5))
+    )
+    assert any("410,382 is read as 410.382" in note for note in read_sweep(tmp_path / "a.csv").notes)
+    (tmp_path / "a.csv").write_text(
+        "f (Hz);G' (Pa);G'' (Pa)\n" + "".join(f"0,{k};410,382;110,{k}00\n" for k in range(1, 5))
+    )
+    assert not read_sweep(tmp_path / "a.csv").notes
 
 
 def test_all_columns_have_the_table_s_decimal_sign():
@@ -198,7 +220,7 @@ def column(name: str, place: int, value: str, head: int = 1, delimiter: str = ",
 HEAD = "frequency_Hz,complex_modulus_Pa,phase_deg\n"
 #: What was done to a file, and a part of the sentence.
 SPOILED = {
-    "psi": (changed("bohlin, phase", (r"\[Pa\]", "[psi]")), r"unit 'psi' of column Complex Modulus \[psi\].*use Pa"),
+    "bar": (changed("bohlin, phase", (r"\[Pa\]", "[bar]")), r"unit 'bar' of column Complex Modulus \[bar\].*use Pa"),
     "milli": (changed("rheowin, complex", ("in Pa", "in mPa")), "unit 'mPa'.*use Pa"),
     "turns": (changed("bohlin, phase", ("°", "turn")), "unit 'turn' of column Phase Angle.*use deg or rad"),
     "rpm": (changed("bohlin, phase", ("Hz", "rpm")), "unit 'rpm'.*use Hz or rad_s"),

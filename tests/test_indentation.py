@@ -132,6 +132,10 @@ def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
             [],
             "the force falls while the depth grows: change its sign",
         ),
+        ("depth_m,force_N\n", [], "there are no numbers below the header in line 1"),
+        ("depth_m,force_N\n" + "".join(f"{k}e-5,0\n" for k in range(8)), [], "the force is the same in all rows"),
+        ("depth_m,force_N\n" + "".join(f"{k}e-5,{k}e200\n" for k in range(8)), [], "beyond any measurement"),
+        ("depth_m,force_N\n0," + 200000 * "1" + "\n", [], "line 2 has more than"),
         ("depth_m,force_N\n0,0\n", ["--thickness", "-1"], "must be above 0"),
         ("depth_m,force_N\n0,0\n", ["--poisson", "0.7"], "must be from 0 to 0.5"),
         ("depth_m,force_N\n0,0\n", ["--radius", "0"], "must be above 0"),
@@ -143,6 +147,35 @@ def test_bad_curves_and_options_are_one_sentence(tmp_path, capsys, text, more, w
     assert main([*command, "--out", str(tmp_path / "out")]) == 2
     told = capsys.readouterr().err
     assert words in told and len(told.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Displacement (um),Indentation (um),Force (mN)",
+        "Displacement (um),Indentation depth [um],Load / mN",
+        "Displacement rate um,Eindringtiefe (um),Kraft (mN)",
+        "Time (s),Indentation,Force\ns,um,mN",
+    ],
+)
+def test_the_right_column_of_several_is_read(tmp_path, header):
+    rows = np.column_stack([1.5e6 * DEPTH, 1e6 * DEPTH, 1e3 * hertz(DEPTH - START)])
+    lines = [",".join(f"{v:.9g}" for v in row) for row in rows]
+    lines[5:5] = [",,"]
+    (tmp_path / "c.csv").write_text("\n".join([header, *lines, ""]))
+    curve = read_indentation(tmp_path / "c.csv")
+    assert np.allclose(curve.depth, DEPTH) and np.allclose(curve.force, hertz(DEPTH - START))
+    told = any("not used: 'Displacement (um)'" in note for note in curve.notes)
+    assert told == header.startswith("Displacement (um)")
+
+
+@pytest.mark.parametrize("points", [20, 200])
+def test_an_unloading_is_no_second_loading(tmp_path, points):
+    depth = np.concatenate([np.linspace(0, 1, points), np.linspace(1, 0, points)[1:]])
+    text = "depth_mm,force_mN\n" + "".join(f"{d:.9g},{d**1.5:.9g}\n" for d in depth)
+    (tmp_path / "c.csv").write_text(text)
+    curve = read_indentation(tmp_path / "c.csv")
+    assert not any("several loadings" in note for note in curve.notes) and len(curve.depth) <= points
 
 
 def test_no_such_file():

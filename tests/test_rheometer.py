@@ -167,7 +167,7 @@ BAD = {
     "no numbers": (HEADER, "no numbers below the header"),
     "no frequency": ("time_s,storage_modulus_Pa,loss_modulus_Pa\n1,2,3\n", "no column for frequency"),
     "no loss": ("frequency_Hz,storage_modulus_Pa\n1,2\n", "no column for loss"),
-    "unit": (HEADER.replace("loss_modulus_Pa", "loss_modulus_psi") + ROWS, "unit 'psi' of column loss_modulus_psi"),
+    "unit": (HEADER.replace("loss_modulus_Pa", "loss_modulus_bar") + ROWS, "unit 'bar' of column loss_modulus_bar"),
     "frequency unit": (HEADER.replace("_Hz", "_rpm") + ROWS, "unit 'rpm'"),
     "negative": (HEADER + ROWS.replace("60", "-60"), "line 3: loss_modulus_Pa = -60 is not positive"),
     "zero": (HEADER + ROWS.replace("60", "0"), "loss_modulus_Pa = 0 is not positive"),
@@ -411,7 +411,7 @@ def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
     for path in (tmp_path / "new.xlsx", old):
         with pytest.raises(InputError, match=r"cannot be read .*export the sheet of the frequency sweep as CSV"):
             read_sweep(path)
-        with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of the curves as CSV"):
+        with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of curves as CSV"):
             read_curves([path])
     monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
     with pytest.raises(InputError, match=r"pip install '\.\[excel\]'"):

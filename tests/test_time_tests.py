@@ -13,6 +13,7 @@ from fitting.__main__ import main
 from fitting.fits import time_tests as fits
 from fitting.methods import time_response
 from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import Sample, read_time_test
 from liverjax import InputError
 
@@ -203,7 +204,7 @@ BAD = {
     "no header": ("1,2\n2,3\n", [], "no header names time_s"),
     "the other test": ("time_s,creep_compliance_1/Pa\n" + ROWS, [], "a relaxation test needs"),
     "few rows": ("time_s,relaxation_modulus_Pa\n1,2\n", [], "1 rows of numbers"),
-    "unit": ("time_s,relaxation_modulus [psi]\n" + ROWS, [], "unit 'psi' of modulus is not known"),
+    "unit": ("time_s,relaxation_modulus [bar]\n" + ROWS, [], "unit 'bar' of modulus is not known"),
     "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is no number"),
     "order": ("time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n0.5,6\n2,5\n3,5\n", [], "follows"),
     "backwards": (
@@ -432,6 +433,23 @@ def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset
     assert found.modes == 1
     G0, ratio = found.uncertainty.values[0], found.uncertainty.values[1]
     assert abs(G0 / 1000 - 1) < 0.006 and abs(G0 * (1 - ratio) / 600 - 1) < 0.006
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Zeit [s];Relaxationsmodul [Pa]",
+        "Zeit / s;Relaxationsmodul / Pa",
+        "Time, s;Relaxation modulus in Pa",
+        "Elapsed time in s;Shear modulus in Pa",
+        "t [s];G(t) [Pa]",
+        "Temps (s);Module de relaxation (Pa)",
+    ],
+)
+def test_headings_of_other_programs_are_read(header, tmp_path):
+    (tmp_path / "t.csv").write_text(header + "\n" + "".join(f"{k};{900 - k}\n" for k in range(1, 9)))
+    columns, _ = read_columns(tmp_path / "t.csv")
+    assert np.allclose(columns["time"], np.arange(1, 9)) and np.allclose(columns["modulus"], 900 - np.arange(1, 9))
 
 
 def test_lines_of_words_unknown_units_and_further_tables_are_told(tmp_path):

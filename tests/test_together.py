@@ -48,6 +48,21 @@ def found() -> together.Together:
     return together.fit([sweep(0.02), relaxation(0.005)], 2)
 
 
+@pytest.mark.parametrize(
+    ("tests", "start", "words"),
+    [
+        ([], TRUTH, "tests is empty"),
+        (None, TRUTH._replace(shear_modulus=-1.0), "shear_modulus = -1"),
+        (None, TRUTH._replace(ratios=np.array([0.7, 0.5])), "add up to less than 1"),
+        (None, TRUTH._replace(relaxation_times=np.array([1.0])), "2 ratios and 1 relaxation_times"),
+    ],
+)
+def test_a_start_from_which_no_joint_fit_begins_is_refused(tests, start, words):
+    tests = [joint.sweep(sweep(0.02))] if tests is None else tests
+    with pytest.raises(InputError, match=words):
+        joint.fit(tests, start, lj.laws.create("neo_hookean", mu=770.0, bulk=7700.0))
+
+
 def test_two_tests_find_what_neither_sees_alone(found):
     errors = found.uncertainty.standard_errors
     values = np.array([800, 0.3, 0.4, 30, 0.1])

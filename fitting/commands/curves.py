@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from fitting.commands import shared_options
 from fitting.commands.exit_codes import EXIT_CODES
 from liverjax import laws
 from liverjax.core.files import writable
@@ -35,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
     from fitting.readers import curves
     from fitting.reports import curves_report
 
+    shared_options.refuse_copies(options.files)
     candidates = stress_stretch.candidates(options.law, options.terms)
     found, notes = curves.read_curves(options.files, options.unit)
     if options.law == "all":

@@ -20,6 +20,15 @@ def add_modes(command: argparse.ArgumentParser) -> None:
     )
 
 
+def refuse_copies(files: list[Path]) -> None:
+    """Refuse files with the same content: they are one measurement, which would count twice."""
+    seen: dict[bytes, Path] = {}
+    for file in (file for file in files if file.is_file()):
+        first = seen.setdefault(file.read_bytes(), file)
+        if first is not file:
+            raise InputError(f"{file}: it is the same measurement as {first}: give each once")
+
+
 def add_cards_and_samples(command: argparse.ArgumentParser) -> None:
     """Options --samples and --cards."""
     command.add_argument("--samples", type=int, metavar="N", help="4 chains of N draws of the posterior, posterior.csv")

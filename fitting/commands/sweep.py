@@ -15,6 +15,7 @@ from liverjax.core.plotting import import_meanwhile
 from liverjax.core.struct import Content
 
 if TYPE_CHECKING:
+    from fitting.commands.together import Measured
     from fitting.fits.posterior import Posterior
     from fitting.fits.simulated_rheometer import Simulation
     from fitting.fits.viscoelastic import Fit
@@ -159,6 +160,7 @@ def run(options: argparse.Namespace) -> int:
         return together.run(options)
     options.method = options.method or "torsion"
     shift: Content = {}
+    tests = _tests_to_predict(options)  # before the fit: a bad file would lose it
     if options.master is None:
         sweep = shared_options.usable_sweep(options, options.sweep[0])
     else:
@@ -173,7 +175,7 @@ def run(options: argparse.Namespace) -> int:
     if options.profile:
         profile = uncertainty.profile_intervals(fits[0].solution, sweep, fits[0].uncertainty)
     posterior = _posterior(options, sweep, fits[-1])
-    predictions = _predictions(options, sweep, fits[-1])
+    predictions = _predictions(tests, sweep, fits[-1])
     content = sweep_report.write(options.out, sweep, fits, profile, posterior)
     print(sweep_report.table(sweep, fits))
     for told in predictions:
@@ -214,17 +216,25 @@ def _master(options: argparse.Namespace) -> tuple["Sweep", dict]:
     return sweep, {"shift": master_curve.shift_numbers(found)}
 
 
-def _predictions(options: argparse.Namespace, sweep: "Sweep", fit: "Fit") -> list[str]:
-    """A sentence on each test that the fit is asked to predict."""
+def _tests_to_predict(options: argparse.Namespace) -> list["Measured"]:
+    """The tests that the fit is asked to predict."""
     if not options.predict:
         return []
     from fitting.commands.together import read_any
-    from fitting.reports import prediction
 
     tests = [read_any(options, path, whole=True) for path in options.predict]
     for test in tests:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
+    return tests
+
+
+def _predictions(tests: list["Measured"], sweep: "Sweep", fit: "Fit") -> list[str]:
+    """A sentence on each test that the fit predicts."""
+    if not tests:
+        return []
+    from fitting.reports import prediction
+
     return [prediction.sentence(prediction.predict(fit, sweep.resolved, test)) for test in tests]
 
 
@@ -260,7 +270,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.profile and options.model != "prony":
         raise InputError(f"--profile works with --model prony only; leave it out for --model {options.model}")
     _note_idle(options)
-    _refuse_copies([*options.sweep, *options.others])
+    shared_options.refuse_copies([*options.sweep, *options.others])
     shared_options.check_samples(options.samples)
     if options.samples and options.model == "spectrum":
         raise InputError("--samples works with models of a few numbers only; leave it out for --model spectrum")
@@ -278,15 +288,6 @@ def _note_idle(options: argparse.Namespace) -> None:
         print(f"note: {name} is for the simulation: it changes nothing in the closed form", file=sys.stderr)
     if several and options.optimizer != "levenberg-marquardt":
         print(f"note: --optimizer {options.optimizer} is for a single sweep: it changes nothing here", file=sys.stderr)
-
-
-def _refuse_copies(files: list[Path]) -> None:
-    """Refuse files with the same content: they are one measurement, which would count twice."""
-    seen: dict[bytes, Path] = {}
-    for file in (file for file in files if file.is_file()):
-        first = seen.setdefault(file.read_bytes(), file)
-        if first is not file:
-            raise InputError(f"{file}: it is the same measurement as {first}: give each once")
 
 
 def _check_friction(options: argparse.Namespace) -> None:

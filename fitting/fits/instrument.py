@@ -68,7 +68,7 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
         moved, words = raw_torque.UNCERTAINTY * sweep.inertia, "the inertia that the instrument subtracted is off by {}"
         out.append(Nuisance("inertia", moved + 0j, raw_torque.UNCERTAINTY, words))
     if sweep.friction is not None:
-        words = "the friction that the instrument subtracted is too small by {}"
+        words = "the friction that the instrument subtracted is off by {}"
         out.append(Nuisance("friction", -1j * sweep.friction, sweep.friction_error, words))
     return out
 

@@ -115,6 +115,7 @@ def fit(
         part: part of the stress that relaxes, as in `Prony`.
         max_iterations, progress: as in `levenberg_marquardt_host`.
     """
+    _check_joint(tests, start, law)
     begin = time.perf_counter()
     worst: list[int] = []
 
@@ -153,6 +154,25 @@ def fit(
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=tuple(worst), seconds=time.perf_counter() - begin)
+
+
+def _check_joint(tests: Sequence[Test], start: generalised_maxwell.Maxwell, law: Law) -> None:
+    """Refuse a start from which no search can begin."""
+    if not tests:
+        raise InputError("tests is empty: give one test or more")
+    if not callable(getattr(law, "shear_modulus", None)):
+        raise InputError(f"law = {law!r} is no law: give e.g. laws.typical('neo_hookean')")
+    ratios, times = (np.atleast_1d(np.asarray(v, float)) for v in (start.ratios, start.relaxation_times))
+    if ratios.shape != times.shape or ratios.ndim != 1:
+        raise InputError(
+            f"start has {ratios.size} ratios and {times.size} relaxation_times: give each mode one of both"
+        )
+    if not (np.isfinite(start.shear_modulus) and start.shear_modulus > 0):
+        raise InputError(f"start: shear_modulus = {start.shear_modulus} must be above 0 Pa: give e.g. 1000.0")
+    if not (np.all(ratios > 0) and ratios.sum() < 1):
+        raise InputError(f"start: ratios = {ratios.tolist()} must be above 0 and add up to less than 1")
+    if not (np.all(times > 0) and np.all(np.isfinite(times))):
+        raise InputError(f"start: relaxation_times = {times.tolist()} must be above 0 s")
 
 
 def _missing(tests: Sequence[Test], material: tuple[Law, Prony]) -> np.ndarray:

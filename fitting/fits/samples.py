@@ -58,7 +58,14 @@ def fit(
         model: one of `models.MODELS`.
         modes: number of Prony modes, or "auto".
         progress: called with the name of each fit.
+
+    Raises:
+        InputError: a single sweep, or an unknown model.
     """
+    if len(sweeps) < 2:
+        raise InputError(f"sweeps has {len(sweeps)} of two or more samples: fit one with viscoelastic.closed_form")
+    if model not in models.MODELS:
+        raise InputError(f"model = {model!r} is not known: use one of {', '.join(models.MODELS)}")
     dense = [generalised_maxwell.refuse_impossible(s) for s in sweeps]
     tried: list[_Candidate] = []
     if model in ("prony", "auto"):

@@ -93,12 +93,14 @@ def fit_contact(
     noise = float(np.sqrt(residuals @ residuals / (len(force) - J.shape[1])))
     sizes, correlation, alike = _errors_of_any_noise(J, residuals, noise)
     independent = None if alike is None else alike.independent
-    # Offset and tilt with their errors; 0 where the base has none.
-    known = [float(v) for pair in zip(numbers[1:], sizes[2:] * np.abs(force).max(), strict=True) for v in pair]
-    known += [0.0] * (4 - len(known))
+    # Offset and tilt, then their errors; 0 where the base has none.
+    (offset, tilt), (offset_error, tilt_error) = (
+        np.append(v, np.zeros(2))[:2] for v in (numbers[1:], sizes[2:] * np.abs(force).max())
+    )
     before = int(np.sum(depth <= start))
     errors = sizes[:2] * np.array([E, span])
-    return ContactFit(E, start, errors, correlation, noise, residuals, before, *known, independent)
+    bases = float(offset), float(offset_error), float(tilt), float(tilt_error)
+    return ContactFit(E, start, errors, correlation, noise, residuals, before, *bases, independent)
 
 
 def _errors_of_any_noise(J: np.ndarray, residuals: np.ndarray, noise: float) -> tuple[np.ndarray, float, Alike | None]:
@@ -133,12 +135,12 @@ def fit_with_offset(depth: np.ndarray, force: np.ndarray, unit_force: Callable[[
     # A large offset passes for force in contact, and the plain fit has no points before contact. Then the offset must
     # explain more than another shape would, and the force must not rise before contact.
     better = np.sum(plain.residuals**2) - np.sum(free.residuals**2) > _CLEAR**2 * free.noise**2
-    slope, error = _rise(depth[depth <= free.contact_point], force[depth <= free.contact_point])
+    slope, error = _slope_and_error(depth[depth <= free.contact_point], force[depth <= free.contact_point])
     flat = abs(slope) < _SEEN * error
     return free if plain.before >= _FEWEST or (better and flat) else plain
 
 
-def _rise(depth: np.ndarray, force: np.ndarray) -> tuple[float, float]:
+def _slope_and_error(depth: np.ndarray, force: np.ndarray) -> tuple[float, float]:
     """Slope of a straight line through points [N/m], and its standard error."""
     x, y = depth - depth.mean(), force - force.mean()
     square = max(float(x @ x), 1e-300)
@@ -158,7 +160,7 @@ def fit_without_tilt(
     free = depth < depth.min() + _FREE * (plain.contact_point - depth.min())
     if free.sum() < _FEWEST or not np.ptp(depth[free]) > 0:
         return None
-    slope, error = _rise(depth[free], force[free])
+    slope, error = _slope_and_error(depth[free], force[free])
     level = fit_contact(depth, force, unit_force, "line")
     seen = abs(slope) > _SEEN * error and slope * level.tilt > 0
     return level if seen and abs(level.tilt) > _CLEAR * level.tilt_error else None

@@ -1,6 +1,5 @@
 """Stress-stretch curves of an incompressible sample: tension, compression, shear, equibiaxial and pure-shear data."""
 
-import csv
 import itertools
 import re
 from pathlib import Path
@@ -8,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers import workbook
-from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, to_number
+from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, split_cells, text_of, to_number
 from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
@@ -76,34 +74,36 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
 
 
 def _rows_of_curves(file: Path) -> list[dict[str, str]]:
-    try:
-        data = file.read_bytes()
-        workbook.refuse_workbook(file, data, "the sheet of the curves")
-        text = data.decode("utf-8-sig")
-    except IsADirectoryError:
-        raise InputError(f"{file} is a folder: give a CSV file of curves") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{file} is not text: give a CSV file of curves") from None
-    except OSError as error:
-        raise InputError(f"{file} cannot be read ({error.strerror}): give a CSV file of curves") from None
+    text = text_of(file, "curves")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if len(lines) < 2:
+    cells = [[c.strip('" ') for c in split_cells(line, _delimiter_of_curves(line))] for line in lines]
+    first = next((k for k, names in enumerate(cells) if _names_curves(names)), 0)
+    end = next((k for k in range(first, len(cells)) if cells[k][:1] == ["[step]"]), len(cells))  # the next sheet
+    if end < first + 2:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
-    between = find_delimiter(lines[0])
-    between = between if between in ";\t" else ","
-    rows = [{k.strip(): (v or "").strip() for k, v in r.items() if k} for r in csv.DictReader(lines, delimiter=between)]
+    names, between = cells[first], _delimiter_of_curves(lines[first])
+    rows = [dict(zip(names, own, strict=False)) for own in cells[first + 1 : end]]
     if between != ",":  # decimals may have commas then
         sign = decimal_sign(cell for row in rows for cell in row.values())
         rows = [{k: _with_point(v, between, sign) for k, v in row.items()} for row in rows]
-    rows = [row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
+    rows = [dict.fromkeys(names, "") | row | {"row": str(k)} for k, row in enumerate(rows, 1) if any(row.values())]
     if not rows:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
-    if "F11" not in rows[0] and not ("test" in rows[0] and {"stretch", "shear"} & set(rows[0])):
+    if not _names_curves(names):
         raise InputError(
-            f"{file} has columns {', '.join(list(rows[0])[:-1])[:100]}: give F11 … F33, P11 … P33, "
+            f"{file} has columns {', '.join(names)[:100]}: give F11 … F33, P11 … P33, "
             "or test, stretch, shear, nominal_stress_kPa"
         )
     return rows
+
+
+def _delimiter_of_curves(line: str) -> str:
+    found = find_delimiter(line)
+    return found if found in ";\t" else ","
+
+
+def _names_curves(names: list[str]) -> bool:
+    return "F11" in names or ("test" in names and bool({"stretch", "shear"} & set(names)))
 
 
 def _with_point(cell: str, between: str, sign: str | None) -> str:
@@ -185,6 +185,8 @@ def _kind(F: np.ndarray) -> str:
 
 #: A test whose smallest stretch is this large began far from rest: strains in % are more likely.
 STRAINED = 1.9
+#: A shear beyond this one is more likely in %.
+SHEARED = 3.0
 #: The same for tests that reach `STRAINED` and have a stretch below this one with a stress of the same sign.
 SHORTENED = 0.9
 
@@ -205,6 +207,11 @@ def _named_tests(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], 
         shear = homogeneous.TESTS[test] == "shear"
         stretch = _column(file, group, "stretch", 1.0 if shear else None)
         driven = _column(file, group, "shear") if shear else stretch
+        if shear and np.abs(driven).max() > SHEARED:
+            raise InputError(
+                f"{file}: a shear of {driven[np.argmax(np.abs(driven))]:g} is too large: a shear is the displacement "
+                "over the height; write a shear of 2 % as 0.02"
+            )
         if np.any(stretch <= 0):
             raise InputError(f"{file}: a stretch of {stretch.min():g} is not possible: give length over rest length")
         if not shear and stretch.min() >= STRAINED:

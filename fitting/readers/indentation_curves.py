@@ -7,12 +7,26 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
-from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, split_cells, text_of, to_number
+from fitting.readers.tables.text_tables import (
+    decimal_sign,
+    find_delimiter,
+    means_nothing,
+    split_cells,
+    text_of,
+    to_number,
+)
 from fitting.readers.units import INDENTATION_UNITS
 from liverjax.core.errors import InputError
 
-#: First words of the two columns.
-_WORDS = {"depth": ("depth", "displacement", "indentation"), "force": ("force", "load")}
+#: First words of the two columns; of several columns the one with the earlier word is read.
+_WORDS = {
+    "depth": ("indentation", "eindringtiefe", "enfoncement", "depth", "tiefe", "profondeur", "displacement", "weg"),
+    "force": ("force", "kraft", "load", "normal force"),
+}
+#: Words of columns that are something else: a speed, an error.
+_NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus", "time", "cell"}
+#: A number beyond this one, in SI units, is no measurement.
+_LARGEST = 1e30
 _FEWEST = 6
 #: A loading ends where the indenter goes back by this part of the depth; a longer hold at its end, in points, is cut.
 _BACK, _HELD = 0.1, 0.15
@@ -41,22 +55,25 @@ def read_indentation(path: str | Path) -> IndentationCurve:
         InputError: one sentence naming file, column or line, value and remedy.
     """
     lines = text_of(Path(path), "an indentation curve").splitlines()
-    head = next((k for k, line in enumerate(lines) if all(_depth_and_force(line).values())), None)
+    head = next((k for k, line in enumerate(lines) if len(_depth_and_force(lines, k)) == 2), None)
     if head is None:
         raise InputError(f"{path}: no header names depth and force with units; write depth_mm,force_mN above the rows")
-    delimiter = find_delimiter(lines[head])
-    columns = {
-        quantity: _in_si_units(str(path), lines[head + 1 :], head + 2, delimiter, *place)
-        for quantity, place in _depth_and_force(lines[head]).items()
-        if place is not None
-    }
+    found, delimiter = _depth_and_force(lines, head), find_delimiter(lines[head])
+    columns, notes = _in_si_units(str(path), lines, head, delimiter, found)
+    notes = [*_told_of_others(lines, head, found), *notes]
     depth, force = columns["depth"], columns["force"]
-    last, notes = _end_of_loading(depth, force)
+    if not len(depth):
+        raise InputError(
+            f"{path}: there are no numbers below the header in line {head + 1}; give {_FEWEST} rows or more"
+        )
+    last, told = _end_of_loading(depth, force)
+    notes += told
     if last < _FEWEST or np.ptp(depth[:last]) == 0:
         falls = len(depth) >= _FEWEST and np.argmax(depth) < len(depth) / 10 and depth[-1] < depth[0]
         pulls = len(force) >= _FEWEST and np.mean(force) < 0 and np.argmin(force) > len(force) / 2
         remedy = "the depth falls: it must grow further in, so change its sign" if falls else "give more of them"
         remedy = "the force falls while the depth grows: change its sign" if pulls and not falls else remedy
+        remedy = "the force is the same in all rows: is the right column named?" if np.ptp(force) == 0 else remedy
         raise InputError(f"{path}: {last} loading points; a fit needs {_FEWEST} or more, at different depths: {remedy}")
     depth, force = depth[:last], force[:last]
     offset = _offset(force)
@@ -71,7 +88,9 @@ def _end_of_loading(depth: np.ndarray, force: np.ndarray) -> tuple[int, list[str
     back = np.maximum.accumulate(depth) - depth > _BACK * np.ptp(depth)
     end = int(np.argmax(back)) if back.any() else number
     last = int(np.argmax(depth[:end])) + 1
-    if np.any(depth[end:] > depth[last - 1] - 2 * _BACK * np.ptp(depth)):
+    # After the way back the indenter comes down again, by more than the part that counts as back.
+    after = depth[end:]
+    if len(after) and np.max(after - np.minimum.accumulate(after)) > _BACK * np.ptp(depth):
         notes.append("the file has several loadings: the first is fitted")
     reached = [int(np.argmax(v[:last] >= np.max(v[:last]) - _margin(v[:last]))) + 1 for v in (depth, force)]
     if last - min(reached) > max(5, _HELD * last):
@@ -101,30 +120,73 @@ def _margin(values: np.ndarray) -> float:
     return 2 * noise_of_series(values) + 0.005 * float(np.ptp(values))
 
 
-def _depth_and_force(line: str) -> dict[str, tuple[int, float] | None]:
-    """Places of both columns in a line; None if the line does not name one of them."""
-    cells = split_cells(line, find_delimiter(line))
-    return {quantity: _place_and_factor(cells, quantity) for quantity in _WORDS}
+class _PlacedColumn(NamedTuple):
+    """A column of the table."""
+
+    column: int  # from 0
+    name: str
+    factor: float  # to SI
 
 
-def _place_and_factor(cells: list[str], quantity: str) -> tuple[int, float] | None:
-    """Column and factor to SI of the heading that names a quantity with its unit."""
+def _depth_and_force(lines: list[str], head: int) -> dict[str, _PlacedColumn]:
+    """The column of each quantity that a line names, with its unit there or in the line below."""
+    cells = split_cells(lines[head], find_delimiter(lines[head]))
+    below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
+    found = {}
+    for quantity in _WORDS:
+        places = _places(cells, below, quantity)
+        if places:
+            found[quantity] = places[0]
+    return found
+
+
+def _places(cells: list[str], below: list[str], quantity: str) -> list[_PlacedColumn]:
+    """Columns of a quantity, best first: those whose heading, with a unit, begins with one of its words."""
+    found, units = [], INDENTATION_UNITS[quantity]
     for j, cell in enumerate(cells):
-        words = [w for w in re.split(r"[\s_()\[\]#\"]+", cell) if w]
-        if len(words) > 1 and words[0].lower() in _WORDS[quantity] and words[-1] in INDENTATION_UNITS[quantity]:
-            return j, INDENTATION_UNITS[quantity][words[-1]]
-    return None
+        words = [w for w in re.split(r"[\s_()\[\]#\"/,]+", cell) if w]
+        unit = words[-1] if len(words) > 1 and words[-1] in units else None
+        if unit is None and j < len(below):
+            unit = next((w for w in [below[j].strip('[]() "')] if w in units), None)
+        rank = next((k for k, word in enumerate(_WORDS[quantity]) if cell.lower().lstrip('# "').startswith(word)), None)
+        if unit is not None and rank is not None and not _NOT & {w.lower() for w in words}:
+            found.append((rank, j, _PlacedColumn(j, cell.strip('# "'), units[unit])))
+    return [place for _, _, place in sorted(found)]
 
 
-def _in_si_units(path: str, lines: list[str], first: int, delimiter: str, place: int, factor: float) -> np.ndarray:
-    values = []
-    numbered = [(k, line) for k, line in enumerate(lines, first) if line.strip(f"{delimiter} \t")]
+def _told_of_others(lines: list[str], head: int, found: dict[str, _PlacedColumn]) -> list[str]:
+    """A note for a quantity that several columns name."""
+    cells = split_cells(lines[head], find_delimiter(lines[head]))
+    below = split_cells(lines[head + 1], find_delimiter(lines[head])) if head + 1 < len(lines) else []
+    notes = []
+    for quantity, place in found.items():
+        others = [each.name for each in _places(cells, below, quantity) if each != place]
+        if others:
+            notes.append(f"the {quantity} is the column {place.name!r}; not used: {', '.join(map(repr, others))}")
+    return notes
+
+
+def _in_si_units(
+    path: str, lines: list[str], head: int, delimiter: str, found: dict[str, _PlacedColumn]
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns in SI units; then a note on rows with an empty cell, which are left out."""
+    numbered = [(k, line) for k, line in enumerate(lines[head + 1 :], head + 2) if line.strip(f"{delimiter} \t")]
     rows = [(k, split_cells(line, delimiter)) for k, line in numbered if not line.lstrip().startswith("#")]
-    sign = decimal_sign(cell for _, cells in rows for cell in cells)
+    if rows and means_nothing(rows[0][1][p.column] for p in found.values() if p.column < len(rows[0][1])):
+        rows = rows[1:]  # the line of units
+    sign, kept, empty = decimal_sign(cell for _, cells in rows for cell in cells), [], 0
     for number, cells in rows:
-        value = to_number(cells[place], delimiter, sign) if place < len(cells) else None
-        if value is None or not np.isfinite(value):
-            shown = repr(cells[place]) if place < len(cells) else "missing"
-            raise InputError(f"{path}: line {number}: {shown} is not a finite number; correct or remove the line")
-        values.append(factor * value)
-    return np.array(values)
+        shown = [cells[p.column] if p.column < len(cells) else "" for p in found.values()]
+        values = [to_number(cell, delimiter, sign) for cell in shown]
+        wrong = [cell for cell, value in zip(shown, values, strict=True) if value is None or np.isinf(value)]
+        if wrong:
+            raise InputError(f"{path}: line {number}: {wrong[0]!r} is not a finite number; correct or remove the line")
+        if np.any(np.isnan(np.array(values, float))):
+            empty += 1
+            continue
+        kept.append(values)
+    table = np.array(kept, float).reshape(-1, len(found)) * [p.factor for p in found.values()]
+    if np.any(np.abs(table) > _LARGEST):
+        raise InputError(f"{path}: {np.abs(table).max():g} is beyond any measurement: correct the unit or the row")
+    notes = [f"{empty} of {len(rows)} rows are left out: a cell in them is empty"] if empty else []
+    return dict(zip(found, table.T, strict=True)), notes

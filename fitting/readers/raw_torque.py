@@ -27,6 +27,9 @@ HEADINGS = (
     ("shear strain", "strain"),
     ("strain amplitude", "strain"),
     ("strain", "strain"),
+    ("scherdeformation", "strain"),
+    ("deformation", "strain"),
+    ("déformation", "strain"),
 )
 
 

@@ -99,6 +99,7 @@ def _below_zero(first: dict[str, tuple[Column, np.ndarray]], good: np.ndarray) -
 
 def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
     written = np.asarray(table.rows)
+    notes += table.notes
     first: dict[str, tuple[Column, np.ndarray]] = {}
     columns: dict[int, np.ndarray] = {}
     for j, column in enumerate(table.columns):

@@ -29,7 +29,7 @@ def tables(text: str) -> str | None:
             lines.append("")
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
-    return "\n".join(lines)
+    return "\n".join(lines) if lines else None
 
 
 def _is_column(values: list) -> bool:

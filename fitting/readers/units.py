@@ -5,11 +5,13 @@ import numpy as np
 #: mPa is left out on purpose: it may be a millipascal or a careless MPa, a factor of 1e9.
 MODULUS_UNITS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9} | {"pa": 1.0, "kpa": 1e3, "gpa": 1e9, "MPA": 1e6}
 MODULUS_UNITS |= dict.fromkeys(("N/m2", "N/m²", "N/m^2"), 1.0) | {"N/mm2": 1e6, "N/mm²": 1e6, "N/mm^2": 1e6}
+MODULUS_UNITS |= {"psi": 6894.757293168, "ksi": 6894757.293168}
 MODULUS_UNITS |= dict.fromkeys(("dyn/cm2", "dyn/cm²", "dyn/cm^2", "dyne/cm2", "dyne/cm²", "dyne/cm^2"), 0.1)
 #: Units in `PER_SECOND` do not show a factor of 2 pi, so they are accepted only in columns that are called angular.
-PER_SECOND = ("1/s", "s-1", "s^-1")
-FREQUENCY_UNITS = {"hz": 2 * np.pi} | dict.fromkeys(("rad/s", "rad/sec", "rad_s", *PER_SECOND), 1.0)
+PER_SECOND = ("1/s", "s-1", "s^-1", "s⁻¹")
+FREQUENCY_UNITS = {"hz": 2 * np.pi, "khz": 2e3 * np.pi} | dict.fromkeys(("rad/s", "rad/sec", "rad_s", *PER_SECOND), 1.0)
 FREQUENCY_UNITS |= dict.fromkeys(("rad s-1", "rad_s-1", "rad s^-1", "rad·s-1", "rad.s-1", "rad*s-1"), 1.0)
+FREQUENCY_UNITS |= dict.fromkeys(("rad s⁻¹", "rad·s⁻¹", "rad/sek"), 1.0)
 ANGLE_UNITS = dict.fromkeys(("°", "º", "deg", "degree", "degrees", "grad"), np.pi / 180) | {"rad": 1.0, "mrad": 1e-3}
 TANGENT_UNITS = dict.fromkeys(("", "-", "1", "none"), 1.0)
 VISCOSITY_UNITS = {

@@ -44,12 +44,6 @@ def text(path: Path, data: bytes, wanted: str) -> str:
     return "\n".join(line for part in parts for line in part)
 
 
-def refuse_workbook(path: Path, data: bytes, wanted: str) -> None:
-    """Raise `InputError` if the bytes are a workbook but text is needed; it says to export `wanted` as CSV."""
-    if is_one(data):
-        raise InputError(f"{path} is a spreadsheet workbook, not text: open it, export {wanted} as CSV, and give that")
-
-
 def _line(cell: object) -> str:
     """A cell without the characters that end a cell or a line; numbers with all their digits."""
     return " ".join(str(cell).split())

@@ -53,7 +53,9 @@ def first_missing(columns: list[Column]) -> str:
 
 def is_angular(column: Column) -> bool:
     """Whether the heading names an angular frequency."""
-    return bool(re.match(r"\s*(ang|omega|ω|kreisf|circular|radian|pulsation|w\b)", column.name.lower()))
+    return bool(
+        re.match(r"\s*(ang|omega|ω|kreisf|winkelf|circular|radian|pulsa|frecuencia ang|w\b)", column.name.lower())
+    )
 
 
 def header_columns(cells: list[str]) -> list[Column]:
@@ -96,7 +98,9 @@ def columns_beside(cells: list[str], units: list[str], used: list[Column]) -> li
 
 def is_tensile(column: Column) -> bool:
     """Whether the heading names a modulus of tension or bending, E."""
-    return bool(re.match(r"\s*e['′’_ ]|\s*epp?\b|\s*[(|]?e\b|\s*tensile", column.name.lower().replace('"', "'")))
+    name = re.sub('[′’`´″”"]', "'", column.name.lower())
+    words = r"\b(tensile|young|flexural|bending|compressive|zug|biege)|(?:^|[\s(\[|_])e('|\*)"
+    return bool(re.match(r"\s*e[_ ]|\s*epp?\b|\s*[(|]?e\b", name) or re.search(words, name))
 
 
 #: Units of temperature: factor and offset to kelvin.

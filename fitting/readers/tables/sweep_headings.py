@@ -12,16 +12,18 @@ WORDS = {
     "frequency": (
         *("angular frequency", "ang frequency", "angular freq", "ang freq", "angular velocity", "angular", "omega"),
         *("circular frequency", "radian frequency", "frequency", "freq", "f", "w"),
-        *("kreisfrequenz", "frequenz", "pulsation", "fréquence"),
+        *("kreisfrequenz", "winkelfrequenz", "frequenz", "pulsation", "fréquence"),
+        *("frecuencia angular", "frecuencia", "pulsazione", "frequenza"),
     ),
     "storage": (
         *("g'", "gp", "gprime", "g prime", "e'", "ep", "e stor", "e storage", "storage modulus", "storage mod"),
         *("stor modulus", "elastic modulus", "modulus elastic component", "speichermodul", "storage"),
-        *("module de conservation", "module élastique"),
+        *("module de conservation", "module élastique", "módulo de almacenamiento", "modulo conservativo"),
     ),
     "loss": (
         *("g''", "gpp", "g double prime", "gdoubleprime", "e''", "epp", "e loss", "loss modulus", "loss mod"),
         *("viscous modulus", "modulus viscous component", "verlustmodul", "loss", "module de perte", "module visqueux"),
+        *("módulo de pérdida", "módulo de pérdidas", "modulo dissipativo"),
     ),
     "complex": (
         *("g*", "e*", "complex modulus", "complex shear modulus", "modulus complex component"),
@@ -37,6 +39,8 @@ WORDS = {
     ),
     "viscosity": ("complex viscosity", "eta*", "komplexe viskosität", "viscosité complexe"),
 }
+#: Words before the name of a modulus.
+KINDS = ("shear", "dynamic", "tensile", "flexural", "bending", "compressive", "young's", "youngs", "young")
 UNCERTAIN = {"storage", "loss", "f", "w", "phase", "delta", "angular"}
 _LONGEST_FIRST = sorted(
     ((words.split(), quantity) for quantity, names in WORDS.items() for words in names),
@@ -74,7 +78,7 @@ def quantity_of(cell: str) -> tuple[str, str | None] | None:
     words = [w for w in re.split(r"[\s_.,:()\[\]]+", name) if w]
     spread = any(w.lower() in DEVIATION_WORDS for w in words)
     words = [w for w in words if w.lower() not in DEVIATION_WORDS | {"standard", "mean"}]
-    while len(words) > 1 and words[0].lower() in ("shear", "dynamic", "tensile"):
+    while len(words) > 1 and words[0].lower() in KINDS:
         words = words[1:]
     lower = [w.lower() for w in words]
     found = next(((first, q) for first, q in _LONGEST_FIRST if lower[: len(first)] == first), None)

@@ -16,6 +16,7 @@ from fitting.readers.tables.sweep_columns import (
     header_columns,
     is_complete,
 )
+from fitting.readers.tables.sweep_headings import DEVIATION_WORDS
 from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, means_nothing, split_cells, to_number
 from fitting.readers.units import MODULUS_UNITS
 from liverjax.core.errors import InputError
@@ -34,6 +35,7 @@ class Table(NamedTuple):
     raw: dict[str, np.ndarray]  # raw measurements of the instrument, one value per row
     strain_unit: str = ""  # unit of the strain column, as the file states it
     beside: tuple[tuple[Column, np.ndarray], ...] = ()  # columns that the sweep does not need, for comparison
+    notes: tuple[str, ...] = ()  # on headings and numbers of two meanings
 
     @property
     def frequencies(self) -> int:
@@ -67,6 +69,7 @@ def choose_table(
 
 def _named(path: str, tables: list[Table], names: list[str], wanted: str) -> int:
     """Index of the table with this number or name, or of the only table whose name contains the text."""
+    wanted = str(wanted)
     if wanted.isdecimal() and 1 <= int(wanted) <= len(tables):
         return int(wanted) - 1
     sought = wanted.strip().lower()
@@ -130,9 +133,31 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
             unit = raw_torque.unit_of("strain", cells, units[-1] if units else [])
             others = [c for c in columns_beside(cells, units[-1] if units else [], columns) if c.place < len(cells)]
             beside = tuple((c, _cells_of(c.place, own, delimiter, sign)) for c in others)
-            tables.append(Table(name, columns, rows, numbers, raw, unit, beside))
+            told = (*_nameless_deviations(cells), *_perhaps_thousands(own, columns, sign))
+            tables.append(Table(name, columns, rows, numbers, raw, unit, beside, told))
         free = k
     return tables, headers
+
+
+def _nameless_deviations(cells: list[str]) -> list[str]:
+    """A note on headings such as "SD" and "±", which do not say of which modulus."""
+    words = [re.sub(r"[^a-z±]", " ", cell.lower()).split() for cell in cells]
+    found = [c for c, own in zip(cells, words, strict=True) if own and set(own) <= {*DEVIATION_WORDS, "±", "pa", "kpa"}]
+    if not found:
+        return []
+    return [
+        f"columns {', '.join(map(repr, found))} are not used: they do not say of what they are the deviations; name "
+        "them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
+    ]
+
+
+def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str | None) -> list[str]:
+    """A note if each number that has a comma may be one with separated thousands: "410,382"."""
+    cells = [row[c.place].strip('" ') for row in rows for c in columns if c.place < len(row)]
+    shown = next((cell for cell in cells if re.fullmatch(r"[1-9]\d{0,2},\d{3}", cell)), None)
+    if sign is not None or shown is None:
+        return []
+    return [f"{shown} is read as {shown.replace(',', '.')}: if thousands are separated, write the numbers without"]
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:

@@ -10,6 +10,9 @@ from pathlib import Path
 from fitting.readers import trios_json, workbook
 from liverjax.core.errors import InputError
 
+#: Longest line of a table; Python's reader of CSV refuses longer cells.
+LONGEST_LINE = 131072
+
 
 def text_of(path: Path, what: str = "a frequency sweep") -> str:
     """Content of a text file of any encoding, or of a workbook. `InputError` if it is neither; it names `what`."""
@@ -26,6 +29,11 @@ def text_of(path: Path, what: str = "a frequency sweep") -> str:
     if workbook.is_one(data):
         return workbook.text(path, data, f"the sheet of {what.replace('a ', 'the ', 1)}")
     text = _decoded(path, data)
+    long = next((k for k, line in enumerate(text.splitlines(), 1) if len(line) > LONGEST_LINE), None)
+    if long is not None and not text.lstrip().startswith("{"):
+        raise InputError(
+            f"{path}: line {long} has more than {LONGEST_LINE} characters: no table has that; export again"
+        )
     if text.lstrip().startswith("{"):
         found = trios_json.tables(text)
         if found is None:

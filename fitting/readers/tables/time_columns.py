@@ -15,6 +15,31 @@ from liverjax.core.errors import InputError
 
 #: Words that begin a heading, and the quantity; the longer ones come first.
 WORDS = (
+    ("relaxationsmodul", "modulus"),
+    ("schubmodul", "modulus"),
+    ("module de relaxation", "modulus"),
+    ("kriechnachgiebigkeit", "compliance"),
+    ("complaisance", "compliance"),
+    ("scherdeformation", "strain"),
+    ("deformation", "strain"),
+    ("dehnung", "strain"),
+    ("déformation", "strain"),
+    ("schubspannung", "stress"),
+    ("scherspannung", "stress"),
+    ("contrainte", "stress"),
+    ("drehmoment", "torque"),
+    ("auslenkwinkel", "angle"),
+    ("normal force", "force"),
+    ("normalkraft", "force"),
+    ("kraft", "force"),
+    ("load", "force"),
+    ("extension", "displacement"),
+    ("déplacement", "displacement"),
+    ("weg", "displacement"),
+    ("elapsed time", "time"),
+    ("test time", "time"),
+    ("zeit", "time"),
+    ("temps", "time"),
     ("relaxation modulus", "modulus"),
     ("shear modulus", "modulus"),
     ("modulus", "modulus"),
@@ -34,6 +59,7 @@ WORDS = (
     ("displacement", "displacement"),
     ("step time", "time"),
     ("time", "time"),
+    ("t", "time"),
 )
 #: Quantities that a file must have in addition to the time, best first.
 FORMS = (
@@ -130,7 +156,7 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
         name = (text[: bracket.start()] if bracket else text).replace("_", " ").strip()
         for word, quantity in WORDS:
             if name.lower().startswith(word):
-                rest = name[len(word) :].strip()
+                rest = re.sub(r"^(?:[/,]|in\b)\s*", "", name[len(word) :].strip())  # "Zeit / s", "time, s", "time in s"
                 if rest and not _known_column(quantity, rest):
                     break  # "strain rate", "stress (step)"
                 found.setdefault(quantity, (k, unit or rest or None))
