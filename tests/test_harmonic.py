@@ -1,6 +1,7 @@
 """Harmonic motion: against waves in closed form, against runs in time, and its derivatives."""
 
 import json
+import tomllib
 
 import h5py
 import jax
@@ -12,7 +13,9 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
+from liverjax.jobs import waves
 from liverjax.laws.base import Law
+from liverjax.scenes.scene_file import scene_from
 from liverjax.simulation.cautions import cautions_of_waves
 
 pytestmark = pytest.mark.quick_to_compile
@@ -305,6 +308,31 @@ def test_an_undamped_resonance_is_told():
 def test_what_cannot_be_is_refused(changes, words):
     with pytest.raises(lj.InputError, match=words):
         lj.harmonic(**{"scene": slab(2, 1), "frequencies_Hz": FREQUENCIES} | changes)
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        {"law": {"mu": 9000.0}},
+        {"law": {"name": "yeoh", "c1": 4500.0, "c2": 100.0, "c3": 10.0, "bulk": 90000.0}},
+        {"viscosity": {"ratios": [0.1]}},
+    ],
+    ids=["numbers", "law", "viscosity"],
+)
+def test_the_state_of_rest_of_regions_has_relaxed(region):
+    """Against a static run of very long steps, in which all modes relax: regions kept their first moduli, 12 % off."""
+    content = tomllib.loads(FILE) | {"viscosity": {"ratios": [0.5], "relaxation_times": [0.1]}}
+    content["region"] = [{"where": {"x_min": 0.0149}} | region]
+    content["mesh"] = content["mesh"] | {"cells": [4, 1, 1]}
+    content["body"] = {"density": 1000.0, "gravity": [-3.0, 0.0, 0.0]}
+    content["fixed"] = [{"where": {"x_max": 0.0}}]
+    del content["displaced"]
+    content["solve"] = {"kind": "static", "dt": 1e6, "steps": 4}
+    long = lj.simulate(scene_from(content)).check().positions[-1]
+    content["solve"] = {"kind": "harmonic", "frequencies": [40.0]}
+    rest = waves._under_its_weight(scene_from(content))
+    moved = np.abs(long - scene_from(content).mesh.points).max()
+    assert np.abs(rest - long).max() < 1e-6 * moved  # Newton's tolerance of 1e-8, and modes of exp(-1e7)
 
 
 def test_histories_are_refused():

@@ -329,6 +329,19 @@ def test_elements_named_twice_and_reduced_models_are_refused():
         refuse_unknown_physics(pulled("static", lambda e: lj.Region(elements=e, law=TUMOUR)))
 
 
+def test_volumes_of_several_kinds_are_not_mixed():
+    """Pressures as unknowns have one kind of U(J): with two, all elements had the first one's, 25 % off and unsaid."""
+    own = {"name": "neo_hookean", "mu": 800.0, "bulk": 3000.0, "volumetric": "log"}
+    region = {"region": [{"where": {"z_min": 0.01}, "law": own}]}
+    with pytest.raises(lj.InputError, match="one kind of volumetric energy in all laws"):
+        scene_from(CONTENT | region | {"solve": {"volumetric": "mixed"}})
+    mesh = {"mesh": CONTENT["mesh"] | {"order": 2}}
+    scene = scene_from(CONTENT | region | mesh | {"solve": {"volumetric": "auto"}})
+    assert prepared(scene).solve.volumetric == "element"
+    region["region"][0]["law"]["volumetric"] = "quadratic"
+    assert prepared(scene_from(CONTENT | region | mesh | {"solve": {"volumetric": "auto"}})).solve.volumetric == "mixed"
+
+
 def test_numbers_out_of_bounds_have_their_place():
     with pytest.raises(lj.InputError, match=r"region\.0\.law\.bulk"):
         lj.check_scene(pulled("static", lambda e: lj.Region(elements=e, law=dataclasses.replace(LIVER, bulk=-1.0))))

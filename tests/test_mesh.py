@@ -12,6 +12,7 @@ import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.mesh.files import meshio_cells
 from liverjax.mesh.refinement import refined
+from liverjax.scenes.regions import select_elements
 from liverjax.simulation.automatic import qualities
 from liverjax.tensors.matrices import deformation_gradient, pack
 
@@ -32,6 +33,16 @@ def test_generated_mesh_is_conforming(name):
     # Euler's formula of a ball's boundary: triangles = 2 * (boundary nodes) - 4.
     outer = [f for f, n in count.items() if n == 1]
     assert len(outer) == 2 * len(np.unique(outer)) - 4
+
+
+def test_a_set_without_nodes_or_elements_is_no_place():
+    """It held nothing, and the body fell freely, with status 0."""
+    mesh = lj.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    mesh = replace(mesh, node_sets={"EMPTY": np.empty(0, int)}, element_sets={"EMPTY": np.empty(0, int)})
+    with pytest.raises(lj.InputError, match="fixed: the node set 'EMPTY' of the mesh holds no node"):
+        lj.boundary.select(mesh, None, "EMPTY", "fixed")
+    with pytest.raises(lj.InputError, match="the element set 'EMPTY' of the mesh holds no element"):
+        select_elements(mesh, None, "EMPTY")
 
 
 def test_volumes():

@@ -18,6 +18,7 @@ from liverjax.core.struct import replace
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.play import pulling
 from liverjax.play.server import PlayServer
+from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -100,6 +101,24 @@ def test_loads_act_before_anyone_pulls(still, monkeypatch):
     monkeypatch.setattr(pulling, "compiled", lambda *_: lambda *_: (failed, None))
     with pytest.raises(InputError, match="load step 2 of 2, before anyone pulls: the stiffness"):
         pulling.at_rest(raised())
+
+
+def test_motions_end_where_a_run_ends_and_stay_there():
+    """A plane that presses and nodes that move within 2 steps of time: as in the run, then at rest."""
+    content = {
+        "mesh": {"shape": "box", "size": [0.02, 0.02, 0.02], "cells": [2, 2, 2]},
+        "law": {"name": "neo_hookean", "mu": 1000.0, "bulk": 3000.0},
+        "displaced": [{"where": {"z_max": 0.0}, "by": [0.0, 0.0, 0.001]}],
+        "obstacle": [{"shape": "plane", "axis": [0, 0, -1], "position": [0, 0, 0.02], "by": [0, 0, -0.001]}],
+        "solve": {"steps": 2, "dt": 0.1},
+    }
+    scene = scene_from(content)
+    expected, playing = lj.simulate(scene).check().positions, pulling.at_rest(scene)
+    assert np.ptp(expected[1][:, 2]) < 0.0185
+    for k in range(3):
+        playing = pulling.pulled(playing)
+        # Newton's tolerance, and the spring that does not pull.
+        np.testing.assert_allclose(playing.positions, expected[min(k, 1)], atol=1e-8)
 
 
 @pytest.fixture

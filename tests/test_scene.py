@@ -165,6 +165,7 @@ REFUSED = {
     "two meshes": (lambda c: c["mesh"].update(file="a.vtu"), "either file"),
     "where meets nothing": (lambda c: c["fixed"][0].update(where={"z_max": -1.0}), "meets no node"),
     "unknown where": (lambda c: c["fixed"][0].update(where={"zmax": 0.0}), "did you mean z_max"),
+    "place beyond numbers": (lambda c: c["fixed"][0].update(where={"z_max": 10**400}), "is not a length"),
     "unknown set": (lambda c: c["fixed"][1].update(set="vena_cava"), "no node set 'vena_cava'"),
     "ratios add up": (lambda c: c["viscosity"].update(ratios=[0.5, 0.6]), "less than 1"),
     "viscosity without dt": (lambda c: c["solve"].pop("dt"), "no dt, which viscosity needs"),

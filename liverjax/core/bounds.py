@@ -161,6 +161,28 @@ def finite(value: float) -> bool:
         return False
 
 
+def array_of(value: object) -> np.ndarray | None:
+    """The float array of a number, or of lists of numbers, of a scene file; None for texts, booleans, numbers that are
+    not finite, and lists of unequal length."""
+    if not _is_numbers(value):
+        return None
+    try:
+        return np.array(value, float)
+    except ValueError:
+        return None
+
+
+def _is_numbers(value: object) -> bool:
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_numbers, value))
+    if isinstance(value, (bool, str)):
+        return False
+    if isinstance(value, (int, float)):
+        return finite(value)
+    array = np.asarray(value)
+    return array.dtype.kind in "fiu" and bool(np.all(np.isfinite(array)))
+
+
 def check_one(where: str, value: object) -> None:
     """Refuse a value of a scene file that is not one finite number.
 

@@ -17,6 +17,7 @@ from liverjax.core.struct import replace
 from liverjax.jobs.output import read_by_step
 from liverjax.jobs.reactions import held_forces
 from liverjax.mesh.files import meshio_cells
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
 from liverjax.simulation.cautions import cautions_of_waves
 from liverjax.simulation.equations import forces_at
@@ -69,7 +70,7 @@ def _under_its_weight(scene: Scene) -> jax.Array | None:
     """Positions at rest under gravity, with stresses that have relaxed; None without gravity."""
     if scene.body is None or not np.any(np.asarray(scene.body.gravity)):
         return None
-    still = resting(replace(scene, traction=(), body=replace(scene.body, times=None, history=None)))
+    still = resting(replace(by_element(scene), traction=(), body=replace(scene.body, times=None, history=None)))
     # With a sponge the steps are so long that its fluid has flowed.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
@@ -107,7 +108,7 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     if scene.porosity is not None or not pulled.any():
         return []
     at = pulled > 0.01 * pulled.max()
-    still = resting(replace(scene, traction=(), fixed=(), displaced=(), physics=()))
+    still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=()))
     still = replace(still, solve=Solve(volumetric=scene.solve.volumetric))
     relaxed = np.asarray(jax.jit(forces_at)(prepared(still), x))
     apart = float(np.linalg.norm((relaxed - reactions)[at]) / np.linalg.norm(reactions[at]))

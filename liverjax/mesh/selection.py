@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from liverjax.core.bounds import finite
 from liverjax.core.did_you_mean import as_word, hint
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Indices
@@ -33,7 +34,10 @@ def select(
         if as_word(set, f"{name}: set") not in mesh.node_sets:
             there = ", ".join(mesh.node_sets) or "none"
             raise InputError(f"{name}: the mesh has no node set {set!r} (it has: {there}); use one of them or where")
-        return np.asarray(mesh.node_sets[set])
+        nodes = np.asarray(mesh.node_sets[set])
+        if not len(nodes):
+            raise InputError(f"{name}: the node set {set!r} of the mesh holds no node: correct the mesh, or use where")
+        return nodes
     if not isinstance(where, Mapping):
         raise InputError(f"{name} = {where!r} is not a place: write where = {{z_max = 0.0}}")
     points = np.asarray(mesh.points)
@@ -43,7 +47,7 @@ def select(
     for key, bound in where.items():
         if key not in known:
             raise InputError(f"{name}: {key!r} is not known: {hint(key, known)}")
-        if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not np.isfinite(bound):
+        if isinstance(bound, bool) or not isinstance(bound, (int, float)) or not finite(bound):
             raise InputError(f"{name}: {key} = {bound!r} is not a length: give a number in metres")
         x = points[:, AXES.index(key[0])]
         _warn_of_millimetres(x, key, bound, name)

@@ -73,11 +73,26 @@ def at_rest(scene: Scene) -> Playing:
     )
     solve = replace(scene.solve, reduced="")
     scene = prepared(replace(scene, physics=(*scene.physics, spring), solve=solve))
+    scene = _with_histories(scene)
     state = initial_state(scene) if scene.solve.dt is not None else _after_load_steps(scene)
     scene = replace(scene, solve=replace(scene.solve, steps=STEPS))
     program = compiled(partial(simulate_part, count=1), scene, state, 1.0)
     nodes, triangles = np.unique(boundary_triangles(scene.mesh), return_inverse=True)
     return Playing(scene, program, state, 0, size, nodes, triangles.reshape(-1, 3), np.asarray(state.x))
+
+
+def _with_histories(scene: Scene) -> Scene:
+    """The scene whose motions and forces that grow until the last step follow a history: a play has no last step."""
+    if scene.solve.dt is None:
+        return scene
+    table = {"times": scene.solve.steps * scene.solve.dt * jnp.array([0.0, 1.0]), "history": jnp.array([0.0, 1.0])}
+
+    def grows(part: object, field: str) -> bool:
+        return getattr(part, field, None) is not None and getattr(part, "history", None) is None
+
+    displaced = tuple(replace(d, **table) if grows(d, "by") else d for d in scene.displaced)
+    physics = tuple(replace(p, **table) if grows(p, getattr(p, "driven", "")) else p for p in scene.physics)
+    return replace(scene, displaced=displaced, physics=physics)
 
 
 def _after_load_steps(scene: Scene) -> State:

@@ -42,7 +42,10 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
         if as_word(set, f"{name}: set") not in mesh.element_sets:
             known = ", ".join(mesh.element_sets) or "none"
             raise InputError(f"{name}: the mesh has no element set {set!r} (it has: {known}); use one of them or where")
-        return np.asarray(mesh.element_sets[set])
+        elements = np.asarray(mesh.element_sets[set])
+        if not len(elements):
+            raise InputError(f"{name}: the element set {set!r} of the mesh holds no element: correct it, or use where")
+        return elements
     nodes = boundary.select(mesh, where, set, name)
     inside = np.flatnonzero(np.isin(np.asarray(mesh.tetrahedra), nodes).all(axis=1))
     if not len(inside):

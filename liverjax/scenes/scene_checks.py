@@ -36,6 +36,29 @@ def check_before_run(scene: Scene) -> None:
     check_plates_alone(scene)
 
 
+def check_time_and_mass(scene: Scene) -> None:
+    """Refuse a scene that lacks the time step or the mass that it needs; numbers do not matter.
+
+    Raises:
+        InputError: no `dt` with viscosity, porosity, a history or in dynamics; no mass in dynamics.
+    """
+    solve = scene.solve
+    loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
+    histories = any(getattr(load, "history", None) is not None for load in loads)
+    if solve.dt is None and solve.kind != "harmonic":
+        for present, what in (
+            (scene.viscosity is not None, "viscosity"),
+            (scene.porosity is not None, "porosity"),
+            (histories, "a history"),
+        ):
+            if present:
+                raise InputError(f"[solve] has no dt, which {what} needs: give the time step in seconds")
+        if solve.kind == "dynamic":
+            raise InputError("[solve] kind = 'dynamic' needs dt: give the time step in seconds")
+    if solve.kind == "dynamic" and scene.body is None:
+        raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
+
+
 def check_physics(scene: Scene, only: Container[str] | None = None) -> None:
     """Refuse further physics whose numbers, nodes or places no run can begin with; host side.
 
@@ -67,21 +90,7 @@ def check_scene(scene: Scene) -> None:
     check_physics(scene)
     check_normals(scene)
     check_plates_alone(scene)
-    solve = scene.solve
-    loads = (*scene.displaced, *scene.traction, *scene.physics, *([] if scene.body is None else [scene.body]))
-    histories = any(getattr(load, "history", None) is not None for load in loads)
-    if solve.dt is None and solve.kind != "harmonic":
-        for present, what in (
-            (scene.viscosity is not None, "viscosity"),
-            (scene.porosity is not None, "porosity"),
-            (histories, "a history"),
-        ):
-            if present:
-                raise InputError(f"[solve] has no dt, which {what} needs: give the time step in seconds")
-        if solve.kind == "dynamic":
-            raise InputError("[solve] kind = 'dynamic' needs dt: give the time step in seconds")
-    if solve.kind == "dynamic" and scene.body is None:
-        raise InputError("[solve] kind = 'dynamic' needs mass: add [body] with a density")
+    check_time_and_mass(scene)
     check_prescribed_once(scene)
     check_motion_in_planes(scene)
     if not free_places(scene.mesh, scene.fixed, ()).any():
@@ -90,5 +99,5 @@ def check_scene(scene: Scene) -> None:
             "nodes at and above it, {z_max = 0} those at and below",
             stacklevel=2,
         )
-    if solve.kind == "static" or scene.points_are == "loaded":
+    if scene.solve.kind == "static" or scene.points_are == "loaded":
         check_held(scene)

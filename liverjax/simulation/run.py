@@ -14,7 +14,7 @@ from liverjax.core.struct import Number, param, replace, struct
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene
-from liverjax.scenes.scene_checks import check_before_run
+from liverjax.scenes.scene_checks import check_before_run, check_time_and_mass
 from liverjax.simulation import automatic, gradient_checkpoints
 from liverjax.simulation.equations import Sizes, State, equations, force_sizes, initial_state, outputs
 from liverjax.simulation.mesh_error import MeshError, mesh_error_of, refuse
@@ -130,11 +130,13 @@ def simulate(
             begins in the reference positions.
 
     Raises:
-        InputError: unknown choices; numbers out of bounds, unless traced; a loaded mesh without a reference shape
-            (traced: its points are NaN, its steps NOT_FINITE); precision "float64" if JAX's 64-bit mode is off.
+        InputError: unknown choices; no time step or mass where one is needed; numbers out of bounds, unless traced;
+            a loaded mesh without a reference shape (traced: its points are NaN, its steps NOT_FINITE); precision
+            "float64" if JAX's 64-bit mode is off.
             `check_scene` checks more, the mesh above all; reading a scene file calls it.
     """
     scene = prepared(scene)
+    check_time_and_mass(scene)
     if start is not None:
         start = jnp.array(start, scene.mesh.points.dtype)
         if start.shape != scene.mesh.points.shape:

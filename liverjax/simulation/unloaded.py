@@ -64,12 +64,15 @@ def resting(scene: Scene) -> Scene:
         scene = replace(scene, viscosity=series_at_rest(scene.springpots), springpots=None)
     law = scene.law
     if scene.viscosity is not None:
-        left = lasting(scene.viscosity, scene.mesh.order)
-        split, volume = law.isochoric_part(), law.volumetric_part()
-        if scene.viscosity.part == "all" or split is None:
-            law = laws.scaled(law, left)
-        else:
-            law = laws.scaled(split, left) if volume is None else laws.scaled(split, left) + volume
+        left, part = lasting(scene.viscosity, scene.mesh.order), scene.viscosity.part
+
+        def relaxed(own):
+            split, volume = own.isochoric_part(), own.volumetric_part()
+            if part == "all" or split is None:
+                return laws.scaled(own, left)
+            return laws.scaled(split, left) if volume is None else laws.scaled(split, left) + volume
+
+        law = law.each(relaxed)
     held = tuple(Fixed(nodes=d.nodes, axes=d.axes) for d in scene.displaced)
     # A step without length: histories are at their beginning.
     solve = replace(scene.solve, kind="static", steps=1, dt=0.0, newton="converged", robust="off")

@@ -131,11 +131,8 @@ def between(mesh: TetMesh, points: np.ndarray, name: str = "ligament", **given: 
 def _vector(value: object, name: str) -> np.ndarray:
     for one in value if isinstance(value, (list, tuple)) else ():
         bounds.check_one(name, one)
-    try:
-        vector = np.array(value, float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+    vector = bounds.array_of(value)
+    if vector is None or vector.shape != (3,):
         raise InputError(f"{name} = {value!r} is not a point: give three numbers in m")
     return vector
 

@@ -60,14 +60,12 @@ class Vessel(Physics):
             return crossing(mesh, lines, law, name=name, **given)
         if "radius" not in table or "unit" in table:
             raise InputError(f"{name} line needs radius, both in m: give radius, and leave unit out")
-        try:
-            line, radius = np.array(table["line"], float), np.array(table["radius"], float)
-        except (TypeError, ValueError):
-            line, radius = np.empty(0), np.empty(0)
+        line, radius = (bounds.array_of(table[key]) for key in ("line", "radius"))
+        line, radius = (np.empty(0) if v is None else v for v in (line, radius))
         if line.ndim != 2 or line.shape[1] != 3 or len(line) < 2 or radius.shape not in ((), (len(line),)):
             raise InputError(f"{name} needs line = [[x, y, z], …] of two points or more, radius one number or one each")
-        if not np.all(np.isfinite(line)) or not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
-            raise InputError(f"{name} line has a point twice in a row, or one that is not finite: mend the line")
+        if not np.all(np.any(np.diff(line, axis=0) != 0, axis=1)):
+            raise InputError(f"{name} line has a point twice in a row: mend the line")
         return along(mesh, line, radius, law, name=name, **given)
 
     def check(self, mesh: TetMesh, name: str) -> None:

@@ -349,12 +349,8 @@ def three_numbers(value: object, name: str) -> jax.Array:
     Raises:
         InputError: the value is not three finite numbers.
     """
-    given = np.asarray(value, object)
-    try:
-        vector = np.array(given, float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+    vector = bounds.array_of(value)
+    if vector is None or vector.shape != (3,):
         raise InputError(f"{name} = {value!r} must be three numbers: write [x, y, z]")
     return jnp.asarray(vector)
 

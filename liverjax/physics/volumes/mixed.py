@@ -16,7 +16,7 @@ with the mean over the element (Bochev, Dohrmann and Gunzburger 2006): it decrea
 size.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import jax
@@ -36,17 +36,19 @@ from liverjax.tensors.matrices import Matrix, cofactor, determinant, scale_matri
 from liverjax.tensors.places import given, taken
 
 
-def check_mixed_law(law: Law, name: str = "[solve] volumetric = 'mixed'") -> None:
-    """Refuse a law whose pressure cannot be an unknown of its own.
+def check_mixed_laws(several: Sequence[Law], name: str = "[solve] volumetric = 'mixed'") -> None:
+    """Refuse laws of a body whose pressure cannot be an unknown of its own.
 
     Raises:
         InputError: no isochoric split, or volumetric energies of several kinds.
     """
-    U = volumetric_part(law)
-    if isochoric_part(law) is None or U is None:
-        raise InputError(f"{name} needs a law with an isochoric part and bulk, which {type(law).__name__} has not")
-    parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
-    kinds = {(part.volumetric, part.below) for part in parts}
+    kinds = set()
+    for law in several:
+        U = volumetric_part(law)
+        if isochoric_part(law) is None or U is None:
+            raise InputError(f"{name} needs a law with an isochoric part and bulk, which {type(law).__name__} has not")
+        parts = [part for own in U.pieces() for part in own.summands() if isinstance(part, Volumetric)]
+        kinds |= {(part.volumetric, part.below) for part in parts}
     if len(kinds) != 1 or next(iter(kinds))[1] is not None:
         raise InputError(f"{name} needs one kind of volumetric energy in all laws: give each the same volumetric = …")
 

@@ -5,7 +5,7 @@ import numpy as np
 from liverjax import laws
 from liverjax.core.errors import InputError
 from liverjax.physics import viscosity
-from liverjax.physics.volumes.mixed import check_mixed_law
+from liverjax.physics.volumes.mixed import check_mixed_laws
 from liverjax.scenes.checks.kinds import check_kinds
 from liverjax.scenes.checks.loads import check_loads
 from liverjax.scenes.regions import laws_of
@@ -82,9 +82,7 @@ def _loaded(scene: Scene) -> None:
 
 
 def _mixed(scene: Scene) -> None:
-    name = "[solve] volumetric = 'mixed'"
-    for law in laws_of(scene.law, scene.region):
-        check_mixed_law(law, name)
+    check_mixed_laws(laws_of(scene.law, scene.region))
 
 
 def _own_volumes(scene: Scene) -> None:
