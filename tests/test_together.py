@@ -13,6 +13,7 @@ from fitting.__main__ import main
 from fitting.commands import together as command
 from fitting.fits import joint, together, viscoelastic
 from fitting.fits.families import springpots_in_time
+from fitting.fits.honesty import sizes_of_samples
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -96,6 +97,40 @@ def test_a_factor_between_the_tests_is_named(scale):
         return
     found, error = map(float, re.search(r"relaxation.csv are ([\d.]+) ± ([\d.e-]+) times", told[0]).groups())
     assert abs(found - scale) < 4 * error + 0.005 * scale and error < 0.02  # printed with three digits
+
+
+def wide_and_long(factor: float, seed: int) -> list[Sweep | TimeTest]:
+    """A sweep of three decades and a relaxation whose moduli are multiplied."""
+    omega, rng = np.geomspace(0.05, 100, 25), np.random.default_rng(seed)
+    storage, loss = (G * (1 + 0.02 * rng.standard_normal(25)) for G in generalised_maxwell.moduli(TRUTH, omega))
+    test = relaxation(0.0, factor)
+    noisy = test.answer * (1 + 0.01 * rng.standard_normal(len(test.answer)))
+    return [Sweep(omega, storage, loss, source="sweep.csv"), test._replace(answer=noisy)]
+
+
+def test_total_errors_contain_the_sizes_of_the_samples():
+    """Each test has a factor of its own: errors of noise held G0 in 3 of 10 such fits, and the second ratio in 7."""
+    hits, by_noise = [], []
+    for seed in range(12):
+        factor = 1 + 0.013 * np.random.default_rng(100 + seed).standard_normal()
+        fit = together.fit(wide_and_long(factor, seed), 2)
+        shares, u = sizes_of_samples.shares_with_sizes(fit, 0.013), fit.uncertainty
+        off, whole = np.abs(u.values - np.array([800, 0.3, 0.4, 30, 0.1])), sizes_of_samples.root_of_squares(shares)
+        hits.append(off < u.quantile * np.array([whole[name] for name in u.names]))
+        by_noise.append(off < u.quantile * u.standard_errors)
+    assert np.all(np.mean(hits, axis=0) >= 0.83) and np.mean(by_noise, axis=0).min() < 0.7
+    # A factor of both tests alike is a factor of G0 alone.
+    assert shares["geometry"]["shear_modulus"] >= 0.0129 * fit.model.shear_modulus
+
+
+def test_a_small_factor_between_the_tests_is_named_too():
+    """5 % hides in the ratios: each test is followed nearly as well as by itself."""
+    fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", 2)
+    (told,) = [w for w in fit.warnings if "the tests agree if" in w]
+    found, error = map(float, re.search(r"relaxation.csv are ([\d.]+) ± ([\d.e-]+) times", told).groups())
+    assert abs(found - 1.05) < 4 * error + 0.005
+    same = springpots_in_time.choose_together(wide_and_long(1.0, 1), "prony", 2)
+    assert not any("the tests agree if" in w for w in same.warnings)
 
 
 def test_tests_that_differ_by_more_than_a_factor_are_only_told_apart():
@@ -234,7 +269,7 @@ def test_given_deviations_are_believed_beside_another_test(model):
 
 def test_the_mean_error_is_not_above_the_largest_one(tmp_path):
     found = together.fit([with_deviations(0.02, 0.02), relaxation(0.005)], 2)
-    content = together_report.write(tmp_path, found)
+    content = together_report.write(tmp_path, found, 0.013)
     assert (
         0.005 < content["mean_relative_error"] < 0.03 and content["mean_relative_error"] < content["max_relative_error"]
     )

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> int:
     """Fit all tests in closed form; exit code 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time
+    from fitting.fits.honesty import total_error
+    from fitting.fits.simulated_rheometer import Simulation
     from fitting.reports import together_report
     from liverjax.core.files import writable
 
@@ -28,8 +30,11 @@ def run(options: argparse.Namespace) -> int:
     writable(options.out, ("fit.json", "fit.png"))
     with named_bar(f"{len(tests)} tests") as told:
         found = springpots_in_time.choose_together(tests, options.model, options.modes, told)
-    together_report.write(options.out, found)
-    print(together_report.table(found))
+    default = Simulation()
+    rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
+    relative = total_error.of_geometry(rig, None)
+    together_report.write(options.out, found, relative)
+    print(together_report.table(found, relative))
     if options.cards:
         shared_options.write_cards(options.out, found.model)
     for sentence in found.warnings:

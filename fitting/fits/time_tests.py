@@ -230,7 +230,10 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
         }
         for f in tried
     ]
-    out = [] if chosen.converged else ["the fit did not converge; its best point is given: try fewer modes"]
+    elastic = _without_relaxation(test, chosen)
+    advice = "try fewer modes" if chosen.modes > 1 else "look at the data"
+    out = [elastic] if elastic else []
+    out += [] if chosen.converged else [f"the fit did not converge; its best point is given: {advice}"]
     mean = float(chosen.relative_errors.mean())
     if mean > 0.05:
         out.append(f"the fit misses the data by {100 * mean:.2g} % on average: try more modes, or look at the data")
@@ -249,6 +252,25 @@ def _told(chosen: TimeFit, test: TimeTest, tried: list[TimeFit]) -> TimeFit:
     details["residuals"] = {"runs": runs, "probability": chance}
     seconds = {n: sum(getattr(f, n) for f in tried) for n in ("run_time", "compile_time")}
     return chosen._replace(warnings=tuple(out), details=details, **seconds)
+
+
+def _without_relaxation(test: TimeTest, chosen: TimeFit) -> str:
+    """A sentence if one modulus, without any mode, explains the test as well as the chosen fit does."""
+    rows = thinned(test)
+    x, y, s = test.driven[rows], test.answer[rows], _scales(test, rows)
+    square = float(np.sum((x / s) ** 2))
+    if not square > 0:
+        return ""
+    ratio, m = float(np.sum(x * y / s**2)) / square, len(rows)
+    rss = max(float(np.sum(((ratio * x - y) / s) ** 2)), 2e-300 * m)
+    if ratio <= 0 or m * np.log(rss / m) + np.log(m) > criterion(chosen):
+        return ""
+    error = float(np.sqrt(rss / max(m - 1, 1) / square)) / ratio
+    modulus = ratio if test.kind == "relaxation" else 1 / ratio
+    return (
+        f"the test shows no relaxation: an elastic material of {modulus:.4g} ± {modulus * error:.2g} Pa explains it as "
+        "well; ratios and relaxation times mean nothing here, and G0 and the equilibrium modulus are this modulus"
+    )
 
 
 def structured_misfit(fit: TimeFit) -> list[str]:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitting.fits.families import limits
+from fitting.fits.honesty import sizes_of_samples
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.time_tests import thinned
 from fitting.fits.together import Share, Together
 from fitting.methods.generalised_maxwell import moduli
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.frequency_sweep import Sweep
-from fitting.reports.sweep_report import ends_of_interval, numbers, own_numbers, spectrum_rows
+from fitting.reports.sweep_report import by_stem, ends_of_interval, numbers, own_numbers, spectrum_rows
 from fitting.waves import shear_waves
 from fitting.waves.dispersion import Dispersion
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
@@ -34,8 +35,14 @@ QUANTITIES = {
 }
 
 
-def write(out: Path, found: Together) -> Content:
-    """Write both files. Return the JSON; its names are the same as for a sweep, and `tests` is added."""
+def write(out: Path, found: Together, relative: float) -> Content:
+    """Write both files. Return the JSON; its names are the same as for a sweep, and `tests` is added.
+
+    Args:
+        out: folder.
+        found: the fit.
+        relative: relative error of all moduli of a test by the size of its sample.
+    """
     out.mkdir(parents=True, exist_ok=True)
     u, n = found.uncertainty, found.modes
     errors = np.array([s.mean_relative_error for s in found.shares])
@@ -58,6 +65,7 @@ def write(out: Path, found: Together) -> Content:
             "mean_relative_error": float(errors @ points / points.sum()),
             "max_relative_error": max(_largest(found)),
             "shear_waves": _waves(found),
+            **_total_errors(found, relative),
             "tests": [_share_of_test(s, found) for s in found.shares],
             "warnings": list(found.warnings),
             "run_time_s": found.run_time,
@@ -70,6 +78,12 @@ def write(out: Path, found: Together) -> Content:
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(found), out / "fit.png")
     return content
+
+
+def _total_errors(found: Together, relative: float) -> Content:
+    shares = sizes_of_samples.shares_with_sizes(found, relative)
+    whole = sizes_of_samples.root_of_squares(shares)
+    return {"total_errors": by_stem(whole), "error_shares": {source: by_stem(part) for source, part in shares.items()}}
 
 
 def _waves(found: Together) -> Content:
@@ -122,8 +136,8 @@ def _largest(found: Together) -> list[float]:
     return [float(np.max(np.abs(f - y) / np.maximum(np.abs(y), 1e-3 * np.abs(y).max()))) for y, f in pairs]
 
 
-def table(found: Together) -> str:
-    """Parameters ± standard error, and the errors that remain without each of the tests."""
+def table(found: Together, relative: float) -> str:
+    """Parameters ± standard error, the errors that remain without each of the tests, and the total error of G0."""
     u, n, own = found.uncertainty, found.modes, found.parameters
     heads = [f"without {k}" for k in range(1, len(found.shares) + 1)]
     rows = [f"{k}: {s.name}, {s.points} numbers, {Path(s.source).name}" for k, s in enumerate(found.shares, 1)]
@@ -144,6 +158,7 @@ def table(found: Together) -> str:
     if found.kind.effective is not None:
         rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that represent it")
     rows += spectrum_rows(found.details or {})
+    rows += _with_sizes(found, relative)
     for k, s in enumerate(found.shares, 1):
         rows.append(f"{k}: misfit {100 * s.misfit:.2g} %, by itself {100 * s.misfit_alone:.2g} %")
     for row in found.tried if len(found.tried) > 1 else []:
@@ -151,6 +166,22 @@ def table(found: Together) -> str:
         modes = f"{row['modes']:2d} modes, " if row["model"].startswith("prony") else 10 * " "
         rows.append(f"{row['model']:24s} {modes}criterion +{row['above_the_lowest']:.1f}{free}")
     return "\n".join(rows)
+
+
+def _with_sizes(found: Together, relative: float) -> list[str]:
+    """The total error of the first number, and the largest part that the sizes of the samples have in the others."""
+    shares = sizes_of_samples.shares_with_sizes(found, relative)
+    whole, names = sizes_of_samples.root_of_squares(shares), list(shares["noise"])
+    if not names or not np.isfinite(whole[names[0]]):
+        return []
+    told = (
+        f"{names[0]} with the sizes of the samples ({100 * relative:.2g} % of a test's moduli): ± {whole[names[0]]:.2g}"
+    )
+    known = [n for n in names[1:] if 0 < shares["noise"][n] < np.inf]
+    worst = max(known, key=lambda n: shares["geometry"][n] / shares["noise"][n], default=None)
+    if worst is None or shares["geometry"][worst] < shares["noise"][worst]:
+        return [told]
+    return [f"{told}; {worst}: ± {whole[worst]:.2g}"]
 
 
 def _error(value: float) -> str:

@@ -15,13 +15,16 @@ from fitting.methods.estimate import spread
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.least_squares import from_starts
 
-#: A factor is named if it differs from 1 by so many standard errors.
-CERTAIN = 4.0
+#: A factor is named if it differs from 1 by so many standard errors, and by more than this.
+CERTAIN, LEAST = 4.0, 0.005
 
 
 def told(fit: Together) -> list[str]:
-    """A sentence on the test whose factor makes all tests agree; none if the tests agree, or if no factor helps."""
-    if not together.disagreements(fit.shares) or fit.kind.effective is not None:
+    """A sentence on the test whose factor makes all tests agree; none if the tests agree, or if no factor helps.
+
+    A factor of a few percent hides in ratios and times: each test is then followed nearly as well as by itself.
+    """
+    if fit.kind.effective is not None:
         return []
     found = {k: factor_of(fit, k) for k in range(1 if len(fit.tests) == 2 else 0, len(fit.tests))}
     known = {k: own for k, own in found.items() if own is not None}
@@ -60,7 +63,7 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
     worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
     last = np.eye(len(found.u))[-1:]
     error = float(np.linalg.norm(spread(np.asarray(found.jacobian), max(1.0, worst), last)[0]))
-    if worst > together.APART or not abs(found.u[-1]) > CERTAIN * error:
+    if worst > together.APART or not abs(found.u[-1]) > max(CERTAIN * error, LEAST):
         return None
     factor = float(np.exp(found.u[-1]))
     return factor, factor * error, worst

@@ -1,0 +1,58 @@
+"""Several tests: the error of the numbers by the sizes of the samples, with which each test has a factor of its own.
+
+Torque over twist is G pi R^4 / 2 h: a gap or a radius that is off multiplies all moduli of a test. In one test the
+factor is that of G0 alone. Between tests that are fitted together it also moves ratios and times.
+"""
+
+from functools import partial
+
+import numpy as np
+
+from fitting.fits import together
+from fitting.fits.together import Together
+from fitting.methods import uncertainty
+from fitting.methods.estimate import with_slope
+from fitting.waves.dispersion import Dispersion
+
+
+def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, float]]:
+    """Errors of each number by noise and by the sizes of the samples; without the strengths of a spectrum.
+
+    Args:
+        fit: the common fit.
+        relative: standard deviation of the factor of a test, `total_error.of_geometry`.
+    """
+    own = fit.uncertainty if fit.parameters is None else fit.parameters
+    names = [n for n in own.names if not n.startswith("strengths[")]
+    kept = [own.names.index(n) for n in names]
+    by_size = _by_sizes(fit)[kept] * relative
+    # Samples of their own have independent factors; one sample, mounted once, has one factor for all its tests.
+    both = np.maximum(np.linalg.norm(by_size, axis=1), np.abs(by_size.sum(axis=1)))
+    noise = own.standard_errors[kept]
+    out = {
+        "noise": dict(zip(names, noise.tolist(), strict=True)),
+        "geometry": dict(zip(names, both.tolist(), strict=True)),
+    }
+    return out
+
+
+def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Root of the sum of the squares of the shares, by name."""
+    return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
+
+
+def _by_sizes(fit: Together) -> np.ndarray:
+    """Change (P, K) of each number by a factor of 1 + 1 of the moduli of each test, to first order."""
+    J, u = np.asarray(fit.solution.jacobian), fit.solution.u
+    of = fit.kind.values if fit.parameters is not None else None
+    _, slope = with_slope(of or partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)
+    if not np.all(np.isfinite(J)):
+        return np.zeros((len(slope), len(fit.tests)))
+    moved, first = np.zeros((len(J), len(fit.tests))), 0
+    for k, (test, share) in enumerate(zip(fit.tests, fit.shares, strict=True)):
+        _, measured, scales = together.reported_numbers(test)
+        if not isinstance(test, Dispersion):  # waves have no size of a sample
+            moved[first : first + share.points, k] = measured / (scales * share.noise)
+        first += share.points
+    size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    return (slope / size) @ (np.linalg.pinv(J / size) @ moved)
