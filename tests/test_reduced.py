@@ -397,6 +397,8 @@ def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     with pytest.raises(lj.InputError, match="was made for scene"):
         porous = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5)
         lj.simulate_reduced(again, replace(scene, porosity=porous))
+    with pytest.raises(lj.InputError, match="newton = 'one_step' is not for reduced models"):
+        lj.simulate_reduced(again, replace(scene, solve=replace(scene.solve, newton="one_step")))
     with pytest.raises(lj.InputError, match="there is no such reduced model"):
         lj.load_reduced(tmp_path / "none.h5")
     with pytest.raises(lj.InputError, match="between 0 and 1"):

@@ -13,6 +13,7 @@ from fitting.methods.estimate import Estimate, estimated
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, levenberg_marquardt
+from fitting.readers.frequency_sweep import SHARED
 from fitting.readers.rheometer import Sweep
 from liverjax.core.struct import Content
 
@@ -187,6 +188,10 @@ def superfluous(data: Band, u: Estimate) -> list[str]:
     return out
 
 
+#: Scatter below which points were computed, not measured.
+_SMALL = 1e-4
+
+
 def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
     """Warnings about numbers that the data do not determine, each with a remedy."""
     modes = (len(u.values) - 1) // 2
@@ -212,6 +217,12 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
             f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are no noise: the points scatter by "
             f"{100 * sweep.point_scatter:.2g} % only. They are used as weights, and as the spread between samples: "
             "one sample may differ by as much from these moduli; give the files of the samples to fit each"
+        )
+    elif sweep.noise_given and _SMALL < sweep.point_scatter < sweep.relative_deviation / SHARED:
+        out.append(
+            f"the points scatter by {100 * sweep.point_scatter:.2g} %, the deviations in the file are "
+            f"{100 * sweep.relative_deviation:.2g} %: if they are the spread between samples, errors of ratios and "
+            "times are too large, and that of this curve's moduli says little; give the files of the samples to fit each"
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(

@@ -37,11 +37,13 @@ class Sweep(NamedTuple):
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Scales of the residuals [Pa]: the given deviations, or the moduli themselves (relative errors)."""
-        return (
-            self.storage if self.storage_sd is None else self.storage_sd,
-            self.loss if self.loss_sd is None else self.loss_sd,
-        )
+        """Scales of the residuals [Pa]: the given deviations, or the moduli themselves (relative errors).
+
+        Deviations that are themselves estimates from few repeats are smoothed.
+        """
+        pairs = ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
+        first, second = (m if sd is None else smooth_deviations(self.angular_frequency, m, sd) for m, sd in pairs)
+        return first, second
 
     @property
     def noise_given(self) -> bool:
@@ -128,6 +130,27 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
         _, _, Vt = np.linalg.svd(np.vander(own, m - 1, increasing=True).T)
         left.append(Vt[-1] @ y[k : k + m])
     return np.array(left)
+
+
+#: Standard deviation of ln(deviation / modulus) about a smooth curve above which deviations are those of few repeats:
+#: the deviation of five has 0.4, of three 0.64. Fewest points, and degree of the polynomial that replaces them.
+_FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
+
+
+def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Deviations (n,) that change smoothly with the frequency, in place of such that scatter from point to point.
+
+    The deviation of three repeats is off by a factor of two and more. Points whose deviation is small by chance would
+    have most of the weight, and the errors would be too small.
+    """
+    x = np.log(omega)
+    if len(np.unique(x)) < max(_POINTS, len(x)):
+        return sd
+    part = np.log(sd / modulus)
+    if distance_from_smooth(x, part) < _FEW_REPEATS:
+        return sd
+    smooth = modulus * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
+    return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # squares of deviations are right on average
 
 
 def merged(omega: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:

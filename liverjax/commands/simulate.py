@@ -153,7 +153,8 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: 
         attributes["bulk"] = porosity.bulk_in_force(scene.porosity, scene.law)
         print(attributes["bulk"])
     said = cautions_of_run(scene, ran.result)
-    output.write_hdf5(target, scene, ran.result, attributes | {"warnings": said, "versions": versions()}, found)
+    attributes |= {"warnings": said, "versions": versions()}
+    output.write_hdf5(target, scene, ran.result, attributes, found, ran.beside)
     if resumable_parts.beside(target).exists():
         resumable_parts.remove(resumable_parts.beside(target))
     s, steps = ran.result.statistics, len(ran.result.times)

@@ -5,7 +5,7 @@ new tangent, whether or not the run was stopped before it, so a resumed run ends
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +34,7 @@ class Ran(NamedTuple):
     steps: int  # computed now
     run_time: float  # [s]
     compile_time: float  # [s]
+    beside: Mapping[str, tuple[np.ndarray, str]] = {}  # further datasets of the result: name -> values, unit
 
 
 def run(

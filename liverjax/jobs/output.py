@@ -32,8 +32,10 @@ def write_hdf5(
     result: Result,
     attributes: Mapping[str, object],
     fields: dict[str, np.ndarray] | None = None,
+    beside: Mapping[str, tuple[np.ndarray, str]] | None = None,
 ) -> None:
-    """Rows, mesh and `fields` (T, E, …) as datasets; status, iterations and `attributes` as attributes.
+    """Rows, mesh, `fields` (T, E, …) and `beside` (values and unit) as datasets; status, iterations and `attributes` as
+    attributes.
 
     An array with one number per step becomes a dataset if it is too long for an attribute: `read_by_step` finds both.
     The nodes of quadratic tetrahedra (E, 10) are in the order of VTK.
@@ -55,6 +57,9 @@ def write_hdf5(
             for place, numbers in (("elements", values), ("vertices", at_vertices(scene.mesh, values))):
                 out[f"fields/{place}/{name}"] = numbers
                 out[f"fields/{place}/{name}"].attrs["unit"] = FIELDS[name]
+        for name, (values, unit) in (beside or {}).items():
+            out[name] = values
+            out[name].attrs["unit"] = unit
         out["times"].attrs["unit"] = "s" if scene.solve.dt is not None else "load step"
         out["reference"] = np.asarray(scene.mesh.points)
         out["reference"].attrs["unit"] = "m"

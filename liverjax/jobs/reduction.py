@@ -85,13 +85,16 @@ def tried(scene: Scene) -> Tried:
         f"estimated error {error.max():.2g} m"
         + (f", {error.max() / moved:.2%} of the largest displacement" if moved else "")
     )
-    if found.pressure_error is not None:
-        said += f", and {float(found.pressure_error.max()):.2g} Pa of pressure"
-    if np.any(np.asarray(first.status)) or not error.max() <= solve.reduced_tolerance * moved:
+    small, beside = error.max() <= solve.reduced_tolerance * moved, {"reduced_error": (error, "m")}
+    P = None if model.pressures is None else reduced_pressure(model, plain, found)
+    if P is not None and found.pressure_error is not None:
+        off, whole = np.asarray(found.pressure_error), float(np.abs(np.asarray(P)).max())
+        said += f", and {off.max():.2g} Pa of pressure" + (f", {off.max() / whole:.2%} of the largest" if whole else "")
+        small, beside["reduced_pressure_error"] = small and off.max() <= solve.reduced_tolerance * whole, (off, "Pa")
+    if np.any(np.asarray(first.status)) or not small:
         limit = f"{float(np.asarray(solve.reduced_tolerance)):.2%}"
         return Tried(None, f"{said}: above {limit}, or a step failed, so the full model runs")
-    P = None if model.pressures is None else reduced_pressure(model, plain, found)
-    ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time)
+    ran = Ran(_as_result(found, x, P), len(found.times), run_time, compile_time, beside)
     return Tried(ran, said)
 
 

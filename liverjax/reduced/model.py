@@ -167,6 +167,8 @@ def refuse_unknown_physics(scene: Scene) -> None:
         raise InputError(f"[solve] volumetric = {scene.solve.volumetric!r} is not for reduced models: use 'element'")
     if scene.body is not None and scene.body.mass != "lumped":
         raise InputError(f"[body] mass = {scene.body.mass!r} is not for reduced models: use 'lumped'")
+    if scene.solve.newton != "converged":
+        raise InputError(f"[solve] newton = {scene.solve.newton!r} is not for reduced models: use 'converged'")
     if scene.solve.precision != "float64":
         raise InputError(f"[solve] precision = {scene.solve.precision!r} is not for reduced models: use 'float64'")
     if scene.solve.kind == "static" and scene.viscosity is not None and scene.solve.dt is None:
