@@ -222,7 +222,7 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
         out.append(
             f"the points scatter by {100 * sweep.point_scatter:.2g} %, the deviations in the file are "
             f"{100 * sweep.relative_deviation:.2g} %: if they are the spread between samples, errors of ratios and "
-            "times are too large, and that of this curve's moduli says little; give the files of the samples to fit each"
+            "times are too large, and that of this curve says little; give the files of the samples to fit each"
         )
     elif sweep.noise_given and u.noise > 1.5:
         out.append(
