@@ -180,7 +180,7 @@ def inertial(omega, G, height):
     return G * x * np.cos(x) / np.sin(x)
 
 
-@pytest.mark.parametrize("by", ["torque", "angle"])
+@pytest.mark.parametrize("by", ["torque", pytest.param("angle", marks=pytest.mark.slow)])
 def test_a_cycle_with_inertia_begins_without_a_transient(law, prony, by, verified):
     """One cycle is the torsional wave: a start on the cycle without inertia was 16 % off in G'' here.
 

@@ -378,7 +378,7 @@ def test_components_that_follow_the_axes_are_never_accused(noise, sign):
     assert components.order_sentence(field._replace(displacement=sign * field.displacement)) is None
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
     """Voxels twice as long along the way of a wave as across it: the wave's own error, whatever the axis."""
     spacing, shape = np.full(3, H), np.full(3, 7)
@@ -434,7 +434,7 @@ def _found_in(U):
     return own, elastography.regions_of(own)
 
 
-@pytest.mark.parametrize("width", [0.0, 0.7])
+@pytest.mark.parametrize("width", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
 def test_errors_of_smoothed_noise_hold_the_truth(width):
     """Noise of 2 % behind a Gaussian filter of 0.7 voxels: stated errors were a third of the true ones, without a
     word; two thirds of the moduli were more than two of them off."""
