@@ -15,6 +15,7 @@ from fitting.methods.estimate import errors_and_correlation, noise_factor, sprea
 from fitting.methods.generalised_maxwell import HOPELESS
 from fitting.methods.least_squares import Solution, levenberg_marquardt
 from fitting.methods.noise.alike_noise import Alike, along_rows
+from fitting.methods.noise.factor_noise import FactorNoise, factors_of_series
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers.curves import Curve
 from liverjax import laws
@@ -291,7 +292,7 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
     own_slope = slope[np.ix_(known, known)]
     half, s = spread(J[:n, known], noise, own_slope)
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
-    its_errors, its_correlation, alike = _errors_of_law(curves, (J[:n, known], misfit, noise), own_slope, half)
+    its_errors, its_correlation, alike, factors = _errors_of_law(curves, (J[:n, known], misfit, noise), own_slope, half)
     if n > p:
         errors[known] = its_errors
     if np.all(np.isfinite(half)):
@@ -329,13 +330,19 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
             f"offset of its own, or the law misses something; {n} points measure as much as {alike.independent:.0f} of "
             "independent noise, and the standard errors are those of such noise"
         )
+    if factors is not None:
+        told.append(
+            f"each test seems to have a factor of its own, of {100 * factors.deviation:.2g} %, as by another sample or "
+            f"a wrong size of it; the standard errors contain such factors of {len(curves)} tests"
+        )
     return result._replace(warnings=told)
 
 
 def _errors_of_law(
     curves: list[Curve], residuals: tuple[np.ndarray, np.ndarray, float], slope: np.ndarray, half: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Alike | None]:
-    """Errors and correlation, whatever noise is in the residuals, and the noise that neighbouring points share.
+) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
+    """Errors and correlation, whatever noise is in the residuals; the noise that neighbouring points share; factors of
+    the tests.
 
     Args:
         curves: that were fitted.
@@ -347,17 +354,20 @@ def _errors_of_law(
     errors, correlation = errors_and_correlation(half)
     fitted = np.concatenate([c.stress / c.scale for c in curves]) + misfit
     roots = [uneven_root(J, misfit, slope), growing_root(J, misfit, fitted, slope)]
-    alike = None
+    alike, factors, counts = None, None, [len(c.stress) for c in curves]
     if J.size and noise > EXACT:  # else the residuals are roundoff
-        alike = along_rows([len(c.stress) for c in curves], misfit, J, noise, np.linalg.pinv(J))
+        alike = along_rows(counts, misfit, J, noise, np.linalg.pinv(J))
+        factors = factors_of_series(counts, J, misfit, fitted, slope)
     if alike is not None:
         roots.append(slope @ alike.root)
+    if factors is not None:
+        roots.append(factors.root)
     for root in roots:
         uneven = errors_and_correlation(root)
         if np.any(uneven[0] > _UNEVEN * errors):
             correlation = uneven[1]
         errors = np.maximum(errors, uneven[0])
-    return errors, correlation, alike
+    return errors, correlation, alike, factors
 
 
 def _warnings(fit: LawFit, curves: list[Curve], singular: np.ndarray, held: bool) -> list[str]:
