@@ -95,6 +95,8 @@ def _ring(x, corners):
     return x + RADIUS * (np.cos(a) * out + np.sin(a) * np.array([0.0, 0.0, 1.0]))
 
 
+# scikit-image 0.26 sets shapes as NumPy 2.5 no longer likes.
+@pytest.mark.filterwarnings("ignore:Setting the shape:DeprecationWarning")
 def test_a_fork_has_three_branches():
     measure = pytest.importorskip("skimage.measure", reason="the surface of a fork needs scikit-image")
     h = 5e-4
