@@ -161,6 +161,8 @@ def test_deviations_without_a_name_and_doubtful_thousands_are_told(tmp_path):
     )
     found = read_sweep(tmp_path / "a.csv")
     assert found.storage_sd is None and any("'SD', '±' are not used" in note for note in found.notes)
+    (tmp_path / "a.csv").write_text("f (Hz),G' (Pa),Pa,G'' (Pa)\n" + "".join(f"{k},900,9,80\n" for k in range(1, 5)))
+    assert not read_sweep(tmp_path / "a.csv").notes
     (tmp_path / "a.csv").write_text(
         "f (Hz);G' (Pa);G'' (Pa)\n" + "".join(f"{k};410,382;110,{k}00\n" for k in range(1, 5))
     )

@@ -156,6 +156,7 @@ def test_bad_curves_and_options_are_one_sentence(tmp_path, capsys, text, more, w
         "Displacement (um),Indentation depth [um],Load / mN",
         "Displacement rate um,Eindringtiefe (um),Kraft (mN)",
         "Time (s),Indentation,Force\ns,um,mN",
+        "Displacement rate um,Depth (um),Load cell (mN)",
     ],
 )
 def test_the_right_column_of_several_is_read(tmp_path, header):

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from fitting.fits import viscoelastic
+from fitting.fits.honesty import edges
+from fitting.methods import generalised_maxwell
 from fitting.readers.frequency_sweep import some
 from fitting.readers.rheometer import Sweep, read_sweep
 from fitting.readers.scattering_phase import weighed_by_scatter
@@ -76,6 +78,29 @@ def test_deviations_of_few_repeats_do_not_choose_the_points(repeats):
         told += any("times the given deviations" in w for w in fit.warnings)
     assert kept == 30 if repeats == 50 else kept <= 3
     assert np.mean(hits) >= 0.88 and np.mean(hits, axis=0).min() >= 0.8 and told <= 4
+
+
+def test_points_left_keep_the_weights_of_all_points():
+    """Smoothed anew, deviations of three repeats let the ends decide 48 % of fits of nine points."""
+    omega, told = np.geomspace(0.1, 10, 9) * 2, 0
+    x = 1j * omega
+    G = 1000 * (0.5 + 0.5 * x / (1 + x))
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        both = [part * (1 + 0.02 * rng.standard_normal((3, 9))) for part in (G.real, G.imag)]
+        means, errors = zip(*((v.mean(0), v.std(0, ddof=1) / np.sqrt(3)) for v in both), strict=True)
+        s = Sweep(omega, *means, *errors)
+        told += bool(edges.moved(edges.honest(viscoelastic.closed_form(s, 1), s, generalised_maxwell.spectrum(s))))
+    assert told <= 4  # 5 %, of few points
+
+
+def test_the_curvature_of_a_coarse_sweep_is_no_scatter():
+    """Three points per decade of five modes: 5 % off smooth curves without any noise."""
+    omega, times = np.geomspace(0.02, 200, 13), np.geomspace(0.01, 100, 5)
+    x = 1j * omega[:, None] * times
+    G = 1000 * (0.25 + (0.15 * x / (1 + x)).sum(axis=1))
+    s = Sweep(omega, G.real, G.imag)
+    assert weighed_by_scatter(s) is s
 
 
 def test_a_step_of_the_deviations_is_kept():

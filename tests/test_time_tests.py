@@ -445,11 +445,14 @@ def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset
         "Elapsed time in s;Shear modulus in Pa",
         "t [s];G(t) [Pa]",
         "Temps (s);Module de relaxation (Pa)",
+        "time (s);modulus (Pa);T (°C)",
     ],
 )
 def test_headings_of_other_programs_are_read(header, tmp_path):
     (tmp_path / "t.csv").write_text(header + "\n" + "".join(f"{k};{900 - k}\n" for k in range(1, 9)))
     columns, _ = read_columns(tmp_path / "t.csv")
+    (tmp_path / "first.csv").write_text("T (°C);" + header + "\n" + "".join(f"25;{k};{900 - k}\n" for k in range(1, 9)))
+    assert np.array_equal(read_columns(tmp_path / "first.csv")[0]["time"], columns["time"])
     assert np.allclose(columns["time"], np.arange(1, 9)) and np.allclose(columns["modulus"], 900 - np.arange(1, 9))
 
 

@@ -123,6 +123,19 @@ def test_total_errors_contain_the_sizes_of_the_samples():
     assert shares["geometry"]["shear_modulus"] >= 0.0129 * fit.model.shear_modulus
 
 
+def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
+    """Sweep and creep: a stiffer sample creeps less, so both move G0 alike and the ratios against each other."""
+    at, g = np.append(0.0, TIME), 0.4
+    strain = (1 + g / (1 - g) * (1 - np.exp(-(1 - g) * at / 5.0))) / 1000  # of one mode of 5 s, G0 = 1000 Pa
+    creep = TimeTest("creep", at, np.ones(len(at)), strain, at > 0, source="creep.csv")
+    x = 1j * OMEGA / 50 * 5.0
+    G = 1000 * (1 - g + g * x / (1 + x))
+    fit = together.fit([Sweep(OMEGA / 50, G.real, G.imag, source="sweep.csv"), creep], 1)
+    assert np.allclose(fit.uncertainty.values, [1000, g, 5.0], rtol=1e-3)
+    moved = sizes_of_samples._by_sizes(fit)
+    assert np.allclose(moved.sum(axis=1), [1000, 0, 0], atol=[5, 5e-3, 5e-2])
+
+
 def test_a_small_factor_between_the_tests_is_named_too():
     """5 % hides in the ratios: each test is followed nearly as well as by itself."""
     fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", 2)

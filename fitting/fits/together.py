@@ -91,8 +91,11 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
 
 
 def sizes_of(test: Measured) -> np.ndarray:
-    """Sizes for relative errors of the reported numbers: the numbers themselves; bounded below in tests in time."""
+    """Sizes for relative errors of the reported numbers: the numbers themselves; bounded below in tests in time; for a
+    loss that scatters with the phase |G*|."""
     _, measured, scales = reported_numbers(test)
+    if isinstance(test, Sweep) and test.sd_estimated:
+        return np.concatenate([test.storage, np.hypot(test.storage, test.loss)])
     return scales if isinstance(test, TimeTest) else measured
 
 

@@ -45,9 +45,9 @@ def of_data(sweep: Sweep, dense: Spectrum) -> Consistency:
     """Check the bounds and the spectrum; `dense` comes from `generalised_maxwell.spectrum`."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
     noises = scatter(omega, storage), scatter(omega, loss)
-    breaches = []
+    each, breaches = _noise_of_loss(sweep, noises[1]), []
     for k in range(len(omega) - 1):
-        why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], noises)
+        why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], (noises[0], each[k : k + 2]))
         if why:
             breaches.append((float(omega[k]), float(omega[k + 1]), why))
     late = onset_of(sweep)
@@ -85,13 +85,20 @@ def without_instrument(sweep: Sweep) -> Sweep:
 def onset_of(sweep: Sweep) -> tuple[float, str] | None:
     """Last frequency [rad/s] before the instrument's mark within half a decade of the end, and the bound it breaks."""
     omega, storage, loss = merged(sweep.angular_frequency, sweep.storage, sweep.loss)
-    noises = scatter(omega, storage), scatter(omega, loss)
+    noise, each = scatter(omega, storage), _noise_of_loss(sweep, scatter(omega, loss))
     for k in range(len(omega) - 1):
         if omega[k] > omega[-1] / math.sqrt(10):
-            why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], noises)
+            why = _breach(omega[k : k + 2], storage[k : k + 2], loss[k : k + 2], (noise, each[k : k + 2]))
             if why.startswith("G' "):
                 return float(omega[k]), why
     return None
+
+
+def _noise_of_loss(sweep: Sweep, same: float) -> np.ndarray:
+    """Relative noise of G'' at every frequency: `same`, or larger where the phase scatters and G'' is small."""
+    if sweep.sd_estimated and sweep.loss_sd is not None:
+        return np.maximum(same, sweep.loss_sd / sweep.loss)
+    return np.full(len(np.unique(sweep.angular_frequency)), same)
 
 
 def _breach(omega, storage, loss, noise) -> str:
@@ -105,7 +112,7 @@ def _breach(omega, storage, loss, noise) -> str:
         return "G' rises by more than its loss allows"
     if -rise > margin:
         return "G' falls"
-    if abs(math.log(loss[1] / loss[0])) > step + max(SIGNIFICANT * math.sqrt(2) * noise[1], NEGLIGIBLE):
+    if abs(math.log(loss[1] / loss[0])) > step + max(SIGNIFICANT * math.hypot(*noise[1]), NEGLIGIBLE):
         return "G'' changes faster than the frequency"
     return ""
 

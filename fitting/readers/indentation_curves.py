@@ -24,7 +24,7 @@ _WORDS = {
     "force": ("force", "kraft", "load", "normal force"),
 }
 #: Words of columns that are something else: a speed, an error.
-_NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus", "time", "cell"}
+_NOT = {"rate", "velocity", "speed", "sd", "std", "error", "modulus"}
 #: A number beyond this one, in SI units, is no measurement.
 _LARGEST = 1e30
 _FEWEST = 6

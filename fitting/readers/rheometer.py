@@ -54,7 +54,8 @@ def read_sweep(path: str | os.PathLike, table: str | None = None) -> Sweep:
 
 
 def read_all_sweeps(path: str | os.PathLike) -> list[tuple[str, Sweep]]:
-    """Read every table of a file that is a sweep, as `read_sweep` does; with the name of each."""
+    """Read every table of a file that is a sweep, with the name of each. Unlike in `read_sweep`, the points are not
+    weighed by their scatter."""
     tables = tables_of(str(path), text_of(Path(path)).splitlines())
     return [(table.name, _sweep(str(path), table, [])) for table in tables]
 

@@ -6,8 +6,8 @@ from fitting.readers.frequency_sweep import Sweep, distance_from_smooth, distanc
 
 #: The phase may be the cause where G'' scatters by more than this part of itself, and by this factor more than G'.
 _SCATTERS, _MORE = 0.03, 3.0
-#: Fewest points whose scatter is looked at.
-_FEWEST = 8
+#: Fewest points whose scatter is looked at, and fewest per decade: fewer show the curvature of the material as scatter.
+_FEWEST, _PER_DECADE = 8, 5.0
 #: Noise in proportion to G'' must be more likely than this (logarithm): G'' alone has few causes of such noise.
 _BETTER = 8.0
 #: Neighbours that the two kinds of noise are compared over.
@@ -24,6 +24,8 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
     if sweep.storage_sd is not None or len(np.unique(omega)) < max(len(omega), _FEWEST):
         return sweep
     x, sine = np.log(omega), sweep.loss / size
+    if (len(x) - 1) * np.log(10) < _PER_DECADE * np.ptp(x) * (1 - 1e-6):
+        return sweep
     storage, phase = (distance_from_smooth(x, y) for y in (np.log(sweep.storage), sine))
     scatters = float(np.median(phase * size / sweep.loss))
     if not (scatters > _SCATTERS and scatters > _MORE * storage):
@@ -32,7 +34,8 @@ def weighed_by_scatter(sweep: Sweep) -> Sweep:
         return sweep
     note = (
         f"G'' scatters by {100 * scatters:.2g} % and G' by {100 * storage:.2g} %, as by an error of the phase of "
-        f"{np.degrees(phase):.2g} degrees: G'' is weighed by |G*|, not by itself; give deviations to weigh otherwise"
+        f"{np.degrees(phase):.2g} degrees (or by outliers): G'' is weighed by |G*|, not by itself; give deviations to "
+        "weigh otherwise"
     )
     storage_sd = np.maximum(storage, phase * sine) * sweep.storage
     return sweep._replace(storage_sd=storage_sd, loss_sd=phase * size, sd_estimated=True, notes=(*sweep.notes, note))

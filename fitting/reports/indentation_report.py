@@ -119,7 +119,7 @@ def table(rig: Indenter, fit: ContactFit, content: Content) -> str:
     """Modulus and contact point ± standard error."""
     e, offset = content["standard_errors"], []
     if fit.offset_error:
-        offset = [f"F0  {fit.offset:11.5g} ± {fit.offset_error:<9.2g} N, the force before contact"]
+        offset = [f"F0  {fit.offset:11.5g} ± {fit.offset_error:<9.2g} N, force before contact that is left"]
     return "\n".join(
         [
             f"{rig.shape} on a bonded layer of {1e3 * rig.thickness:g} mm, Poisson's ratio {rig.poisson:g}",

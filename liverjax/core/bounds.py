@@ -179,7 +179,10 @@ def _is_numbers(value: object) -> bool:
         return False
     if isinstance(value, (int, float)):
         return finite(value)
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # a traced value is no number of a file
+        return False
     return array.dtype.kind in "fiu" and bool(np.all(np.isfinite(array)))
 
 

@@ -15,7 +15,8 @@ from fitting.readers.rheometer import Sweep
 #: Chance that noise alone moves one of the numbers of a fit far enough to be told.
 CHANCE = 0.05
 #: Where points scatter about a smooth curve by less than this part of the residuals, the model causes the residuals.
-SMOOTH = 0.5
+#: Then the fewest points whose scatter is looked at.
+SMOOTH, ENOUGH = 0.5, 16
 
 
 def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]:
@@ -74,7 +75,7 @@ def _noise_of_residuals(fit: Fit, sweep: Sweep, J: np.ndarray) -> np.ndarray:
     r, n = np.asarray(fit.solution.residuals)[: len(J)], len(J) // 2
     own = None if fit.kind.effective is not None else grouped_sizes(J, r, np.arange(2 * n) >= n)
     sizes = np.full(2 * n, fit.uncertainty.noise) if own is None else own
-    if len(np.unique(sweep.angular_frequency)) < n:
+    if len(np.unique(sweep.angular_frequency)) < max(n, ENOUGH):  # a few points say too little of their scatter
         return sizes
     columns = ((sweep.storage, slice(0, n)), (sweep.loss, slice(n, 2 * n)))
     for (modulus, rows), deviation in zip(columns, sweep.deviations, strict=True):

@@ -125,6 +125,10 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     """New values minus old ones of a fit to the points kept."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
+    # The points left keep the weights that they had among all: deviations are smoothed once.
+    if sweep.storage_sd is not None:
+        storage_sd, loss_sd = sweep.deviations
+        sweep = sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd)
     part = some(sweep, kept)
     old = {name: value for name, (value, _) in values(fit).items()}
     if fit.kind.effective is not None:

@@ -52,7 +52,8 @@ def _by_sizes(fit: Together) -> np.ndarray:
     for k, (test, share) in enumerate(zip(fit.tests, fit.shares, strict=True)):
         _, measured, scales = together.reported_numbers(test)
         if not isinstance(test, Dispersion):  # waves have no size of a sample
-            moved[first : first + share.points, k] = measured / (scales * share.noise)
+            sign = -1.0 if together.name_of(test) == "creep" else 1.0  # a stiffer sample creeps less
+            moved[first : first + share.points, k] = sign * measured / (scales * share.noise)
         first += share.points
     size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     return (slope / size) @ (np.linalg.pinv(J / size) @ moved)

@@ -142,7 +142,8 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
 def _nameless_deviations(cells: list[str]) -> list[str]:
     """A note on headings such as "SD" and "±", which do not say of which modulus."""
     words = [re.sub(r"[^a-z±]", " ", cell.lower()).split() for cell in cells]
-    found = [c for c, own in zip(cells, words, strict=True) if own and set(own) <= {*DEVIATION_WORDS, "±", "pa", "kpa"}]
+    spread = {*DEVIATION_WORDS, "±"}
+    found = [c for c, own in zip(cells, words, strict=True) if spread & set(own) and set(own) <= spread | {"pa", "kpa"}]
     if not found:
         return []
     return [

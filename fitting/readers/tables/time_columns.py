@@ -159,6 +159,8 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
                 rest = re.sub(r"^(?:[/,]|in\b)\s*", "", name[len(word) :].strip())  # "Zeit / s", "time, s", "time in s"
                 if rest and not _known_column(quantity, rest):
                     break  # "strain rate", "stress (step)"
+                if word == "t" and not (name[0] == "t" and (unit or rest) and _known_column("time", unit or rest)):
+                    break  # T is a temperature
                 found.setdefault(quantity, (k, unit or rest or None))
                 break
     return found
