@@ -13,7 +13,7 @@ from fitting.__main__ import main
 from fitting.commands import together as command
 from fitting.fits import joint, together, viscoelastic
 from fitting.fits.families import springpots_in_time
-from fitting.fits.honesty import sizes_of_samples
+from fitting.fits.honesty import sizes_of_samples, total_error
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.readers.frequency_sweep import Sweep
@@ -115,7 +115,7 @@ def test_total_errors_contain_the_sizes_of_the_samples():
         factor = 1 + 0.013 * np.random.default_rng(100 + seed).standard_normal()
         fit = together.fit(wide_and_long(factor, seed), 2)
         shares, u = sizes_of_samples.shares_with_sizes(fit, 0.013), fit.uncertainty
-        off, whole = np.abs(u.values - np.array([800, 0.3, 0.4, 30, 0.1])), sizes_of_samples.root_of_squares(shares)
+        off, whole = np.abs(u.values - np.array([800, 0.3, 0.4, 30, 0.1])), total_error.root_of_squares(shares)
         hits.append(off < u.quantile * np.array([whole[name] for name in u.names]))
         by_noise.append(off < u.quantile * u.standard_errors)
     assert np.all(np.mean(hits, axis=0) >= 0.83) and np.mean(by_noise, axis=0).min() < 0.7

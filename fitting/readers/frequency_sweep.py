@@ -1,6 +1,7 @@
 """A measured frequency sweep, and the parts of it that can be used."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -143,6 +144,13 @@ def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) ->
     The deviation of three repeats is off by a factor of two and more. Points whose deviation is small by chance would
     have most of the weight, and the errors would be too small.
     """
+    return _smooth_of_bytes(*(np.asarray(v, float).tobytes() for v in (omega, modulus, sd)))
+
+
+@lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
+def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
+    """`smooth_deviations` of the bytes of its columns."""
+    omega, modulus, sd = (np.frombuffer(column) for column in columns)
     x = np.log(omega)
     if len(np.unique(x)) < max(_POINTS, len(x)):
         return sd

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitting.fits.families import limits
-from fitting.fits.honesty import sizes_of_samples
+from fitting.fits.honesty import sizes_of_samples, total_error
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.time_tests import thinned
 from fitting.fits.together import Share, Together
@@ -82,7 +82,7 @@ def write(out: Path, found: Together, relative: float) -> Content:
 
 def _total_errors(found: Together, relative: float) -> Content:
     shares = sizes_of_samples.shares_with_sizes(found, relative)
-    whole = sizes_of_samples.root_of_squares(shares)
+    whole = total_error.root_of_squares(shares)
     return {"total_errors": by_stem(whole), "error_shares": {source: by_stem(part) for source, part in shares.items()}}
 
 
@@ -171,7 +171,7 @@ def table(found: Together, relative: float) -> str:
 def _with_sizes(found: Together, relative: float) -> list[str]:
     """The total error of the first number, and the largest part that the sizes of the samples have in the others."""
     shares = sizes_of_samples.shares_with_sizes(found, relative)
-    whole, names = sizes_of_samples.root_of_squares(shares), list(shares["noise"])
+    whole, names = total_error.root_of_squares(shares), list(shares["noise"])
     if not names or not np.isfinite(whole[names[0]]):
         return []
     told = (

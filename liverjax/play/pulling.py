@@ -72,8 +72,7 @@ def at_rest(scene: Scene) -> Playing:
         rest_length=jnp.asarray(SLACK * size),
     )
     solve = replace(scene.solve, reduced="")
-    scene = prepared(replace(scene, physics=(*scene.physics, spring), solve=solve))
-    scene = _with_histories(scene)
+    scene = prepared(_with_histories(replace(scene, physics=(*scene.physics, spring), solve=solve)))
     state = initial_state(scene) if scene.solve.dt is not None else _after_load_steps(scene)
     scene = replace(scene, solve=replace(scene.solve, steps=STEPS))
     program = compiled(partial(simulate_part, count=1), scene, state, 1.0)
@@ -129,6 +128,8 @@ def pulled(playing: Playing, node: int | None = None, to: np.ndarray | None = No
         spring = replace(
             spring, nodes=jnp.full((1, 1), node, jnp.int32), to=jnp.asarray(end), stiffness=jnp.asarray(stiffness)
         )
+    # In the precision of the compiled program.
+    spring = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), spring, playing.scene.physics[-1])
     scene = replace(playing.scene, physics=(*others, spring))
     first = STEPS if playing.scene.solve.dt is None else playing.step + 1  # without time: under the whole load
     result, state = jax.block_until_ready(playing.program(scene, playing.state, float(first)))

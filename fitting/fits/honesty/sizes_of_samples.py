@@ -29,16 +29,8 @@ def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, flo
     # Samples of their own have independent factors; one sample, mounted once, has one factor for all its tests.
     both = np.maximum(np.linalg.norm(by_size, axis=1), np.abs(by_size.sum(axis=1)))
     noise = own.standard_errors[kept]
-    out = {
-        "noise": dict(zip(names, noise.tolist(), strict=True)),
-        "geometry": dict(zip(names, both.tolist(), strict=True)),
-    }
-    return out
-
-
-def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Root of the sum of the squares of the shares, by name."""
-    return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
+    shares = {"noise": noise, "geometry": both}
+    return {source: dict(zip(names, part.tolist(), strict=True)) for source, part in shares.items()}
 
 
 def _by_sizes(fit: Together) -> np.ndarray:

@@ -59,8 +59,12 @@ def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
 
 def total_errors(fit: Fit) -> dict[str, float]:
     """Root of the sum of the squares of `error_shares`, by the names of `edges.values`."""
-    found = error_shares(fit)
-    return {name: float(np.sqrt(sum(part[name] ** 2 for part in found.values()))) for name in found["noise"]}
+    return root_of_squares(error_shares(fit))
+
+
+def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Total errors by name, from shares of independent sources."""
+    return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
 
 
 def _moduli(fit: Fit) -> set[str]:
