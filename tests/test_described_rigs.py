@@ -131,6 +131,38 @@ def test_a_load_that_was_there_at_once(tmp_path, drive):
     assert abs(float(fits.fit(ramp, 1).model.shear_modulus) / 800 - 1) > 0.01
 
 
+@pytest.mark.parametrize(("shape", "back"), [("sphere", True), ("cone", True), ("punch", False)])
+def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
+    """Fitted with the formula of a contact that grows, a sphere taken back made G0 350 times too large."""
+    sizes = {"thickness": 0.02} | ({"half_angle": 60.0} if shape == "cone" else {"radius": 0.005})
+    time = np.arange(1, 61) / 10
+    d = 1e-3 * np.minimum(time, 1.0) + 2e-6 * np.random.default_rng(0).normal(size=60)
+    d[45:] -= 1.5e-5 * np.arange(15)
+    file = written(tmp_path, {"test": shape} | sizes, (time, d, np.maximum(d, 0) * 100 * (1 + np.exp(-time))))
+    test = read_described(file)
+    said = [note for note in test.notes if "shrinks" in note]
+    assert bool(said) == back
+    if back:
+        # 2 % of the depth is not a return yet.
+        assert said[0].startswith("13 rows from 4.8 s on are left out")
+        assert test.time[-1] == pytest.approx(4.7)
+
+
+@SLOW
+def test_a_compression_by_a_fifth_is_computed(tmp_path):
+    """The finest cells of the plates' rims turn inside out at 15 % of this disc: coarser ones go on."""
+    time = np.arange(1, 31) / 10
+    d = 0.2 * 0.008 * np.minimum(time, 1.0)
+    secants = []
+    for part in (0.5, 1.0):
+        file = written(
+            tmp_path, {"test": "compression", "radius": 0.01, "height": 0.008}, (time, part * d, 300 * part * d)
+        )
+        test = read_described(file)
+        secants.append(np.max(test.driven) / part)
+    assert 1.02 < secants[1] / secants[0] < 1.2  # a glued disc stiffens in compression
+
+
 def test_the_elastic_curve_before_contact_is_straight():
     values = curve_of(lambda d: 2 * d + d**2, np.array([-0.1, 0.0, 0.5, 1.0]))
     np.testing.assert_allclose(values, [-0.2, 0.0, 1.25, 3.0], atol=1e-3)

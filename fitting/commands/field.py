@@ -45,7 +45,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--noise", type=float, metavar="M", help="standard deviation [m] if a file has no column sd")
     command.add_argument("--unit", default="m", help="unit of the lengths in the displacement files (default m)")
-    command.add_argument("--iterations", type=int, default=60, help="L-BFGS iterations for each weight (default 60)")
+    command.add_argument("--iterations", type=int, default=60, help="most iterations for each weight (default 60)")
     command.add_argument("--resume", action="store_true", help="go on from the last iteration written to --out")
     command.add_argument(
         "--out", type=Path, default=Path("field"), metavar="DIR", help="folder of the results (default field)"
@@ -102,7 +102,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
     with bar:
         found = field.estimate(problem, options.name, length, how)
-    good = all(c == status.CONVERGED for c in found.codes)
+    good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(found))
     content = _files(options) | {"map": field_report.of_field(found)}
     if not found.reached:
@@ -111,6 +111,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
             "or the scene misses something (mesh, supports, loads)",
             file=sys.stderr,
         )
+    _warn(field.distance_sentence(found))
     _warn(field.bias_sentence(found))
     if options.sphere:
         sphere = inclusion.estimate(problem, options.name, inclusion.start_from(problem, found))

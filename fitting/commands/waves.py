@@ -85,7 +85,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"warning: {sentence}", file=sys.stderr)
     files = FILES[:-1] if drawn is not None else FILES[:2]
     print(f"written: {options.out}/{', '.join(files)}")
-    return 0 if np.all(found.whole.converged) and (found.parts is None or np.all(found.parts.converged)) else 1
+    good = np.all(found.whole.converged) and (found.parts is None or np.all(found.parts.converged))
+    return 0 if good and (drawn is None or drawn.distance <= stiffness_map.FAR) else 1
 
 
 @contextmanager

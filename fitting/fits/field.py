@@ -1,11 +1,12 @@
 """A map of stiffness from measured displacements: a smooth field of one number of the law, with its uncertainty.
 
 The number of an element is the scene's number times exp(m). m is the element's mean of a nodal field (V,) with the
-prior of `fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 is sought by L-BFGS in the whitened z, with gradients
-through the runs. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down to
-the number of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty comes from
-the Gauss-Newton Hessian I + J^T J. Lanczos iterations find its largest eigenvalues; each product needs a linearised run
-and its transpose (Bui-Thanh et al. 2013).
+prior of `fitting.methods.prior`. The minimum of chi^2/2 + |z|^2/2 over the whitened z is sought by Gauss-Newton in a
+trust region (Steihaug 1983). The Hessian I + J^T J is never made: each product needs a linearised run and its
+transpose. It is nowhere smaller than I, so the gradient's size is at least the distance to the minimum in standard
+deviations of the map. The prior's standard deviation of m is the regulariser's weight: it grows until chi^2 comes down
+to the number of measured components (discrepancy principle; Morozov 1966), or no longer falls. The uncertainty comes
+from the same Hessian. Lanczos iterations find its largest eigenvalues (Bui-Thanh et al. 2013).
 """
 
 import time
@@ -33,8 +34,10 @@ from liverjax.scenes.scene import numbers_at
 DEVIATIONS = (0.1, 0.2, 0.4, 0.8, 1.6)
 #: If the next deviation lowers chi^2 by less than this part, the search ends.
 _WORTH = 0.02
-#: Largest |z| that is allowed, in standard deviations.
-_BOUND = 8.0
+#: The search ends where the gradient says that the minimum is nearer than this, in standard deviations of the map.
+_NEAR = 0.05
+#: A map that is farther than this from its minimum has not converged.
+FAR = 0.1
 
 
 class Field(NamedTuple):
@@ -51,6 +54,7 @@ class Field(NamedTuple):
     chi2: float
     components: int
     reached: bool  # whether chi^2 came down to the number of components
+    distance: float  # to the minimum, in standard deviations of the map: the length of the next Gauss-Newton step
     history: list[dict]  # one row per deviation: chi2, iterations, evaluations, seconds
     eigenvalues: np.ndarray  # of J^T J in whitened z: the data determine directions above 1
     codes: tuple[int, ...]
@@ -83,23 +87,71 @@ def values_at(problem: Problem, name: str, base: jax.Array, m: jax.Array) -> dic
 
 
 @partial(jax.jit, static_argnames="name")
-def _cost_of_map(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
-    """chi^2/2, its gradient by m, and the codes."""
+def _linearised(problem: Problem, base: jax.Array, m: jax.Array, name: str) -> Any:
+    """The residuals (n,) of the runs at m, their linear map J from changes of m, and the codes of the runs."""
+    return jax.linearize(lambda m: misfit(problem, values_at(problem, name, base, m)), m, has_aux=True)
 
-    def half(m):
-        r, codes = misfit(problem, values_at(problem, name, base, m))
-        return 0.5 * jnp.vdot(r, r), codes
 
-    return jax.value_and_grad(half, has_aux=True)(m)
+@jax.jit
+def _pushed(J: Callable, dm: jax.Array) -> jax.Array:
+    return J(dm)
+
+
+@jax.jit
+def _pulled(J: Callable, r: jax.Array, m: jax.Array) -> jax.Array:
+    return jax.linear_transpose(J, m)(r)[0]
+
+
+class _Linearised(NamedTuple):
+    """The runs, linearised at a whitened field z: products with J, its derivatives by z, and its transpose."""
+
+    p: smooth.Prior
+    deviation: float
+    z: np.ndarray
+    m: jax.Array
+    r: np.ndarray  # residuals (n,)
+    J: Callable  # of changes of m
+    codes: tuple[int, ...]
+
+    @property
+    def finite(self) -> bool:
+        """Whether the runs have an answer."""
+        return bool(np.all(np.isfinite(self.r)) and status.NOT_FINITE not in self.codes)
+
+    @property
+    def cost(self) -> float:
+        """(chi^2 + |z|^2)/2; a large number without an answer: the search goes back."""
+        chi2 = self.r @ self.r if self.finite else 1e3 * (1 + len(self.r))
+        return float(0.5 * (chi2 + self.z @ self.z))
+
+    def push(self, z: np.ndarray) -> jax.Array:
+        """J z (n,)."""
+        return _pushed(self.J, jnp.asarray(self.deviation * smooth.field_at_nodes(self.p, z.ravel())))
+
+    def pull(self, r: np.ndarray | jax.Array) -> np.ndarray:
+        """J^T r (V,) of residuals (n,)."""
+        return self.deviation * smooth.to_whitened(self.p, np.asarray(_pulled(self.J, jnp.asarray(r), self.m)))
+
+    def gradient(self) -> np.ndarray:
+        """Of the cost, by z (V,)."""
+        return self.z + (self.pull(self.r) if self.finite else 0.0)
+
+    def hessian(self, z: np.ndarray) -> np.ndarray:
+        """(I + J^T J) z."""
+        return z + (self.pull(self.push(z)) if self.finite else 0.0)
 
 
 class _Search:
-    """State of a search: the functions that L-BFGS calls, and the file from which a run is resumed."""
+    """State of a search: the functions that the minimiser calls, and the file from which a run is resumed."""
 
-    def __init__(self, problem, name, base, p, file, progress):
+    def __init__(
+        self, problem: Problem, name: str, base: jax.Array, p: smooth.Prior, file: Path | None, progress: Callable
+    ) -> None:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
-        self.history, self.k, self.z = [], 0, np.zeros(len(p.root_mass))
-        self.best, self.evaluations, self.codes = np.inf, 0, ()
+        self.history: list[dict[str, float]] = []
+        self.k, self.z = 0, np.zeros(len(p.root_mass))
+        self.last: list[_Linearised] = []  # two: a trial, and the point from which it was tried
+        self.evaluations = 0
         self.marks = {
             "name": name,
             "length": float(p.scale),  # the prior's scale is a power of the length
@@ -108,23 +160,25 @@ class _Search:
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
         }
 
-    def cost(self, z: np.ndarray) -> tuple[float, np.ndarray]:
-        """(chi^2 + |z|^2)/2 and its gradient."""
+    def at(self, z: np.ndarray) -> _Linearised:
+        """The runs, linearised at z."""
         deviation = DEVIATIONS[self.k]
-        m = deviation * smooth.field_at_nodes(self.p, z)
-        (half, codes), g = _cost_of_map(self.problem, self.base, jnp.asarray(m), self.name)
-        half, g = float(half), np.asarray(g)
+        for one in self.last:
+            if one.deviation == deviation and np.array_equal(one.z, z):
+                return one
+        m = jnp.asarray(deviation * smooth.field_at_nodes(self.p, z))
+        r, J, codes = _linearised(self.problem, self.base, m, self.name)
         self.evaluations += 1
-        if not (np.isfinite(half) and np.all(np.isfinite(g)) and not np.any(np.asarray(codes) == status.NOT_FINITE)):
-            return 1e3 * (1 + z @ z + self.problem.components), z.copy()  # a large cost: the line search goes back
-        self.chi2, self.codes = 2 * half, tuple(int(c) for c in codes)
-        return half + 0.5 * float(z @ z), deviation * smooth.to_whitened(self.p, g) + z
+        here = _Linearised(self.p, deviation, z.copy(), m, np.asarray(r), J, tuple(int(c) for c in codes))
+        self.last = [here, *self.last[:1]]
+        return here
 
     def iterated(self, z: np.ndarray) -> None:
-        """Called by L-BFGS after each iteration."""
+        """Called after each iteration."""
         self.z = z.copy()
         self.write()
-        self.progress(self.k, self.chi2 / self.problem.components)
+        r = self.at(self.z).r
+        self.progress(self.k, float(r @ r) / self.problem.components)
 
     def write(self) -> None:
         """Write the current point; the file is never left half written."""
@@ -141,7 +195,7 @@ class _Search:
         Raises:
             InputError: the file is damaged, or belongs to another problem.
         """
-        if not self.file.is_file():
+        if self.file is None or not self.file.is_file():
             return
         try:
             with h5py.File(self.file) as f:
@@ -158,7 +212,7 @@ _HISTORY = ("deviation", "chi2_per_component", "iterations", "evaluations", "sec
 class MapOptions(NamedTuple):
     """Options of the search for a map, and of the file that keeps its progress."""
 
-    max_iterations: int = 60  # L-BFGS iterations for each deviation of the prior
+    max_iterations: int = 60  # most iterations for each deviation of the prior
     modes: int = 60  # most directions of the field for which the uncertainty is computed
     file: Path | None = None  # HDF5 file for the point of every iteration; None: no file
     resume: bool = False  # begin from that file if it exists
@@ -194,27 +248,29 @@ def estimate(
     if options.resume and options.file is not None:
         search.read()
     _deviations_in_turn(search, options.max_iterations)
-    deviation = DEVIATIONS[search.k]
-    m = deviation * smooth.field_at_nodes(p, search.z)
-    search.cost(search.z)
-    asked = _Asked.at(search, deviation, m)
-    values, vectors = _measured_directions(asked, len(m), options.modes)
+    here = search.at(search.z)
+    if not here.finite:
+        raise InputError("the scene has no answer at the numbers where the map begins: run simulate on it first")
+    deviation, m = here.deviation, np.asarray(here.m)
+    values, vectors = _measured_directions(here, len(m), options.modes)
     before, after = smooth.variances(p, vectors, 1 / (1 + values))
+    slope, chi2 = here.gradient(), float(here.r @ here.r)
     return Field(
         name=name,
         log_factor=m,
-        modulus=np.asarray(values_at(problem, name, base, jnp.asarray(m))[name]),
+        modulus=np.asarray(values_at(problem, name, base, here.m)[name]),
         sd=deviation * np.sqrt(after),
         prior_sd=deviation * np.sqrt(before),
-        mesh_bias=_bias_of_map(search, asked, m, values, vectors) if options.mesh_error else None,
+        mesh_bias=_bias_of_map(search, here, values, vectors) if options.mesh_error else None,
         deviation=deviation,
         length=length,
-        chi2=search.chi2,
+        chi2=chi2,
         components=problem.components,
-        reached=search.chi2 <= problem.components,
+        reached=chi2 <= problem.components,
+        distance=float(np.sqrt(max(slope @ _by_hessian(here, slope, values, vectors), 0.0))),
         history=search.history,
         eigenvalues=values,
-        codes=search.codes,
+        codes=here.codes,
         seconds=time.perf_counter() - begin,
     )
 
@@ -222,91 +278,77 @@ def estimate(
 def _deviations_in_turn(search: _Search, max_iterations: int) -> None:
     """Try one deviation after another, each from the last field, until chi^2 is down to the noise."""
     while True:
-        begin, before = time.perf_counter(), search.evaluations
-        bounds = [(-_BOUND, _BOUND)] * len(search.z)
-        options = {"maxiter": max_iterations, "maxcor": 20, "ftol": 1e-5}
-        found = scipy.optimize.minimize(
-            search.cost, search.z, jac=True, method="L-BFGS-B", bounds=bounds, options=options, callback=search.iterated
-        )
-        search.z = found.x
-        search.cost(found.x)
-        row = (
-            DEVIATIONS[search.k],
-            search.chi2 / search.problem.components,
-            found.nit,
-            search.evaluations - before,
-            time.perf_counter() - begin,
-        )
-        search.history.append(dict(zip(_HISTORY, map(float, row), strict=True)))
-        search.write()
-        enough = search.chi2 <= search.problem.components
+        # A row of a finished search is there already if a run was stopped after it.
+        finished = len(search.history) > search.k and search.history[search.k]["iterations"] < max_iterations
+        if not finished:
+            search.history = [*search.history[: search.k], _minimised(search, max_iterations)]
+            search.write()
         last = [h["chi2_per_component"] for h in search.history[-2:]]
         idle = len(last) == 2 and last[1] > (1 - _WORTH) * last[0]
-        if enough or idle or search.k + 1 == len(DEVIATIONS):
+        if last[-1] <= 1 or idle or search.k + 1 == len(DEVIATIONS):
             return
         search.k += 1
         search.z = search.z * DEVIATIONS[search.k - 1] / DEVIATIONS[search.k]
 
 
-class _Asked(NamedTuple):
-    """The runs, linearised at the fitted field: products with J and its transpose, in whitened z."""
-
-    p: smooth.Prior
-    deviation: float
-    push: Callable
-    pull: Callable
-
-    @classmethod
-    def at(cls, search: _Search, deviation: float, m: np.ndarray) -> "_Asked":
-        """Linearise the runs at the nodal field m (V,)."""
-        name = search.name
-
-        @jax.jit
-        def residuals(m, problem, base):
-            return misfit(problem, values_at(problem, name, base, m))[0]
-
-        _, push = jax.linearize(lambda m: residuals(m, search.problem, search.base), jnp.asarray(m))
-        pull = jax.jit(jax.linear_transpose(push, jnp.asarray(m)))
-        return cls(search.p, deviation, jax.jit(push), pull)
-
-    def gradient(self, r: np.ndarray | jax.Array) -> np.ndarray:
-        """J^T r (V,) of residuals (n,)."""
-        return self.deviation * smooth.to_whitened(self.p, np.asarray(self.pull(jnp.asarray(r))[0]))
-
-    def product(self, z: np.ndarray) -> np.ndarray:
-        """J^T J z (V,)."""
-        dm = jnp.asarray(self.deviation * smooth.field_at_nodes(self.p, z.ravel()))
-        return self.gradient(self.push(dm))
+def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
+    """Find the minimum for the present deviation; return a row of the history."""
+    begin, before = time.perf_counter(), search.evaluations
+    found = scipy.optimize.minimize(
+        lambda z: search.at(z).cost,
+        search.z,
+        jac=lambda z: search.at(z).gradient(),
+        hessp=lambda z, v: search.at(z).hessian(v),
+        method="trust-ncg",
+        callback=search.iterated,
+        options={"maxiter": max_iterations, "gtol": _NEAR},
+    )
+    search.z = found.x
+    r = search.at(found.x).r
+    chi2, seconds = float(r @ r) / search.problem.components, time.perf_counter() - begin
+    row = (DEVIATIONS[search.k], chi2, found.nit, search.evaluations - before, seconds)
+    return dict(zip(_HISTORY, map(float, row), strict=True))
 
 
-def _measured_directions(asked: _Asked, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
+def _measured_directions(here: _Linearised, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
-    k = min(modes, n - 2, jax.eval_shape(asked.push, jnp.zeros(n)).size)
-    operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=asked.product, dtype=float)
+    k = min(modes, n - 2, len(here.r))
+    operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
     # The prior determines directions with an eigenvalue far below 1: they need no accuracy.
     values, vectors = scipy.sparse.linalg.eigsh(operator, k=k, ncv=min(n, 2 * k + 1), tol=1e-2, v0=np.ones(n))
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
-def _bias_of_map(
-    search: _Search, asked: _Asked, m: np.ndarray, values: np.ndarray, vectors: np.ndarray
-) -> np.ndarray | None:
-    """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their error in the residuals."""
-    left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, jnp.asarray(m)))
-    if left_out is None or not np.all(np.isfinite(left_out)):
-        return None
-    n, shrink = len(m), values / (1 + values)
+def _by_hessian(here: _Linearised, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(I + J^T J)^-1 g (V,), to 1 %: what it is used for is of first order only."""
+    n, shrink = len(g), values / (1 + values)
 
     def solved(z: np.ndarray) -> np.ndarray:
         return z - vectors @ (shrink * (vectors.T @ z))
 
     hessian, inverse = (
-        scipy.sparse.linalg.LinearOperator((n, n), matvec=f, dtype=float)
-        for f in (lambda z: z + asked.product(z), solved)
+        scipy.sparse.linalg.LinearOperator((n, n), matvec=f, dtype=float) for f in (here.hessian, solved)
     )
-    # The correction is of first order only, so a tolerance of 1 % is far below its own error.
-    z, _ = scipy.sparse.linalg.cg(hessian, asked.gradient(left_out), rtol=1e-2, maxiter=30, M=inverse)
-    return asked.deviation * smooth.field_at_nodes(asked.p, z)
+    return scipy.sparse.linalg.cg(hessian, g, rtol=1e-2, maxiter=30, M=inverse)[0]
+
+
+def _bias_of_map(search: _Search, here: _Linearised, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
+    """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their error in the residuals."""
+    left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, here.m))
+    if left_out is None or not np.all(np.isfinite(left_out)):
+        return None
+    z = _by_hessian(here, here.pull(left_out), values, vectors)
+    return here.deviation * smooth.field_at_nodes(here.p, z)
+
+
+def distance_sentence(found: Field) -> str | None:
+    """A sentence if the search stopped before the minimum; else None."""
+    if found.distance <= FAR:
+        return None
+    return (
+        f"the search stopped {found.distance:.2g} standard deviations of the map away from its minimum: give more "
+        "--iterations and --resume, or a smaller [solve] tolerance"
+    )
 
 
 def bias_sentence(found: Field) -> str | None:

@@ -41,17 +41,19 @@ def factor(mesh: TetMesh, centre: jax.Array, radius: Number, width: Number) -> j
 
 def start_from(problem: Problem, field: Field) -> np.ndarray:
     """Start u of the sphere from the map: elements whose ln(modulus) differs from the background by more than half of
-    the largest difference.
+    the largest difference, both in standard deviations of the map. A weak prior leaves large values where the data tell
+    little, at corners for example.
     """
     mesh = problem.scenes[0].mesh
     middle = np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)].mean(axis=1)
     volumes = np.asarray(mesh.volumes)
-    m = field.log_factor[np.asarray(mesh.tetrahedra)].mean(axis=1)
+    m, sd = (own[np.asarray(mesh.tetrahedra)].mean(axis=1) for own in (field.log_factor, field.sd))
     order = np.argsort(m)
     background = m[order[np.searchsorted(np.cumsum(volumes[order]), 0.5 * volumes.sum())]]
     away = m - background
-    sign = 1.0 if away.max() >= -away.min() else -1.0
-    weight = volumes * np.maximum(sign * away - 0.5 * (sign * away).max(), 0.0)
+    known = away / sd
+    sign = 1.0 if known.max() >= -known.min() else -1.0
+    weight = volumes * np.maximum(sign * known - 0.5 * (sign * known).max(), 0.0)
     inside = weight > 0
     centre = (weight[:, None] * middle).sum(axis=0) / weight.sum()
     radius = np.cbrt(3 * volumes[inside].sum() / (4 * np.pi))

@@ -20,13 +20,13 @@ class Prior(NamedTuple):
     """A prior, factorised on the host, for the functions below."""
 
     solver: Any  # of kappa^2 M + L
-    root_mass: np.ndarray  # (V,)
+    root_mass: np.ndarray  # (V,) of the vertices
     scale: float  # sqrt(8 pi kappa), of a field of standard deviation 1
 
 
 def prior(mesh: TetMesh, length: float) -> Prior:
-    """The prior of a field with standard deviation 1 and correlation length `length` [m]."""
-    kappa, n = 1 / length, mesh.number_of_nodes
+    """The prior of a field at the vertices with standard deviation 1 and correlation length `length` [m]."""
+    kappa, n = 1 / length, mesh.number_of_vertices
     tets, volumes = np.asarray(mesh.tetrahedra), np.asarray(mesh.volumes)
     D = np.moveaxis(np.asarray(mesh.shape_vectors), -1, 0)
     grad = np.concatenate([-D.sum(axis=1, keepdims=True), D], axis=1)  # (E, 4, 3)

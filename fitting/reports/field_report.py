@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import h5py
+import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits.field import Field
@@ -16,6 +17,7 @@ from liverjax.core.status import NAMES
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
 from liverjax.mesh.files import write_mesh
+from liverjax.mesh.promotion import on_middles
 from liverjax.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:
@@ -67,6 +69,7 @@ def of_field(found: Field) -> Content:
         "largest_mesh_bias_of_ln": None if found.mesh_bias is None else float(np.abs(found.mesh_bias).max()),
         "chi2_per_component": found.chi2 / found.components,
         "discrepancy_reached": found.reached,
+        "distance_to_minimum_in_standard_deviations": found.distance,
         "components": found.components,
         "directions_known": int(np.sum(found.eigenvalues > 1)),
         "history": found.history,
@@ -80,9 +83,11 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
     (out / "field.json").write_text(json.dumps(numbers(content | {"versions": versions()}), indent=1) + "\n")
     if found is None:
         return
-    at_nodes = {"factor": np.exp(found.log_factor), "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
+    at_nodes = {"factor": found.log_factor, "sd_of_ln": found.sd, "prior_sd_of_ln": found.prior_sd}
     if found.mesh_bias is not None:
         at_nodes["mesh_bias_of_ln"] = found.mesh_bias
+    at_nodes = {name: np.asarray(on_middles(mesh, jnp.asarray(values))) for name, values in at_nodes.items()}
+    at_nodes["factor"] = np.exp(at_nodes["factor"])
     write_mesh(out / "field.vtu", mesh, at_nodes)
     with h5py.File(out / "field.h5", "w") as f:
         f["modulus"], f["reference"], f["tetrahedra"] = found.modulus, mesh.points, mesh.tetrahedra
@@ -94,7 +99,7 @@ def write(out: Path, mesh: TetMesh, content: Content, found: Field | None) -> No
 
 
 def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n: int = 200) -> tuple[np.ndarray, tuple]:
-    """Nodal values (V,) on the plane through `middle` normal to an axis, NaN outside, and its extent [cm]."""
+    """Values at the vertices (V,) on the plane through `middle` normal to an axis, NaN outside, and its extent [cm]."""
     X = np.asarray(mesh.points)
     low, high = X.min(axis=0), X.max(axis=0)
     a, b = (k for k in range(3) if k != axis)
@@ -102,6 +107,7 @@ def section(mesh: TetMesh, values: np.ndarray, middle: np.ndarray, axis: int, n:
     grid[..., axis] = middle[axis]
     grid[..., a], grid[..., b] = np.meshgrid(np.linspace(low[a], high[a], n), np.linspace(low[b], high[b], n))
     nodes, weights, outside = locate(mesh, grid.reshape(-1, 3))
+    values = np.asarray(on_middles(mesh, jnp.asarray(values)))
     shown = np.where(outside > 0.01, np.nan, np.sum(weights * values[nodes], axis=1))
     return shown.reshape(n, n), tuple(100 * v for v in (low[a], high[a], low[b], high[b]))
 
@@ -145,8 +151,9 @@ def table_of_field(found: Field) -> str:
             f"{h['deviation']:8g}  {h['chi2_per_component']:14.4f}  {h['iterations']:10.0f}  {h['evaluations']:11.0f}  "
             f"{h['seconds']:7.1f}"
         )
+    known = int(np.sum(found.eigenvalues > 1))
     rows.append(
         f"{found.name} from {found.modulus.min():.4g} to {found.modulus.max():.4g}; the data determine "
-        f"{int(np.sum(found.eigenvalues > 1))} directions of the map; {found.seconds:.1f} s"
+        f"{'at least ' if known == len(found.eigenvalues) else ''}{known} directions of the map; {found.seconds:.1f} s"
     )
     return "\n".join(rows)

@@ -15,7 +15,7 @@ from fitting.waves.elastography import Found, Organ
 from fitting.waves.files import components
 from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
-from fitting.waves.stiffness_map import WaveMap, sd_of_modulus
+from fitting.waves.stiffness_map import FAR, WaveMap, sd_of_modulus
 from liverjax.core.errors import InputError
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.struct import Content
@@ -186,6 +186,7 @@ def _of_map(drawn: WaveMap) -> Content:
         "correlation_length_m": drawn.length,
         "chi2_per_component": drawn.chi2 / drawn.components,
         "discrepancy_reached": drawn.reached,
+        "distance_to_minimum_in_standard_deviations": drawn.distance,
         "part_of_variance_left": float(np.mean((drawn.posterior_sd / drawn.prior_sd) ** 2)),
         "told_from_the_mean": float(np.mean(np.abs(drawn.exponent.real) > TOLD * drawn.sd.real)),
         "history": drawn.history,
@@ -218,6 +219,8 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
                 f"regions {names}: the waves place their edges more than a voxel away from the edges of the labels "
                 "(edges_farther_out_voxels): look at the labels"
             )
+    if drawn is not None and not drawn.distance <= FAR:
+        told.append(f"the map stopped {drawn.distance:.2g} standard deviations away from its minimum: --resume goes on")
     # The mean of n squares scatters by the root of 2/n; the noise that divides them is an estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(

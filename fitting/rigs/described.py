@@ -39,8 +39,12 @@ _OTHER = ("test", "data", "drive", "poisson", "min_time", "ramp")
 _KINDS = {"displacement": "relaxation", "force": "creep"}
 #: Default Poisson's ratios: glued samples have K/mu = 1000, layers keep their volume.
 _GLUED, _LAYER = 0.4995, 0.5
-#: Displacements, divided by the largest one, at which glued samples are computed.
-_GRID = (0.05, 0.5, 1.0)
+#: Displacements, divided by the largest one, at which glued samples are computed; more of them for large strains.
+_GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
+#: Cells at the rims of the plates over the shortest length there. Small ones turn inside out at large compression.
+_RIMS = (0.04, 0.1, 0.2)
+#: An indenter goes back where its depth falls by this part of the largest depth, and by so many times its scatter.
+_BACK, _SCATTERS = 0.02, 4.0
 #: Most rows of an indenter's test, with the rows that are added between the measured ones.
 _MOST_ROWS = 2000
 #: Height of a glued sample over its radius up to which it is computed. Beyond it meshes are large, and minutes go by.
@@ -95,6 +99,9 @@ def read_described(path: str | Path) -> TimeTest:
     first, then = (d, force) if described.drive == "displacement" else (force, d)
     time, first, then, told_of_start = from_rest(columns["time"], first, then, described.at_once)
     d, force = (first, then) if described.drive == "displacement" else (then, first)
+    if described.test in ("sphere", "cone"):
+        kept, told_of_way = _while_contact_grows(time, sign * d)
+        time, d, force, told = time[:kept], d[:kept], force[:kept], [*told, *told_of_way]
     if described.test in ("sphere", "cone") and described.drive == "displacement":
         time, d, force = _with_more_between(time, d, force)
     moved = sign * d if "height" in described.sizes else np.maximum(sign * d, 0.0)  # no force without contact
@@ -103,6 +110,22 @@ def read_described(path: str | Path) -> TimeTest:
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     notes = [*notes, *told, *told_of_start]
     return of_columns(kind, time, driven, answer, (str(path), notes), described.min_time)
+
+
+def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list[str]]:
+    """The number of rows until the indenter goes back, and a note if it does: the force on a contact that shrinks is
+    another one (Ting 1966, J. Appl. Mech. 33:845).
+    """
+    scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
+    fall = np.maximum.accumulate(depth) - depth
+    back = fall > max(_BACK * float(depth.max()), _SCATTERS * scatter)
+    if not back.any():
+        return len(time), []
+    kept = int(np.argmax(back))
+    return kept, [
+        f"{len(time) - kept} rows from {time[kept]:.4g} s on are left out: the indenter goes back there, and the force "
+        "on a contact that shrinks does not follow from these formulas"
+    ]
 
 
 def _with_more_between(time: np.ndarray, d: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -180,7 +203,9 @@ def _elastic(described: Described, largest: float, path: str) -> tuple[Callable[
     )
     layer, per_shear = thin_layer.Layer(indenter), 2 * (1 + described.poisson)
     layer.force(np.array([largest]))  # refuses depths that its table does not reach
-    said = "the contact begins where displacement is 0, without adhesion, and grows until the largest displacement"
+    said = "the contact begins where displacement is 0, without adhesion"
+    if described.test != "punch":
+        said += ", and grows until the largest displacement"
     return (lambda d: per_shear * float(layer.force(np.array([d]))[0])), sizes["thickness"], [said]
 
 
@@ -199,19 +224,26 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
             f"{_SLENDER:g}: the ends of so slender a sample hardly matter, so give its shear stress, a third of the "
             "tensile stress, and strain as a table of its own"
         )
-    at = largest * np.array(_GRID)
+    at = largest * np.array(_GRID if largest <= _LARGE * height else _FINER_GRID)
+    nu = described.poisson
+    law = NeoHookean(mu=1e3, bulk=1e3 * 2 * (1 + nu) / (3 * (1 - 2 * nu)))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        if described.test == "glued_punch":
-            rig = glued.indentation(radius, height, sizes["punch"], 1.0, at)
+        for rim in _RIMS:
+            cells = glued.Cells(rim=rim)
+            if described.test == "glued_punch":
+                rig = glued.indentation(radius, height, sizes["punch"], 1.0, at, cells)
+            else:
+                rig = glued.tension(radius, height, 1.0, way * at / height, cells)
+            force, codes = glued.read(rig, law, None)
+            if not np.any(np.asarray(codes)):
+                break
         else:
-            rig = glued.tension(radius, height, 1.0, way * at / height)
-        nu = described.poisson
-        law = NeoHookean(mu=1e3, bulk=1e3 * 2 * (1 + nu) / (3 * (1 - 2 * nu)))
-        force, codes = glued.read(rig, law, None)
+            raise InputError(
+                f"{path}: the mesh of an elastic sample of {radius:g} m radius and {height:g} m height turns "
+                f"inside out before {largest:g} m: check the sizes, or give the rows of smaller displacements"
+            )
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
-    if np.any(np.asarray(codes) != 0):
-        raise InputError(f"{path}: an elastic sample does not reach {largest:g} m: correct the sizes")
     found = np.asarray(force) / 1e3
     left_out = np.where(np.isfinite(left_out), left_out, 0.0)
     secant = np.abs(found + left_out) / at

@@ -7,7 +7,7 @@ numbers about 0 with the deviation `LEVEL`: an organ that is not uniform may mis
 has no level, for the mean of c does the same. Larger and larger deviations of c are tried. The search
 ends when chi^2 is down to the number of equations (discrepancy principle; Morozov 1966), or when the evidence -(chi^2/n
 + |z|^2)/2 - ln det H falls. The deviation with the highest evidence is taken. The minimum of chi^2/2 + |z|^2/2 over the
-whitened z is sought by Gauss-Newton.
+whitened z is sought by Gauss-Newton. The search ends where the next step is shorter than `NEAR` standard deviations.
 
 The uncertainty has two parts. One comes from the Hessian H = I + J^H J/n, where n is chi^2 over its expected value. The
 other comes from the place of a change in modulus, which is not known exactly. The prior turns a step into a slope over
@@ -38,8 +38,11 @@ from liverjax.core.struct import Content
 DEVIATIONS = (0.2, 0.4, 0.8)
 #: Standard deviation of both parts of the levels.
 LEVEL = 0.5
-#: Most steps of Gauss-Newton for each, and relative decrease of the cost below which a step is the last.
-STEPS, LAST = 8, 3e-4
+#: Most steps of Gauss-Newton for each. A search has ended, or at last a map has converged, where the next step is
+#: shorter than this, in standard deviations of the map.
+STEPS, NEAR, FAR = 40, 0.1, 0.2
+#: A step that is longer than this part of the step before shows that the Hessian is from too far away.
+_SLOW = 0.3
 
 
 class WaveMap(NamedTuple):
@@ -56,6 +59,7 @@ class WaveMap(NamedTuple):
     chi2: float
     components: int
     reached: bool
+    distance: float  # to the minimum, in standard deviations of the map: the length of the next step
     history: list[dict[str, float]]
     seconds: float
 
@@ -140,9 +144,8 @@ class _Reached(NamedTuple):
 class _Begun(NamedTuple):
     """State of a search."""
 
-    start: _Reached  # of the current deviation
-    point: _Reached  # reached from there
-    visited: list[tuple[_Reached, np.ndarray]]  # end of each earlier deviation, with `_information` at its start
+    point: _Reached  # of the current deviation
+    visited: list[tuple[_Reached, np.ndarray]]  # end of each earlier deviation, with `_information` there
     history: list[Content]
 
 
@@ -189,10 +192,10 @@ def map_of(
     excess, evidence = _evidences(course, visited, components)
     for row, value in zip(history[-len(visited) :], evidence, strict=True):
         row["evidence"] = value
-    point = visited[int(np.argmax(evidence))][0]
+    point, information = visited[int(np.argmax(evidence))]
     y = course.natural(course.scales(point.k) * point.z)
     exponent = course.by_frequency(y)
-    before, after, departures = _spread(course, point, excess, draws)
+    before, after, departures = _spread(course, point, information / excess, draws)
     slopes = np.stack([D @ y[: course.corners] for D in course.slopes])
     place = np.random.default_rng(1).uniform(-0.5, 0.5, (draws, 3)) @ slopes
     return WaveMap(
@@ -207,6 +210,7 @@ def map_of(
         chi2=point.chi2,
         components=components,
         reached=point.chi2 <= components,
+        distance=_newton_step(course, point, information)[1],
         history=history,
         seconds=time.perf_counter() - begin,
     )
@@ -279,19 +283,24 @@ def _evidence(course: Course, point: _Reached, information: np.ndarray, excess: 
 def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reached, np.ndarray]]:
     """Try one deviation after another, each from the last field, until chi^2 is down to the noise or evidence falls."""
     components = course.m.balances * len(course.waves.omega)
-    start, point, visited, history = begun
+    point, visited, history = begun
+    information = visited[-1][1] if visited else _information(course, point)
     while True:
-        begin, steps = time.perf_counter(), 0
-        information = _information(course, start)  # the later steps use it too
+        begin, steps, before, fresh = time.perf_counter(), 0, np.inf, True
         while steps < STEPS:
-            steps += 1
-            new = _stepped(course, point, information)
-            fell = point.cost - new.cost
-            point = new
-            progress(point.k, point.chi2 / components)
-            _write(file, course, _Begun(start, point, visited, history))
-            if fell < LAST * point.cost:
+            step, distance = _newton_step(course, point, information)
+            if distance <= NEAR:
                 break
+            new = None if distance > _SLOW * before else _lower(course, point, step)
+            if new is None and fresh:
+                break
+            if new is None:
+                information, fresh, before = _information(course, point), True, np.inf
+                continue
+            point, steps, before, fresh = new, steps + 1, distance, False
+            progress(point.k, point.chi2 / components)
+            _write(file, course, _Begun(point, visited, history))
+        information = _information(course, point)
         history.append(
             {
                 "deviation": DEVIATIONS[point.k],
@@ -304,7 +313,7 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
         evidence = _evidences(course, visited, components)[1]
         if point.chi2 <= components or evidence[-1] < max(evidence) or point.k + 1 == len(DEVIATIONS):
             return visited
-        start = point = _next_start(course, point)
+        point = _next_start(course, point)
 
 
 def _next_start(course: Course, point: _Reached) -> _Reached:
@@ -324,25 +333,32 @@ def _information(course: Course, point: _Reached) -> np.ndarray:
     return course.whitened(half.conj().T).conj().T
 
 
-def _stepped(course: Course, point: _Reached, information: np.ndarray) -> _Reached:
-    """A step of Gauss-Newton that lowers the cost, or the point itself."""
+def _newton_step(course: Course, point: _Reached, information: np.ndarray) -> tuple[np.ndarray, float]:
+    """The step of Gauss-Newton (P + L,), and its length in standard deviations of the map: sqrt(g^H H^-1 g)."""
     scales = course.scales(point.k)
     y = course.natural(scales * point.z)
     each = zip(course.jacobians(y, point.here), point.here, course.waves.sd, strict=True)
     slope = scales * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
-    H = _hessian(course, point.k, information)
-    step = -scipy.linalg.solve(H, slope + point.z, assume_a="pos")
+    slope = slope + point.z
+    step = -scipy.linalg.solve(_hessian(course, point.k, information), slope, assume_a="pos")
+    return step, float(np.sqrt(max(-np.vdot(slope, step).real, 0.0)))
+
+
+def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:
+    """The point after the step, or after a part of it, where the cost is lower; None: it is nowhere lower."""
     for part in (1.0, 0.5, 0.25, 0.1):
         new = _reached(course, point.z + part * step, point.k)
         if new.cost < point.cost:
             return new
-    return point
+    return None
 
 
-def _spread(course: Course, point: _Reached, excess: float, draws: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _spread(
+    course: Course, point: _Reached, information: np.ndarray, draws: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard deviations (F, P) before and after the data, and departures (D, F, P) of samples of the posterior."""
     scales, n = course.scales(point.k)[:, None], len(point.z)
-    L = np.linalg.cholesky(_hessian(course, point.k, _information(course, point) / excess))
+    L = np.linalg.cholesky(_hessian(course, point.k, information))
 
     roots = course.natural(scales * np.linalg.inv(L).conj().T)  # R R^H is the covariance
     rng = np.random.default_rng(0)
@@ -376,9 +392,8 @@ def _write(file: Path | None, course: Course, begun: _Begun) -> None:
 
 def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
     """Begin at a uniform organ, or at the point of an earlier run, whose earlier deviations are evaluated again."""
-    start = _reached(course, np.zeros(course.exponents[0].shape[1], complex), 0)
     if file is None or not file.is_file():
-        return _Begun(start, start, [], [])
+        return _Begun(_reached(course, np.zeros(course.exponents[0].shape[1], complex), 0), [], [])
     try:
         with h5py.File(file) as f:
             refuse_other(file, f.attrs, course.marks())
@@ -387,7 +402,7 @@ def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
     except (OSError, KeyError):  # not HDF5, or from another program
         raise InputError(f"{file} belongs to another fit: leave out --resume or name another --out") from None
     visited = []
-    for end in ends:
-        visited.append((_reached(course, end, start.k), _information(course, start)))
-        start = _next_start(course, visited[-1][0])
-    return _Begun(start, _reached(course, z, start.k), visited, history)
+    for k, end in enumerate(ends):
+        point = _reached(course, end, k)
+        visited.append((point, _information(course, point)))
+    return _Begun(_reached(course, z, len(visited)), visited, history)

@@ -21,14 +21,11 @@ from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
 from liverjax.simulation.cautions import cautions_of_waves
 from liverjax.simulation.equations import forces_at
-from liverjax.simulation.run import prepared, simulate
+from liverjax.simulation.run import prepared
 from liverjax.simulation.unloaded import resting
 from liverjax.waves.harmonic import Harmonic, harmonic
 from liverjax.waves.mesh_error import HarmonicError, harmonic_errors
-
-#: A time [s] after which nothing flows any more.
-_FOR_LONG = 1e12
-
+from liverjax.waves.rest import under_its_weight
 
 #: Part of a run's reactions by which those of the relaxed body may differ without a word.
 _RESTED = 0.05
@@ -55,7 +52,7 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     Raises:
         InputError: as `harmonic`; a file that is not a result of this mesh.
     """
-    x, reactions = (_under_its_weight(scene), None) if about is None else _last_state(about, scene)
+    x, reactions = (under_its_weight(scene), None) if about is None else _last_state(about, scene)
     begin = time.perf_counter()
     found = jax.block_until_ready(harmonic(scene, about=x))
     seconds = time.perf_counter() - begin
@@ -64,20 +61,6 @@ def solved_waves(scene: Scene, about: Path | None, mesh_error: bool) -> Waves:
     if x is not None and reactions is not None:
         said += _of_rest(scene, x, reactions, f"--about {about}")
     return Waves(found, error, seconds, said)
-
-
-def _under_its_weight(scene: Scene) -> jax.Array | None:
-    """Positions at rest under gravity, with stresses that have relaxed; None without gravity."""
-    if scene.body is None or not np.any(np.asarray(scene.body.gravity)):
-        return None
-    still = resting(replace(by_element(scene), traction=(), body=replace(scene.body, times=None, history=None)))
-    # With a sponge the steps are so long that its fluid has flowed.
-    dt = None if scene.porosity is None else _FOR_LONG
-    solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
-    try:
-        return simulate(replace(still, solve=solve)).check().positions[-1]
-    except RuntimeError as error:
-        raise InputError(f"no state of rest under gravity was found ({error}): give one by --about") from None
 
 
 def _last_state(file: Path, scene: Scene) -> tuple[jax.Array, np.ndarray]:

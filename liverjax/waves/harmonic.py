@@ -26,6 +26,7 @@ from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
 from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, free_part, operator
+from liverjax.waves.rest import under_its_weight
 
 MASSES = ("consistent", "lumped")
 #: Values of [solve] for the equations of one instant.
@@ -70,9 +71,9 @@ def harmonic(
 ) -> Harmonic:
     """Small motion of the scene at these frequencies, driven by its tractions, prescribed motions and inlets.
 
-    Their numbers are amplitudes. Law, viscosity, porosity, density, supports, held nodes and regions act; gravity and
-    time steps have no effect. It may be differentiated in both modes and jitted; every derivative costs one more solve
-    per frequency, without a new factorisation.
+    Their numbers are amplitudes. Law, viscosity, porosity, density, gravity, supports, held nodes and regions act.
+    Time steps and histories have no effect; an obstacle stays at its place at time 0. It may be differentiated in both
+    modes and jitted; every derivative costs one more solve per frequency, without a new factorisation.
 
     Args:
         scene: `Scene`. The motion of `displaced` is an amplitude with phase 0.
@@ -80,8 +81,9 @@ def harmonic(
         factors: G*/G0 by which the part of the stress that relaxes is multiplied, complex (F,), or (F, E) by element;
             default: those of the scene's Prony series, 1 - sum g_k/(1 + i omega tau_k), or of its springpots; else 1.
             Pressures of nodes (volumetric "mixed", "nodal", or of a sponge) do not relax.
-        about: positions (V, 3) [m] of an equilibrium that has rested for long, as in `simulate`; default: the
-            reference shape. The law's stress there stiffens the body. A fluid has flowed until its pressure is 0.
+        about: positions (V, 3) [m] of an equilibrium that has rested for long, as in `simulate`; default: the state
+            of rest under gravity, found by a static run, or the reference shape without gravity. The law's stress there
+            stiffens the body. A fluid has flowed until its pressure is 0.
         motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
         mass: "consistent" (each element's integrals), or "lumped" as in runs in time.
 
@@ -90,12 +92,14 @@ def harmonic(
 
     Raises:
         InputError: parts that have no harmonic motion here (pressures that follow, friction, rigid plates), shapes and
-            values that cannot be used.
+            values that cannot be used; no state of rest under gravity.
     """
+    weighed = scene
     omegas = 2 * jnp.pi * _frequencies(scene.solve.frequencies if frequencies_Hz is None else frequencies_Hz)
     if scene.springpots is not None:
         factors = springpot_factors(scene.springpots, omegas) if factors is None else factors
     scene = _small(scene, mass)
+    about = under_its_weight(weighed) if about is None else about
     mesh = scene.mesh
     number, elements = len(omegas), mesh.number_of_elements
     factors = _factors(scene, omegas) if factors is None else jnp.asarray(factors, complex)
@@ -122,7 +126,8 @@ def element_operator(scene: Scene, about: jax.Array | None = None, mass: str = "
     Args:
         scene, about, mass: as in `harmonic`.
     """
-    return _operator(_small(scene, mass), about, mass)
+    small = _small(scene, mass)
+    return _operator(small, under_its_weight(scene) if about is None else about, mass)
 
 
 def _operator(scene: Scene, about: jax.Array | None, mass: str) -> Operator:

@@ -11,6 +11,7 @@ from liverjax.scenes.enriched import enriched
 from liverjax.scenes.scene import Scene
 from liverjax.solvers.point_matrix import restricted
 from liverjax.waves.harmonic import Harmonic, harmonic
+from liverjax.waves.rest import under_its_weight
 
 
 @struct
@@ -57,6 +58,7 @@ def harmonic_errors(
         raise InputError(
             f"the result has {found.displacement.shape[1]} nodes, the scene {nodes}: give the scene of the result"
         )
+    about = under_its_weight(scene) if about is None else about
     rich = enriched(scene)
     if rich.mesh.order == 3:
         # Cubic elements do not lock.

@@ -4,9 +4,13 @@ import numpy as np
 
 from liverjax.core.errors import InputError
 
+#: Neighbours whose wrapped phases differ by this part of pi are nearly ambiguous; a note if more than this part is.
+_STEEP, _MANY = 0.8, 0.01
+
 
 def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Phases without jumps, NaN where they are not measured; then a note if jumps are left.
+    """Phases without jumps, NaN where they are not measured; then notes if jumps are left, or if phases change so fast
+    from voxel to voxel that jumps cannot be told from waves.
 
     In space, edges between voxels are unwrapped in the order of their reliability (Herraez et al. 2002, Appl. Opt. 41,
     7437). The level of each volume is then known up to multiples of 2 pi. From one instant of the period to the next it
@@ -36,5 +40,22 @@ def unwrapped(name: str, phases: np.ndarray) -> tuple[np.ndarray, list[str]]:
         out[f, t, ..., c] = np.ma.filled(unwrap_phase(volume, rng=0), np.nan)
     levels = np.nanmedian(out, axis=(2, 3, 4))  # (F, T, 3)
     left = sum(int(np.sum(np.abs(np.diff(out, axis=a)) > np.pi)) for a in (2, 3, 4))
+    notes = _of_steep_phases(phases)
     note = f"{left} neighbouring voxels still differ by more than pi after unwrapping: their waves are wrong; mask them"
-    return out + (np.unwrap(levels, axis=1) - levels)[:, :, None, None, None], [note] if left else []
+    return out + (np.unwrap(levels, axis=1) - levels)[:, :, None, None, None], notes + ([note] if left else [])
+
+
+def _of_steep_phases(phases: np.ndarray) -> list[str]:
+    """A note for each frequency at which many neighbouring voxels differ by nearly pi, the most that can be seen."""
+    notes = []
+    for f, one in enumerate(phases):
+        steps = [np.diff(one, axis=a) for a in (1, 2, 3)]
+        apart = np.concatenate([np.abs(np.angle(np.exp(1j * s[np.isfinite(s)]))) for s in steps])
+        steep = float(np.mean(apart > _STEEP * np.pi)) if apart.size else 0.0
+        if steep > _MANY:
+            notes.append(
+                f"frequency {f + 1} of {len(phases)}: {100 * steep:.2g} % of neighbouring voxels differ by nearly pi "
+                "in phase: jumps cannot be told from waves there, and the motion may be wrong; encode less motion per "
+                "radian, or give smaller voxels"
+            )
+    return notes
