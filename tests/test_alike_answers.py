@@ -55,7 +55,7 @@ def test_white_noise_changes_nothing():
     assert with_alike_noise(exact := time_tests.fit(_relaxation(time, 0.0 * time), modes=2)) is exact
 
 
-@pytest.mark.parametrize("model", ["prony", "fractional"])
+@pytest.mark.parametrize("model", ["prony", pytest.param("fractional", marks=pytest.mark.slow)])
 def test_the_posterior_counts_independent_answers(model, monkeypatch):
     """The log likelihood is that of fewer answers, so that its intervals are as wide as the errors."""
     time, rng = np.geomspace(0.1, 600, 100), np.random.default_rng(2)

@@ -39,10 +39,10 @@ def test_a_thin_layer_by_the_first_terms_of_its_series():
 
 
 def test_intervals_cover_with_five_percent_of_noise():
-    """200 curves of Hertz's law with noise of 5 % of the largest force: mean within 5 %, 90 to 99 % covered."""
+    """120 curves of Hertz's law with noise of 5 % of the largest force: mean within 5 %, 90 to 99 % covered."""
     force, layer = hertz(DEPTH - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     rng, found = np.random.default_rng(0), []
-    for _ in range(200):
+    for _ in range(120):
         noisy = force + 0.05 * force.max() * rng.normal(size=len(force))
         found.append(fit_contact(DEPTH, noisy, layer.force))
     moduli, points = np.array([f.modulus for f in found]), np.array([f.contact_point for f in found])
@@ -68,7 +68,7 @@ def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
     depth = np.linspace(0.0, 7e-4, 160)
     force, layer = hertz(depth - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     rng, held = np.random.default_rng(3), []
-    for _ in range(80):
+    for _ in range(50):
         noise = _shared(rng, 160) * 0.02 * force.max() if kind == "shared" else 0.05 * force * rng.normal(size=160)
         found = fit_contact(depth, force + noise, layer.force)
         held.append(abs(found.modulus - E) < found.quantile * found.standard_errors[0])
@@ -76,8 +76,8 @@ def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
             assert found.independent is not None and 8 < found.independent < 90
         else:
             assert found.independent is None or len(held) > 1
-    # 80 draws: the binomial spread is 0.024 at 95 %.
-    assert np.mean(held) > 0.88, np.mean(held)
+    # 50 draws: the binomial spread is 0.031 at 95 %.
+    assert np.mean(held) > 0.85, np.mean(held)
 
 
 def test_noise_of_the_depth_is_no_shared_noise():

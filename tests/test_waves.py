@@ -378,7 +378,7 @@ def test_components_that_follow_the_axes_are_never_accused(noise, sign):
     assert components.order_sentence(field._replace(displacement=sign * field.displacement)) is None
 
 
-@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("axis", [0, *(pytest.param(axis, marks=pytest.mark.slow) for axis in (1, 2))])
 def test_the_error_of_long_voxels_is_that_of_the_waves_that_cross_them(axis):
     """Voxels twice as long along the way of a wave as across it: the wave's own error, whatever the axis."""
     spacing, shape = np.full(3, H), np.full(3, 7)
