@@ -46,6 +46,33 @@ MISTAKES = {
         """,
         "stress to tangent",
     ),
+    "wrong beyond moderate stretches": (
+        """
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": self.mu / 2 + jnp.where(I1 > 4.2, 0.1 * self.mu, 0.0)}, {}
+        """,
+        "stress by hand against autodiff, stretches 0.5 to 2",
+    ),
+    "wrong where a number is not 0": (
+        """
+        more: float = lj.param("Pa", typical=0.0)
+
+        def isochoric_energy(self, I1, I2):
+            return self.mu / 2 * (I1 - 3) + self.more * (I1 - 3) ** 2
+
+        def isochoric_derivatives(self, I1, I2):
+            return {"I1": self.mu / 2 + self.more * (I1 - 3)}, {("I1", "I1"): self.more}
+        """,
+        "stress by hand against autodiff, other numbers",
+    ),
+    "another energy than its parts": (
+        """
+        def strain_energy(self, I):
+            W = self.mu * (I.J ** (-2 / 3) * I.I1 - 3)
+            return W if self.bulk is None else W + self.bulk / 4 * (I.J - 1) ** 2
+        """,
+        "energy is that of its parts",
+    ),
     "not objective": (
         """
         def energy(self, F):
@@ -100,6 +127,31 @@ def test_planted_mistakes_are_caught(mistake, tmp_path, capsys, monkeypatch):
     output = capsys.readouterr()
     assert f"failed: {row}" in output.err
     assert "FAILED" in output.out
+
+
+def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        HEAD
+        + """
+    more: float = lj.param("Pa", typical=3.0)
+"""
+    )
+    main(["check", f"{file}:Law", "--out", str(tmp_path)])
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("numbers without effect")]
+    assert row.split()[3] == "more"
+
+
+def test_an_energy_that_needs_its_bulk_gets_one_sentence(tmp_path, capsys):
+    """Parts of a law are made without its bulk."""
+    file = tmp_path / "mine.py"
+    text = """
+    def strain_energy(self, I):
+        return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + self.bulk / 2 * (I.J - 1) ** 2
+"""
+    file.write_text(HEAD + text)
+    assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 2
+    assert "isochoric_part cannot be evaluated" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

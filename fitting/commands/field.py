@@ -19,6 +19,9 @@ from liverjax.scenes.scene import numbers_at
 from liverjax.scenes.scene_file import load_scene
 from liverjax.simulation import gradients
 
+#: Size of the mesh's error over the noise above which there is a note.
+_TOLD = 0.3
+
 
 def parser(prog: str) -> argparse.ArgumentParser:
     """Options of the command; --help shows `prog` as its name."""
@@ -100,11 +103,14 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     file = options.out / "progress.h5"
     bar, told = cost_bar("iterations")
     how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
+    problem, beside = scene_numbers.with_mesh_as_noise(problem)
+    if max(beside) > _TOLD:
+        print(f"note: the error of the mesh is {max(beside):.2g} times the noise: it counts as noise", file=sys.stderr)
     with bar:
         found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(found))
-    content = _files(options) | {"map": field_report.of_field(found)}
+    content = _files(options) | {"map": field_report.of_field(found) | {"mesh_error_over_noise": beside}}
     if not found.reached:
         print(
             f"warning: chi2 stays at {found.chi2 / found.components:.3g} per component: the stated noise is too small, "

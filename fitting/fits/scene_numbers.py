@@ -175,6 +175,24 @@ def missing_or_none(problem: Problem, values: Content) -> np.ndarray | None:
         return None
 
 
+def with_mesh_as_noise(problem: Problem) -> tuple[Problem, list[float]]:
+    """The problem with the error of the meshes as further noise, and its size in each scene, over the stated noise [1].
+
+    The error is that of the scenes' own numbers: its root mean square over the measured components. A map would explain
+    it by stiffness otherwise. Without an estimate the problem stays as it is, with a warning, and the sizes are NaN.
+    """
+    left_out = missing_or_none(problem, {})
+    if left_out is None or not np.all(np.isfinite(left_out)):
+        return problem, [np.nan] * len(problem.data)
+    data, sizes, begin = [], [], 0
+    for one in problem.data:
+        own = left_out[begin : begin + np.size(one.measured)]
+        begin += np.size(one.measured)
+        sizes.append(float(np.sqrt(np.sum(own**2) / one.components)))
+        data.append(one._replace(sd=one.sd * np.hypot(1.0, sizes[-1])))
+    return problem._replace(data=tuple(data)), sizes
+
+
 def fit_numbers(problem: Problem, names: Sequence[str], **options: Any) -> Estimate:
     """Fit the numbers of the scenes with these dotted names; positive numbers stay positive.
 

@@ -257,7 +257,8 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
             if dimension == 3 or (int(group), name) in names:
-                sets[names.get((int(group), name), f"{name}={group}")] = np.flatnonzero(values == group)
+                # A cell in several groups has only the first one's number here; sets of cells have them all.
+                sets.setdefault(names.get((int(group), name), f"{name}={group}"), np.flatnonzero(values == group))
     return sets
 
 

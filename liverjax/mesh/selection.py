@@ -92,7 +92,14 @@ def surface_of(mesh: TetMesh, nodes: Indices | None, set: str | None = None) -> 
     if set is None or set not in groups:
         return triangles
     group = {tuple(corners) for corners in np.sort(np.asarray(groups[set]), axis=1).tolist()}
-    return triangles[[tuple(corners) in group for corners in np.sort(triangles, axis=1).tolist()]]
+    kept = triangles[[tuple(corners) in group for corners in np.sort(triangles, axis=1).tolist()]]
+    if 0 < len(kept) < len(group):
+        warnings.warn(
+            f"{len(group) - len(kept)} of {len(group)} triangles of {set!r} are not on the surface and are left out: "
+            "draw the set on the surface alone",
+            stacklevel=2,
+        )
+    return kept
 
 
 def check_nodes(nodes: Indices, count: int, name: str, least: int = 1) -> None:

@@ -123,6 +123,8 @@ def _names_and_limits(
     """Names and limits (n, 2) of the parameters."""
     if scene.solve.kind != "static" or scene.solve.dt is not None:
         raise InputError("a separated form is for a static answer: give a scene of kind 'static' without dt")
+    if scene.points_are == "loaded":
+        raise InputError('[mesh] is = "loaded" has no separated form: take the scene of lj.unloaded(scene)')
     if not 1 <= len(ranges) <= MOST_PARAMETERS:
         raise InputError(f"ranges has {len(ranges)} parameters: give 1 to {MOST_PARAMETERS}")
     if points < 2 or points ** len(ranges) > MOST_RUNS:

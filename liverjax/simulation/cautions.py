@@ -43,6 +43,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *_of_mesh(scene.mesh),
         *_of_locking(scene),
         *_of_histories(scene, result),
+        *_of_stress_at_start(scene, result),
         *_of_contacts(scene, result),
         *_of_pressures(scene, result),
         *_of_volumes(scene, result),
@@ -150,6 +151,23 @@ def _of_locking(scene: Scene) -> list[str]:
 
 #: Part of a history, of its largest number or of its sum over time, that may fall between two steps without a word.
 MISSED = 0.05
+
+
+#: Relaxation times after which a body that began unrelaxed is within a hundredth of its state of rest.
+_RESTS = 5.0
+
+
+def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
+    """A sentence if a static run from a loaded shape is over before its stress has relaxed."""
+    if scene.points_are != "loaded" or scene.viscosity is None or scene.solve.kind != "static":
+        return []
+    lasts, slowest = float(result.times[-1]), float(np.max(np.asarray(scene.viscosity.relaxation_times)))
+    if scene.solve.dt is None or lasts > _RESTS * slowest:
+        return []
+    return [
+        f"the run begins with stress that has not relaxed and lasts {lasts:.3g} s beside a relaxation time of "
+        f"{slowest:.3g} s, so it does not end in the given shape: leave viscosity out, or run for longer"
+    ]
 
 
 def _of_histories(scene: Scene, result: Result) -> list[str]:
