@@ -281,6 +281,71 @@ def test_a_load_on_a_group_of_triangles_leaves_others_between_its_nodes_alone(or
         assert np.allclose(force.sum(axis=0), [0, 0, 2 * 0.2**2 * 0.1], rtol=1e-12, atol=1e-15)
 
 
+#: Two tetrahedra; the second is in two groups, and so is the first triangle.
+_OVERLAP = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+4
+2 1 "low"
+2 2 "outer"
+3 7 "stiff"
+3 8 "organ"
+$EndPhysicalNames
+$Entities
+0 0 2 2
+1 0 0 0 1 1 0 2 1 2 0
+2 0 0 0 1 1 1 1 2 0
+1 0 0 0 1 1 1 1 8 0
+2 0 0 0 1 1 1 2 7 8 0
+$EndEntities
+$Nodes
+1 5 1 5
+3 1 0 5
+1
+2
+3
+4
+5
+0 0 0
+1 0 0
+0 1 0
+0 0 1
+1 1 1
+$EndNodes
+$Elements
+4 4 1 4
+2 1 2 1
+1 1 2 3
+2 2 2 1
+2 2 3 5
+3 1 4 1
+3 1 2 3 4
+3 2 4 1
+4 2 3 4 5
+$EndElements
+"""
+
+
+def test_cells_in_several_groups_of_gmsh_are_in_all_of_them(tmp_path):
+    """meshio gives each cell one number, that of its first group: half of the organ was lost without a word."""
+    (tmp_path / "two.msh").write_text(_OVERLAP)
+    mesh = lj.read_mesh(tmp_path / "two.msh")
+    assert {name: len(mesh.element_sets[name]) for name in ("stiff", "organ")} == {"stiff": 1, "organ": 2}
+    assert {name: len(t) for name, t in mesh.triangle_sets.items()} == {"low": 1, "outer": 2}
+    assert len(mesh.node_sets["outer"]) == 4 and len(mesh.node_sets["low"]) == 3
+
+
+def test_triangles_of_a_group_that_are_inside_are_told():
+    mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
+    outer = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])
+    inside = next(t for t in np.asarray(mesh.tetrahedra).T[[0, 1, 2]].T if 13 in t)  # 13 is in the middle
+    mixed = replace(mesh, triangle_sets={"both": np.vstack([outer, inside])})
+    with pytest.warns(UserWarning, match="1 of 9 triangles of 'both' are not on the surface"):
+        found = lj.boundary.surface_of(mixed, None, "both")
+    assert len(found) == 8
+
+
 @pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])
 def test_numbers_of_regions_may_be_of_any_type(kind, tmp_path):
     """ParaView's filters write whole numbers as floats; numbers with fractions are no regions."""

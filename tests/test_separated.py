@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
 from liverjax.reduced.separated import _terms
 
@@ -77,6 +78,12 @@ def test_derivatives_are_those_of_the_runs(scene, model):
     assert own == pytest.approx(float(jax.grad(full)(740.0)), rel=0.02)
     lanes = jax.jit(jax.vmap(separated))(jnp.array([700.0, 800.0]))
     assert lanes[0] == pytest.approx(float(separated(700.0)), rel=1e-12)
+
+
+def test_a_loaded_mesh_is_refused(scene):
+    """Its displacements were measured from the given shape, where they end: noise."""
+    with pytest.raises(InputError, match=r"no separated form: take the scene of lj.unloaded"):
+        lj.separate(replace(scene, points_are="loaded"), RANGES)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,9 @@ import pytest
 import liverjax as lj
 from liverjax.core import status
 from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
 from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation import cautions
 from liverjax.simulation.unloaded import unload
 
 pytestmark = pytest.mark.quick_to_compile
@@ -54,6 +57,21 @@ def test_there_and_back():
     heavy = lj.with_parameters(scene, HEAVY)
     with pytest.raises(InputError, match=r"no reference shape was found that these loads bring to the given one"):
         lj.simulate(heavy)
+
+
+def test_a_viscous_run_that_is_too_short_to_end_in_the_given_shape_is_told():
+    viscosity, solve = {"ratios": [0.3], "relaxation_times": [0.3]}, {"dt": 0.05, "steps": 3}
+    scene = scene_from(content(viscosity=viscosity, solve=solve))
+
+    def said(lasts, **solve):
+        at = replace(scene, solve=replace(scene.solve, **solve))
+        zero = jnp.zeros((1, *scene.mesh.points.shape))
+        none = jnp.zeros(1)
+        return cautions._of_stress_at_start(at, SimpleNamespace(times=jnp.array([lasts]), positions=zero, status=none))
+
+    (sentence,) = said(0.15, dt=0.05, steps=3)
+    assert "lasts 0.15 s beside a relaxation time of 0.3 s" in sentence
+    assert said(3.0, dt=1.0, steps=3) == said(0.15, dt=0.05, kind="dynamic") == []
 
 
 @pytest.mark.slow
