@@ -63,7 +63,7 @@ MISTAKES = {
         def isochoric_derivatives(self, I1, I2):
             return {"I1": self.mu / 2 + self.more * (I1 - 3)}, {("I1", "I1"): self.more}
         """,
-        "stress by hand against autodiff, other numbers",
+        "stress by hand against autodiff, numbers times 0.8",
     ),
     "another energy than its parts": (
         """
@@ -142,16 +142,26 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
     assert row.split()[3] == "more"
 
 
-def test_an_energy_that_needs_its_bulk_gets_one_sentence(tmp_path, capsys):
-    """Parts of a law are made without its bulk."""
-    file = tmp_path / "mine.py"
-    text = """
+_UNUSABLE = {
+    # Parts of a law are made without its bulk.
+    "isochoric_part cannot be evaluated": """
     def strain_energy(self, I):
         return self.mu / 2 * (I.J ** (-2 / 3) * I.I1 - 3) + self.bulk / 2 * (I.J - 1) ** 2
-"""
-    file.write_text(HEAD + text)
+""",
+    # A run traces the numbers of a law.
+    "decide by its numbers with jnp.where": """
+    def isochoric_energy(self, I1, I2):
+        return self.mu / 2 * (I1 - 3) if self.mu > 1 else 0 * I1
+""",
+}
+
+
+@pytest.mark.parametrize("words", _UNUSABLE)
+def test_a_law_that_no_scene_can_use_gets_one_sentence(words, tmp_path, capsys):
+    file = tmp_path / "mine.py"
+    file.write_text(HEAD + _UNUSABLE[words])
     assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 2
-    assert "isochoric_part cannot be evaluated" in capsys.readouterr().err
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

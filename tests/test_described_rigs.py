@@ -137,12 +137,16 @@ def test_rows_of_a_contact_that_shrinks_are_left_out(tmp_path, shape, back):
     sizes = {"thickness": 0.02} | ({"half_angle": 60.0} if shape == "cone" else {"radius": 0.005})
     time = np.arange(1, 61) / 10
     d = 1e-3 * np.minimum(time, 1.0) + 2e-6 * np.random.default_rng(0).normal(size=60)
+    d[30] += 5e-5  # one reading is no return
     d[45:] -= 1.5e-5 * np.arange(15)
     file = written(tmp_path, {"test": shape} | sizes, (time, d, np.maximum(d, 0) * 100 * (1 + np.exp(-time))))
     test = read_described(file)
     said = [note for note in test.notes if "shrinks" in note]
     assert bool(said) == back
     if back:
+        backwards = written(tmp_path, {"test": shape} | sizes, (time, np.r_[1e-3, 1e-3 - 1e-5 * np.arange(59)], d))
+        with pytest.raises(lj.InputError, match="goes back from"):
+            read_described(backwards)
         # 2 % of the depth is not a return yet.
         assert said[0].startswith("13 rows from 4.8 s on are left out")
         assert test.time[-1] == pytest.approx(4.7)

@@ -291,6 +291,20 @@ def test_a_map_that_was_killed_ends_where_an_unbroken_one_ends(problem, monkeypa
     assert finished.history == again.history
 
 
+def test_a_search_goes_back_from_where_there_is_no_answer(problem, monkeypatch):
+    """However large chi^2 is: a fixed cost of failed runs was below it, and a failed run was the end."""
+    _of_a_formula(monkeypatch, problem)
+    inner = field._linearised
+
+    def failing(problem, base, m, name):
+        r, J, codes = inner(problem, base, m, name)
+        return (r * 300 if np.abs(m).max() < 0.02 else r * np.nan), J, codes
+
+    monkeypatch.setattr(field, "_linearised", failing)
+    found = field.estimate(problem, length=0.02, modes=10, mesh_error=False, max_iterations=30)
+    assert np.isfinite(found.chi2) and 0 < np.abs(found.log_factor).max() < 0.02
+
+
 def test_a_scene_without_an_answer_is_no_map(problem, monkeypatch):
     def nothing(problem, base, m, name):
         return jax.linearize(lambda m: (jnp.nan * m, (jnp.zeros((), jnp.int32),)), m, has_aux=True)
@@ -298,6 +312,25 @@ def test_a_scene_without_an_answer_is_no_map(problem, monkeypatch):
     monkeypatch.setattr(field, "_linearised", nothing)
     with pytest.raises(lj.InputError, match="no answer at the numbers where the map begins"):
         field.estimate(problem, length=0.02, mesh_error=False)
+
+
+def test_the_error_of_the_mesh_counts_as_noise(problem, monkeypatch):
+    """Per scene, over the components that were measured; without an estimate nothing changes."""
+    first, second = problem.data
+    sd = first.sd.copy()
+    sd[0] = np.inf  # not measured
+    own = problem._replace(data=(first._replace(sd=sd), second))
+    left_out = np.concatenate([np.full(first.measured.size, 3.0), np.full(second.measured.size, 0.5)])
+    left_out[:3] = 0.0
+    monkeypatch.setattr(scene_numbers, "missing_or_none", lambda *_: left_out)
+    found, sizes = scene_numbers.with_mesh_as_noise(own)
+    np.testing.assert_allclose(sizes, [3.0, 0.5], rtol=1e-12)
+    assert np.all(np.isinf(found.data[0].sd[0]))
+    np.testing.assert_allclose(found.data[0].sd[1:], np.sqrt(10) * sd[1:], rtol=1e-12)
+    np.testing.assert_allclose(found.data[1].sd, np.sqrt(1.25) * second.sd, rtol=1e-12)
+    monkeypatch.setattr(scene_numbers, "missing_or_none", lambda *_: None)
+    same, sizes = scene_numbers.with_mesh_as_noise(own)
+    assert same is own and np.all(np.isnan(sizes))
 
 
 @pytest.mark.parametrize("order", [1, 2])

@@ -105,7 +105,8 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     how = field.MapOptions(max_iterations=options.iterations, file=file, resume=options.resume, progress=told)
     problem, beside = scene_numbers.with_mesh_as_noise(problem)
     if max(beside) > _TOLD:
-        print(f"note: the error of the mesh is {max(beside):.2g} times the noise: it counts as noise", file=sys.stderr)
+        finer = "; a finer mesh, or order = 2, would say more" if max(beside) > 1 else ""
+        print(f"note: the mesh's error, {max(beside):.2g} times the noise, counts as noise{finer}", file=sys.stderr)
     with bar:
         found = field.estimate(problem, options.name, length, how)
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR

@@ -111,18 +111,19 @@ class _Linearised(NamedTuple):
     m: jax.Array
     r: np.ndarray  # residuals (n,)
     J: Callable  # of changes of m
+    slope: np.ndarray  # J^T r (V,) by z
     codes: tuple[int, ...]
 
     @property
     def finite(self) -> bool:
         """Whether the runs have an answer."""
-        return bool(np.all(np.isfinite(self.r)) and status.NOT_FINITE not in self.codes)
+        numbers = np.all(np.isfinite(self.r)) and np.all(np.isfinite(self.slope))
+        return bool(numbers and status.NOT_FINITE not in self.codes)
 
     @property
     def cost(self) -> float:
-        """(chi^2 + |z|^2)/2; a large number without an answer: the search goes back."""
-        chi2 = self.r @ self.r if self.finite else 1e3 * (1 + len(self.r))
-        return float(0.5 * (chi2 + self.z @ self.z))
+        """(chi^2 + |z|^2)/2; infinite without an answer: the search goes back."""
+        return float(0.5 * (self.r @ self.r + self.z @ self.z)) if self.finite else np.inf
 
     def push(self, z: np.ndarray) -> jax.Array:
         """J z (n,)."""
@@ -134,7 +135,7 @@ class _Linearised(NamedTuple):
 
     def gradient(self) -> np.ndarray:
         """Of the cost, by z (V,)."""
-        return self.z + (self.pull(self.r) if self.finite else 0.0)
+        return self.z + (self.slope if self.finite else 0.0)
 
     def hessian(self, z: np.ndarray) -> np.ndarray:
         """(I + J^T J) z."""
@@ -157,6 +158,7 @@ class _Search:
             "length": float(p.scale),  # the prior's scale is a power of the length
             "noise": mark_of(*(d.sd for d in problem.data)),
             "displacements": mark_of(*(a for d in problem.data for a in d._replace(sd=d.step))),
+            "search": "trust region",  # files of other searches may end elsewhere
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
         }
 
@@ -169,8 +171,10 @@ class _Search:
         m = jnp.asarray(deviation * smooth.field_at_nodes(self.p, z))
         r, J, codes = _linearised(self.problem, self.base, m, self.name)
         self.evaluations += 1
-        here = _Linearised(self.p, deviation, z.copy(), m, np.asarray(r), J, tuple(int(c) for c in codes))
-        self.last = [here, *self.last[:1]]
+        here = _Linearised(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
+        here = here._replace(slope=here.pull(here.r))
+        base = [one for one in self.last if np.array_equal(one.z, self.z)]  # trials begin there until one is lower
+        self.last = [here, *(base or self.last)[:1]]
         return here
 
     def iterated(self, z: np.ndarray) -> None:

@@ -220,7 +220,9 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
                 "(edges_farther_out_voxels): look at the labels"
             )
     if drawn is not None and not drawn.distance <= FAR:
-        told.append(f"the map stopped {drawn.distance:.2g} standard deviations away from its minimum: --resume goes on")
+        told.append(
+            f"the map stopped {drawn.distance:.2g} standard deviations away from its minimum: compare it with regions"
+        )
     # The mean of n squares scatters by the root of 2/n; the noise that divides them is an estimate.
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(

@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.ndimage
 
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import TimeTest, from_rest, of_columns
 from fitting.rigs import glued, thin_layer
 from liverjax.core.did_you_mean import hint
 from liverjax.core.errors import InputError
+from liverjax.core.status import NAMES
 from liverjax.laws import NeoHookean
 
 #: Lengths that each test needs, in metres; the cone has an angle.
@@ -45,6 +47,8 @@ _GRID, _FINER_GRID, _LARGE = (0.05, 0.5, 1.0), (0.05, 0.25, 0.5, 0.75, 1.0), 0.1
 _RIMS = (0.04, 0.1, 0.2)
 #: An indenter goes back where its depth falls by this part of the largest depth, and by so many times its scatter.
 _BACK, _SCATTERS = 0.02, 4.0
+#: Fewest rows of a growing contact, the one at rest included.
+_FEWEST = 6
 #: Most rows of an indenter's test, with the rows that are added between the measured ones.
 _MOST_ROWS = 2000
 #: Height of a glued sample over its radius up to which it is computed. Beyond it meshes are large, and minutes go by.
@@ -101,6 +105,11 @@ def read_described(path: str | Path) -> TimeTest:
     d, force = (first, then) if described.drive == "displacement" else (then, first)
     if described.test in ("sphere", "cone"):
         kept, told_of_way = _while_contact_grows(time, sign * d)
+        if kept < _FEWEST:
+            raise InputError(
+                f"{described.data}: the indenter goes back from {time[kept]:.4g} s on, after {kept} rows: "
+                "give a test that presses first"
+            )
         time, d, force, told = time[:kept], d[:kept], force[:kept], [*told, *told_of_way]
     if described.test in ("sphere", "cone") and described.drive == "displacement":
         time, d, force = _with_more_between(time, d, force)
@@ -116,6 +125,7 @@ def _while_contact_grows(time: np.ndarray, depth: np.ndarray) -> tuple[int, list
     """The number of rows until the indenter goes back, and a note if it does: the force on a contact that shrinks is
     another one (Ting 1966, J. Appl. Mech. 33:845).
     """
+    depth = scipy.ndimage.median_filter(np.maximum(depth, 0.0), 5, mode="nearest")  # a single reading is no return
     scatter = 1.4826 * float(np.median(np.abs(np.diff(depth, 2)))) / np.sqrt(6) if len(depth) > 2 else 0.0
     fall = np.maximum.accumulate(depth) - depth
     back = fall > max(_BACK * float(depth.max()), _SCATTERS * scatter)
@@ -230,6 +240,7 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for rim in _RIMS:
+            said.clear()
             cells = glued.Cells(rim=rim)
             if described.test == "glued_punch":
                 rig = glued.indentation(radius, height, sizes["punch"], 1.0, at, cells)
@@ -240,8 +251,8 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
                 break
         else:
             raise InputError(
-                f"{path}: the mesh of an elastic sample of {radius:g} m radius and {height:g} m height turns "
-                f"inside out before {largest:g} m: check the sizes, or give the rows of smaller displacements"
+                f"{path}: the run of an elastic sample of {radius:g} m radius and {height:g} m height ends before "
+                f"{largest:g} m ({NAMES[int(np.max(codes))]}): check the sizes, or give rows of smaller displacements"
             )
         left_out = np.asarray(glued.mesh_error(rig, law, None)) / 1e3
     found = np.asarray(force) / 1e3

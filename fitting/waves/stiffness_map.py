@@ -210,7 +210,7 @@ def map_of(
         chi2=point.chi2,
         components=components,
         reached=point.chi2 <= components,
-        distance=_newton_step(course, point, information)[1],
+        distance=_distance_left(course, point, information, excess),
         history=history,
         seconds=time.perf_counter() - begin,
     )
@@ -284,9 +284,9 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
     """Try one deviation after another, each from the last field, until chi^2 is down to the noise or evidence falls."""
     components = course.m.balances * len(course.waves.omega)
     point, visited, history = begun
-    information = visited[-1][1] if visited else _information(course, point)
+    information, fresh = (visited[-1][1], False) if visited else (_information(course, point), True)
     while True:
-        begin, steps, before, fresh = time.perf_counter(), 0, np.inf, True
+        begin, steps, before = time.perf_counter(), 0, np.inf
         while steps < STEPS:
             step, distance = _newton_step(course, point, information)
             if distance <= NEAR:
@@ -300,7 +300,7 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
             point, steps, before, fresh = new, steps + 1, distance, False
             progress(point.k, point.chi2 / components)
             _write(file, course, _Begun(point, visited, history))
-        information = _information(course, point)
+        information, fresh = information if fresh else _information(course, point), True
         history.append(
             {
                 "deviation": DEVIATIONS[point.k],
@@ -342,6 +342,12 @@ def _newton_step(course: Course, point: _Reached, information: np.ndarray) -> tu
     slope = slope + point.z
     step = -scipy.linalg.solve(_hessian(course, point.k, information), slope, assume_a="pos")
     return step, float(np.sqrt(max(-np.vdot(slope, step).real, 0.0)))
+
+
+def _distance_left(course: Course, point: _Reached, information: np.ndarray, excess: float) -> float:
+    """Length of the next step in the standard deviations that are stated: those of noise `excess` times as large."""
+    step = _newton_step(course, point, information)[0]
+    return float(np.sqrt(np.vdot(step, _hessian(course, point.k, information / excess) @ step).real))
 
 
 def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:

@@ -59,7 +59,11 @@ def read_waves(
     found |= {key: _on_the_same_voxels(Path(file), key, *given) for key, file in more.items() if file is not None}
     jumps: list[str] = []
     if found.get("wrapped") is not None:
-        found["phases"], jumps = unwrapped(name, _instants(name, "wrapped", found["wrapped"]))
+        phases = _instants(name, "wrapped", found["wrapped"])
+        only = _whole_numbers(name, "mask", found.get("mask"), phases.shape[2:5])
+        if only is not None:
+            phases = np.where((only != 0)[..., None], phases, np.nan)  # phases of air are noise
+        found["phases"], jumps = unwrapped(name, phases)
         found["unit"] = "rad"
     U, notes = _motion(name, found)
     notes += jumps

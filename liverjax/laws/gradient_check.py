@@ -101,11 +101,11 @@ def _try(law: Law, name: str) -> None:
         F = jnp.broadcast_to(jnp.diag(jnp.array([1.1, 0.9, 1.05])), (*shape, 3, 3))
         for what, expected in (("energy", shape), ("first_piola", (*shape, 3, 3)), ("tangent", (*shape, 3, 3, 3, 3))):
             try:
-                found = jax.eval_shape(getattr(law, what), F).shape
+                found = jax.eval_shape(lambda law, F, what=what: getattr(law, what)(F), law, F).shape
             except Exception as error:
                 raise InputError(
                     f"{name}: its {what} cannot be evaluated ({_reason(error)}): mend the law, name every invariant "
-                    "it uses in `invariants`, and give one direction for fibres"
+                    "it uses in `invariants`, give one direction for fibres, and decide by its numbers with jnp.where"
                 ) from None
             if found != expected:
                 raise InputError(f"{name}: its {what} of F {F.shape} has shape {found}, not {expected}: mend the law")
@@ -176,7 +176,7 @@ def _derivative_rows(law: Law, F: np.ndarray, stable: tuple[float, float], progr
     """
     low, high = max(stable[0], 0.5), min(stable[1], 2.0)
     sets = [("", law, F), (f", stretches {low:.2g} to {high:.2g}", law, _samples(low, high)[0])]
-    sets.append((", other numbers", _with_other_numbers(law), F))
+    sets.append((", numbers times 0.8 (0: 0.1)", _with_other_numbers(law), F))
     rows = []
     oracles = (autodiff.first_piola, autodiff.tangent)
     for name, program, oracle in zip(("stress", "tangent"), programs, oracles, strict=True):

@@ -112,7 +112,8 @@ def harmonic(
         raise InputError(f"motion has shape {motion.shape}: give {mesh.points.shape} or one more axis of frequencies")
     if about is not None and scene.porosity is not None and not _drains(scene.porosity):
         raise InputError(
-            "about does not give the pressure that a sealed sponge under load keeps: give porosity.drained"
+            "a state under load (gravity, about) does not give the pressure that a sealed sponge keeps: give "
+            "porosity.drained"
         )
     if about is not None and jnp.shape(about) != mesh.points.shape:
         raise InputError(f"about has shape {jnp.shape(about)}: give positions of shape {mesh.points.shape}")
