@@ -210,7 +210,7 @@ def map_of(
         chi2=point.chi2,
         components=components,
         reached=point.chi2 <= components,
-        distance=_distance_left(course, point, information, excess),
+        distance=_newton_step(course, point, information, excess)[1],
         history=history,
         seconds=time.perf_counter() - begin,
     )
@@ -288,7 +288,7 @@ def _each_deviation(course, begun: _Begun, file, progress) -> list[tuple[_Reache
     while True:
         begin, steps, before = time.perf_counter(), 0, np.inf
         while steps < STEPS:
-            step, distance = _newton_step(course, point, information)
+            step, distance = _newton_step(course, point, information, max(1.0, point.chi2 / components))
             if distance <= NEAR:
                 break
             new = None if distance > _SLOW * before else _lower(course, point, step)
@@ -333,21 +333,16 @@ def _information(course: Course, point: _Reached) -> np.ndarray:
     return course.whitened(half.conj().T).conj().T
 
 
-def _newton_step(course: Course, point: _Reached, information: np.ndarray) -> tuple[np.ndarray, float]:
-    """The step of Gauss-Newton (P + L,), and its length in standard deviations of the map: sqrt(g^H H^-1 g)."""
+def _newton_step(course: Course, point: _Reached, information: np.ndarray, excess: float) -> tuple[np.ndarray, float]:
+    """The step of Gauss-Newton (P + L,), and its length in the standard deviations of noise that makes chi^2 `excess`
+    times as large as expected.
+    """
     scales = course.scales(point.k)
     y = course.natural(scales * point.z)
     each = zip(course.jacobians(y, point.here), point.here, course.waves.sd, strict=True)
     slope = scales * course.whitened(sum(j.conj().T @ (b.multipliers / sd) for j, b, sd in each))
-    slope = slope + point.z
-    step = -scipy.linalg.solve(_hessian(course, point.k, information), slope, assume_a="pos")
-    return step, float(np.sqrt(max(-np.vdot(slope, step).real, 0.0)))
-
-
-def _distance_left(course: Course, point: _Reached, information: np.ndarray, excess: float) -> float:
-    """Length of the next step in the standard deviations that are stated: those of noise `excess` times as large."""
-    step = _newton_step(course, point, information)[0]
-    return float(np.sqrt(np.vdot(step, _hessian(course, point.k, information / excess) @ step).real))
+    step = -scipy.linalg.solve(_hessian(course, point.k, information), slope + point.z, assume_a="pos")
+    return step, float(np.sqrt(np.vdot(step, _hessian(course, point.k, information / excess) @ step).real))
 
 
 def _lower(course: Course, point: _Reached, step: np.ndarray) -> _Reached | None:
