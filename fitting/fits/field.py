@@ -102,7 +102,7 @@ def _pulled(J: Callable, r: jax.Array, m: jax.Array) -> jax.Array:
     return jax.linear_transpose(J, m)(r)[0]
 
 
-class _Linearised(NamedTuple):
+class _LinearRuns(NamedTuple):
     """The runs, linearised at a whitened field z: products with J, its derivatives by z, and its transpose."""
 
     p: smooth.Prior
@@ -151,7 +151,7 @@ class _Search:
         self.problem, self.name, self.base, self.p, self.file, self.progress = problem, name, base, p, file, progress
         self.history: list[dict[str, float]] = []
         self.k, self.z = 0, np.zeros(len(p.root_mass))
-        self.last: list[_Linearised] = []  # two: a trial, and the point from which it was tried
+        self.last: list[_LinearRuns] = []  # two: a trial, and the point from which it was tried
         self.evaluations = 0
         self.marks = {
             "name": name,
@@ -162,7 +162,7 @@ class _Search:
             "scene": mark_of(base, *jax.tree.leaves(problem.scenes)),
         }
 
-    def at(self, z: np.ndarray) -> _Linearised:
+    def at(self, z: np.ndarray) -> _LinearRuns:
         """The runs, linearised at z."""
         deviation = DEVIATIONS[self.k]
         for one in self.last:
@@ -171,7 +171,7 @@ class _Search:
         m = jnp.asarray(deviation * smooth.field_at_nodes(self.p, z))
         r, J, codes = _linearised(self.problem, self.base, m, self.name)
         self.evaluations += 1
-        here = _Linearised(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
+        here = _LinearRuns(self.p, deviation, z.copy(), m, np.asarray(r), J, z, tuple(int(c) for c in codes))
         here = here._replace(slope=here.pull(here.r))
         base = [one for one in self.last if np.array_equal(one.z, self.z)]  # trials begin there until one is lower
         self.last = [here, *(base or self.last)[:1]]
@@ -314,7 +314,7 @@ def _minimised(search: _Search, max_iterations: int) -> dict[str, float]:
     return dict(zip(_HISTORY, map(float, row), strict=True))
 
 
-def _measured_directions(here: _Linearised, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
+def _measured_directions(here: _LinearRuns, n: int, modes: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest eigenvalues (k,) of J^T J in whitened z, and their directions (n, k)."""
     k = min(modes, n - 2, len(here.r))
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=lambda z: here.pull(here.push(z)), dtype=float)
@@ -323,7 +323,7 @@ def _measured_directions(here: _Linearised, n: int, modes: int) -> tuple[np.ndar
     return np.maximum(values[::-1], 0.0), vectors[:, ::-1]
 
 
-def _by_hessian(here: _Linearised, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def _by_hessian(here: _LinearRuns, g: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """(I + J^T J)^-1 g (V,), to 1 %: what it is used for is of first order only."""
     n, shrink = len(g), values / (1 + values)
 
@@ -336,7 +336,7 @@ def _by_hessian(here: _Linearised, g: np.ndarray, values: np.ndarray, vectors: n
     return scipy.sparse.linalg.cg(hessian, g, rtol=1e-2, maxiter=30, M=inverse)[0]
 
 
-def _bias_of_map(search: _Search, here: _Linearised, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
+def _bias_of_map(search: _Search, here: _LinearRuns, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:
     """The change of the field m (V,) by the meshes: (I + J^T J)^-1 J^T times their error in the residuals."""
     left_out = missing_or_none(search.problem, values_at(search.problem, search.name, search.base, here.m))
     if left_out is None or not np.all(np.isfinite(left_out)):

@@ -83,7 +83,8 @@ def harmonic(
             Pressures of nodes (volumetric "mixed", "nodal", or of a sponge) do not relax.
         about: positions (V, 3) [m] of an equilibrium that has rested for long, as in `simulate`; default: the state
             of rest under gravity, found by a static run, or the reference shape without gravity. The law's stress there
-            stiffens the body. A fluid has flowed until its pressure is 0.
+            stiffens the body. A fluid has flowed until its pressure is 0. If gravity is traced, its value is not known:
+            the program then has this run even for a gravity of 0, unless `about` is given.
         motion: amplitudes of prescribed motion, complex (V, 3) or (F, V, 3) [m], in place of the scene's.
         mass: "consistent" (each element's integrals), or "lumped" as in runs in time.
 
