@@ -1,6 +1,7 @@
 """The gradient check: every shipped law passes, planted mistakes are caught in their row, files are read."""
 
 import textwrap
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -298,3 +299,46 @@ def test_homogeneous_stress_against_textbook_formulas():
     assert np.allclose(homogeneous.response(ogden, "uniaxial", stretch), expected, rtol=1e-12, atol=1e-10)
     with pytest.raises(lj.InputError, match="use one of uniaxial"):
         homogeneous.deformation_gradient("torsion", stretch)
+
+
+@lj.struct
+class Gent(lj.Law):
+    """A law that locks at an uniaxial stretch of 1.26."""
+
+    mu: float = lj.param("Pa", typical=770.0)
+    limit: float = lj.param("1", typical=0.2)
+    bulk: float = lj.param("Pa", typical=7700.0)
+    volumetric: str = lj.static("quadratic")
+
+    def isochoric_energy(self, I1, I2):
+        """-mu limit/2 ln(1 - (Ibar1 - 3)/limit)."""
+        return -self.mu * self.limit / 2 * jnp.log1p(-(I1 - 3) / self.limit)
+
+
+@lj.struct
+class Fibres(lj.Law):
+    """Slack fibres alone: no stiffness at rest, and none ever across them."""
+
+    k: float = lj.param("Pa", typical=100.0)
+    fibre: tuple = lj.static((1.0, 0.0, 0.0))
+    invariants: ClassVar = ("I4",)
+
+    def strain_energy(self, I):
+        """k/4 (I4 - 1)^4."""
+        return self.k / 4 * (I.I4 - 1) ** 4
+
+
+@pytest.mark.parametrize(
+    "law, told",
+    [
+        (Gent(mu=770.0, limit=0.2, bulk=7700.0), ("only from 0.85 to 1.18", "stretch 0.78 to 1.26")),
+        (Fibres(k=100.0), ("no stiffness of its own", "0.0e+00 Pa")),
+        (lj.laws.NeoHookean(mu=-770.0, bulk=7700.0), ("not even at rest",)),
+    ],
+)
+def test_laws_that_lock_and_parts_of_laws_are_no_mistakes(law, told):
+    result = gradient_check.check(law)
+    text = gradient_check.table(result)
+    assert all(words in text for words in told)
+    unstable = [row.name for row in result.failed]
+    assert all(name.startswith("stable in") for name in unstable) and bool(unstable) == ("not even at rest" in told)

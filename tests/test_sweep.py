@@ -347,6 +347,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.mu,law.mu\n1,2\n", "names law.mu twice"),
         ("law.mu\n1,2\n", "row 1 has 2 values for 1 names"),
         ("law.mu;law.bulk\n700;2000\n", "semicolons between its cells"),
+        ("law.mu\tlaw.bulk\n700\t2000\n", "tabs between its cells"),
         ("law.mu\n1\nx\n", "row 2, law.mu = 'x' is not a finite number"),
         ("law.mu\nnan\n", "row 1, law.mu = 'nan' is not a finite number"),
         ("law.mu\n700\n-1\n", "row 2: .*mu = -1"),
@@ -408,6 +409,7 @@ def test_unusable_designs_are_refused(files, capsys):
         (["law.mu=5"], "is not a range"),
         (["law.mu=5:1"], "does not rise"),
         (["a=1:2", "a=1:2"], "two"),
+        (["a=1:2", "b=1:2", "--kind", "grid", "--rows", "3"], "too few for a grid of 2 parameters: give 4"),
     ):
         assert main(["design", str(files / "d.csv"), *given]) == 2
         assert sentence in capsys.readouterr().err

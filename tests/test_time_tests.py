@@ -461,6 +461,41 @@ def test_headings_of_other_programs_are_read(header, tmp_path):
     assert np.allclose(columns["time"], np.arange(1, 9)) and np.allclose(columns["modulus"], 900 - np.arange(1, 9))
 
 
+@pytest.mark.parametrize(
+    ("header", "quantity", "factor"),
+    [
+        ("time [s],E(t) [kPa]", "modulus", 1e3 / 3),
+        ("t (s),Relaxation modulus E(t) (kPa)", "modulus", 1e3 / 3),
+        ("time_s,Young's modulus [Pa]", "modulus", 1 / 3),
+        ("Step time [s],Relaxation modulus G(t) [kPa]", "modulus", 1e3),
+        ("time_s,D(t) [1/Pa]", "compliance", 3.0),
+        ("time_s,tensile creep compliance (1/kPa)", "compliance", 3e-3),
+        ("time_s,tensile stress [kPa],tensile strain [%]", "stress", 1e3 / 3),
+        ("time_s,E(t) [Pa],G(t) [kPa]", "modulus", None),
+    ],
+)
+def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor, tmp_path):
+    rows = "".join(f"{k},{900 - k},{5 + k}\n" for k in range(1, 9))
+    (tmp_path / "t.csv").write_text(header + "\n" + rows)
+    columns, notes = read_columns(tmp_path / "t.csv")
+    expected = 1e3 * (5 + np.arange(1, 9)) if factor is None else factor * (900 - np.arange(1, 9))
+    assert np.allclose(columns[quantity], expected) and not any("tensile" in name for name in columns)
+    assert any("G = E / 3" in note for note in notes) == (factor != 1e3 and factor is not None)
+    if quantity == "stress":
+        assert np.allclose(columns["strain"], 0.01 * (5 + np.arange(1, 9)))
+
+
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_a_file_of_the_other_kind_is_told(kind, tmp_path):
+    time = np.geomspace(0.1, 100, 40)
+    held, moves = np.full(40, 100.0), 0.1 * (2 - np.exp(-time / 5))
+    creep = write(tmp_path / "c.csv", "time_s,stress [Pa],strain [1]", time, held, moves)
+    relaxation = write(tmp_path / "r.csv", "time_s,stress [Pa],strain [1]", time, 10 / moves, held / 1e3)
+    own, other = (relaxation, creep) if kind == "relaxation" else (creep, relaxation)
+    assert any("python -m fitting" in note for note in read_time_test(other, kind).notes)
+    assert not any("python -m fitting" in note for note in read_time_test(own, kind).notes)
+
+
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
 def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
     """Six of such tests became fluids with times of 1e175 s, or did not converge with the advice of fewer modes."""

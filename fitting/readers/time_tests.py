@@ -109,6 +109,7 @@ def read_time_test(
             raise InputError(f"{path}: --ramp {ramp:g} is for a file without the {form[0]}; leave it out")
         strain, stress, told = _as_shear(str(path), form, columns, sample)
         notes += told
+        notes += _of_the_other_kind(kind, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
         time, driven, answer, told = from_rest(time, driven, answer, at_once=ramp == 0)
         return of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
@@ -179,6 +180,24 @@ def kind_of(path: str | os.PathLike) -> str:
     late = len(columns["time"]) // 2
     moves = [np.ptp(columns[q][late:]) / max(float(np.max(np.abs(columns[q]))), 1e-300) for q in form]
     return "relaxation" if moves[0] <= moves[1] else "creep"
+
+
+def _of_the_other_kind(kind: str, strain: np.ndarray, stress: np.ndarray) -> list[str]:
+    """A note if the quantity that this kind of test drives moves in the second half, and the other one is held."""
+    driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
+    late = len(driven) // 2
+    moves, held = (np.std(v[late:]) / max(float(np.max(np.abs(v))), 1e-300) for v in (driven, answer))
+    if not (held < HELD and moves > 3 * held and moves > HELD):
+        return []
+    names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
+    return [
+        f"the {names[0]} is held and the {names[1]} changes, as in a {names[2]} test: python -m fitting {names[2]} "
+        f"fits what was measured as the answer; here the {names[1]}, with its noise, is taken as exact"
+    ]
+
+
+#: A quantity that varies less than this in the second half [1], by its standard deviation, is held.
+HELD = 0.01
 
 
 def _own_table(kind: str) -> str:

@@ -34,9 +34,13 @@ TIME_TEST_UNITS = {
     "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "ms": 1e-3}
     | {"sec": 1.0, "seconds": 1.0, "minutes": 60.0, "hr": 3600.0, "hours": 3600.0},
     "modulus": {"Pa": 1.0} | MODULUS_UNITS,
+    "tensile modulus": {"Pa": 1.0} | MODULUS_UNITS,
     "compliance": {"1/Pa": 1.0} | _PER_PA,
+    "tensile compliance": {"1/Pa": 1.0} | _PER_PA,
     "strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},
     "stress": {"Pa": 1.0} | MODULUS_UNITS,
+    "tensile strain": {"1": 1.0, "%": 1e-2, "-": 1.0, "mm/mm": 1.0},
+    "tensile stress": {"Pa": 1.0} | MODULUS_UNITS,
     "torque": _TORQUE,
     "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
     "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "kN": 1e3},

@@ -38,12 +38,12 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
 
     Args:
         ranges: low and high of every parameter.
-        rows: number of rows; a grid has as many values of each parameter as fit into it, at least two.
+        rows: number of rows; a grid has as many values of each parameter as fit into it.
         kind: "grid", "latin" (hypercube) or "sobol" (balanced if `rows` is a power of 2), from SciPy.
         seed: seed of "latin" and "sobol".
 
     Raises:
-        InputError: an unknown kind, no rows.
+        InputError: an unknown kind, no rows, too few rows for two values of each parameter of a grid.
     """
     from scipy.stats import qmc
 
@@ -55,7 +55,12 @@ def design(ranges: dict[str, tuple[float, float]], rows: int, kind: str = "sobol
         )
     low, high = np.array(list(ranges.values())).T
     if kind == "grid":
-        along = max(2, int(np.floor(rows ** (1 / len(low)) + 1e-9)))
+        if rows < 2 ** len(low):
+            raise InputError(
+                f"--rows {rows} is too few for a grid of {len(low)} parameters: give {2 ** len(low)} or more, or "
+                "another --kind"
+            )
+        along = int(np.floor(rows ** (1 / len(low)) + 1e-9))
         axes = [np.linspace(a, b, along) for a, b in zip(low, high, strict=True)]
         return np.stack([g.ravel() for g in np.meshgrid(*axes, indexing="ij")], axis=1)
     if kind == "latin":

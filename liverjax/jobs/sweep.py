@@ -143,8 +143,9 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise InputError(f"{file} cannot be read ({reason}): give a CSV file of parameters") from None
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if lines and ";" in lines[0] and "," not in lines[0]:
-        raise InputError(f"{file} has semicolons between its cells: write commas, and decimal points")
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if lines and mark in lines[0] and "," not in lines[0]:
+            raise InputError(f"{file} has {name} between its cells: write commas, and decimal points")
     table = [[cell.strip() for cell in row] for row in csv.reader(lines)]
     if len(table) < 2:
         raise InputError(f"{file} has no rows: give a header of dotted names, e.g. law.mu, and one row per run")

@@ -15,6 +15,21 @@ from liverjax.core.errors import InputError
 
 #: Words that begin a heading, and the quantity; the longer ones come first.
 WORDS = (
+    ("relaxation modulus e(t)", "tensile modulus"),
+    ("relaxation modulus g(t)", "modulus"),
+    ("tensile relaxation modulus", "tensile modulus"),
+    ("tensile modulus", "tensile modulus"),
+    ("young's relaxation modulus", "tensile modulus"),
+    ("young's modulus", "tensile modulus"),
+    ("youngs modulus", "tensile modulus"),
+    ("tensile stress", "tensile stress"),
+    ("tensile strain", "tensile strain"),
+    ("e(t)", "tensile modulus"),
+    ("tensile creep compliance", "tensile compliance"),
+    ("creep compliance d(t)", "tensile compliance"),
+    ("creep compliance j(t)", "compliance"),
+    ("tensile compliance", "tensile compliance"),
+    ("d(t)", "tensile compliance"),
     ("relaxationsmodul", "modulus"),
     ("schubmodul", "modulus"),
     ("module de relaxation", "modulus"),
@@ -68,7 +83,17 @@ FORMS = (
     ("displacement", "force"),
     ("modulus",),
     ("compliance",),
+    ("tensile modulus",),
+    ("tensile compliance",),
+    ("tensile strain", "tensile stress"),
 )
+#: Factors that make quantities of tension those of shear, for a sample that keeps its volume.
+TENSILE = {
+    "tensile modulus": ("modulus", 1 / 3),
+    "tensile compliance": ("compliance", 3.0),
+    "tensile strain": ("strain", 1.0),
+    "tensile stress": ("stress", 1 / 3),
+}
 
 
 #: TRIOS writes two times, since the test began and since the experiment began. The time of the test is used.
@@ -103,16 +128,28 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
         found = _heading(cells)
         if "time" in found and any(set(f) <= set(found) for f in FORMS):
             rows, units, left_out = _rows_in_time(path, lines, k + 1, delimiter, found)
-            columns, notes = _in_si(path, found, np.array(rows), units)
+            columns, notes = _of_shear(*_in_si(path, found, np.array(rows), units))
             return columns, [*_told_of_times(cells), *notes, *left_out, *_told_of_tables(lines[k + 1 :])]
     unknown = next(filter(None, map(_unknown_unit, lines)), None)
     if unknown is not None:
         raise InputError(f"{path}: unit {unknown[1]!r} of {unknown[0]} is not known; {_known_units(unknown[0])}")
     first = next((line.strip() for line in lines if line.strip()), "")[:80]
     raise InputError(
-        f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, strain and stress_Pa, "
+        f"{path}: no header names time_s and relaxation_modulus_Pa, creep_compliance_1/Pa, E(t), strain and stress_Pa, "
         f"angle_rad and torque_N.m, or displacement_m and force_N (the first line is {first!r}); add that header"
     )
+
+
+def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Quantities of tension as those of shear, with a note; those of shear come first if both are there."""
+    taken = [tensile for tensile, (shear, _) in TENSILE.items() if tensile in columns and shear not in columns]
+    for tensile, (shear, factor) in TENSILE.items():
+        values = columns.pop(tensile, None)
+        if tensile in taken and values is not None:
+            columns[shear] = factor * values
+    if taken:
+        notes = [*notes, f"{' and '.join(taken)} are taken as those of a sample that keeps its volume: G = E / 3"]
+    return columns, notes
 
 
 def _unknown_unit(line: str) -> tuple[str, str] | None:
