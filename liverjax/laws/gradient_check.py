@@ -350,11 +350,11 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
         low, high = _range(driven, stable, start)
         ranges[test] = (low, high)
         whole = " and maybe beyond" if (low, high) == (driven[0], driven[-1]) else ""
-        text, passed = f"{what} {low:.3g} to {high:.3g}{whole}", bool(stable[start])
-        if not passed and ellipticity(A[[start]])[0] >= -EXACT_LIMIT * np.abs(A[start]).max():
-            text, passed = "no stiffness of its own at rest in some direction: add a law that has some", None
-        elif not passed:
-            text = "not even at rest"
+        text, passed = f"{what} {low:.3g} to {high:.3g}{whole}", (True if stable[start] else None)
+        if not stable[start] and ellipticity(A[[start]])[0] >= -EXACT_LIMIT * np.abs(A[start]).max():
+            text = "no stiffness of its own at rest in some direction: add a law that has some"
+        elif not stable[start]:
+            text, passed = "not even at rest", False
         rows.append(Row(f"stable in {test.replace('_', ' ')}", text, "", passed))
     return rows, ranges
 
