@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 #: Unknowns from which on single precision pays.
 SINGLE_FROM = 20_000
-#: Unknowns of a group that are eliminated together, and the side of the tiles in which they change the rest.
-PIVOTS, TILE = 256, 256
+#: Unknowns of a group that are eliminated together, and the columns that they change together.
+PIVOTS, TILE = 128, 192
 #: Part of all work below which groups are eliminated with their descendants, in one piece.
 PIECE = 1 / 32
 #: Most steps of refinement; backward error that ends it, and backward error above which a solution is wrong.
@@ -225,14 +225,17 @@ def _scaled(A: Any) -> tuple[Any, np.ndarray]:
     import scipy.sparse
 
     A = A.tocsr()
-    size, scale, row = abs(A.data), np.ones(A.shape[0]), np.repeat(np.arange(A.shape[0]), np.diff(A.indptr))
-    known = np.flatnonzero(np.diff(A.indptr))
+    size, scale, in_row = abs(A.data), np.ones(A.shape[0]), np.diff(A.indptr)
+    known, other = np.flatnonzero(in_row), np.empty(A.nnz)  # new memory would take longer than the sums
     for _ in range(3):
         largest = np.zeros(len(scale))
         if len(known):
-            largest[known] = scale[known] * np.maximum.reduceat(size * scale[A.indices], A.indptr[known])
+            np.multiply(size, np.take(scale, A.indices, out=other, mode="clip"), out=other)
+            largest[known] = scale[known] * np.maximum.reduceat(other, A.indptr[known])
         scale = scale / np.sqrt(np.where(largest > 0, largest, 1.0))
-    data = A.data * (scale[row] * scale[A.indices])
+    np.take(scale, A.indices, out=other, mode="clip")
+    other *= np.repeat(scale, in_row)
+    data = A.data * other
     return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape), scale
 
 
@@ -275,7 +278,9 @@ def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[
         A = np.tril(own[a:b, a:b])
         inverse, below = _inverted(A + np.tril(A, -1).T), own[b:, a:b]
         after = np.empty((b - a, len(below)), own.dtype)
-        _dealt_out(partial(_solved_tile, inverse, below, after), len(below), idle())
+        cores = idle()
+        width = max(TILE, -(-len(below) // cores))
+        _dealt_out(partial(_solved_part, (inverse, below, after), width), len(below), cores, width)
         _take_off(own[b:, b:], below, after[:, : n - b], idle())
         X[a:b] = after[:, n - b :]
         found.append(Eliminated(every[a:b], every[b:], inverse, after))
@@ -283,29 +288,28 @@ def _eliminated(own: np.ndarray, rest: np.ndarray, front: Front, idle: Callable[
     return found
 
 
-def _solved_tile(inverse: np.ndarray, below: np.ndarray, out: np.ndarray, j: int) -> None:
-    """A tile of columns of the inverse times the transposed rows below."""
-    np.matmul(inverse, below[j : j + TILE].T, out=out[:, j : j + TILE])
+def _solved_part(matrices: tuple[np.ndarray, np.ndarray, np.ndarray], width: int, j: int) -> None:
+    """Some columns of the inverse times the transposed rows below."""
+    inverse, below, out = matrices
+    np.matmul(inverse, below[j : j + width].T, out=out[:, j : j + width])
 
 
 def _take_off(A: np.ndarray, left: np.ndarray, right: np.ndarray, cores: int) -> None:
-    """Subtract left (N, k) times right (k, M) from A (N, M), tile by tile, where no tile is above the diagonal."""
+    """Subtract left (N, k) times right (k, M) from A (N, M): the tiles on the diagonal and what is below them."""
 
-    def column(j: int) -> None:
-        memory = np.empty(TILE**2, A.dtype)
-        for i in range(j, len(A), TILE):
-            tile = A[i : i + TILE, j : j + TILE]
-            product = memory[: tile.size].reshape(tile.shape, order="F")
-            np.matmul(left[i : i + TILE], right[:, j : j + TILE], out=product)
-            tile -= product
+    def columns(j: int) -> None:
+        part = A[j:, j : j + TILE]
+        product = np.empty(part.shape, A.dtype, order="F")
+        np.matmul(left[j:], right[:, j : j + TILE], out=product)
+        part -= product
 
-    _dealt_out(column, A.shape[1], cores)
+    _dealt_out(columns, A.shape[1], cores, TILE)
 
 
-def _dealt_out(task: Callable[[int], None], size: int, cores: int) -> None:
-    """Do the task of every column of tiles, on so many cores."""
-    starts = range(0, size, TILE)
-    if cores == 1 or len(starts) < 4:
+def _dealt_out(task: Callable[[int], None], size: int, cores: int, width: int) -> None:
+    """Do the task of every part of so many columns, on so many cores."""
+    starts = range(0, size, width)
+    if cores == 1 or len(starts) < 2:
         for j in starts:
             task(j)
     else:
