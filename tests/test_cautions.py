@@ -37,6 +37,19 @@ def test_a_sound_run_has_none():
     assert cautions_of_run(scene(one), run(one, gradients[:1], [1.0])) == []
 
 
+@pytest.mark.parametrize("dt, grows", [(0.01, True), (0.002, False)])
+def test_motion_that_grows_by_long_steps_of_newmark_is_told(dt, grows):
+    """A block of period 12 ms under constant gravity: its energy is known, and a step of 10 ms multiplies it."""
+    mesh = lj.shapes.box((0.002, 0.002, 0.006), (1, 1, 3))
+    body = lj.Body(density=1060.0, gravity=np.array([0.0, 0.0, 40.0]))
+    solve = lj.Solve(kind="dynamic", integrator="newmark", dt=dt, steps=85)
+    own = replace(scene(mesh), body=body, fixed=(lj.Fixed(nodes=mesh.node_sets["z_min"]),), solve=solve)
+    result = lj.simulate(own)
+    assert not np.any(result.status)
+    said = [sentence for sentence in cautions_of_run(own, result) if "more energy than its loads" in sentence]
+    assert bool(said) == grows
+
+
 def test_volumes_name_how_many_which_and_when():
     x = np.asarray(BOX.points)
     result = run(BOX, [np.diag([0.5, 0.08, 1.0]), np.diag([24.0, 1.0, 1.0]), np.eye(3)], [0.1, 0.2, 0.3])

@@ -508,6 +508,10 @@ def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, ca
     assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
     # The weight hangs on the held nodes, whichever model: 3 g of tissue.
     assert np.allclose(found["full"][1], [0, 0, 3e-3], rtol=0, atol=1e-9)
+    # A run that was stopped there is not thrown away by a reduced one.
+    (tmp_path / "used" / "result.h5.parts").mkdir()
+    assert main(["simulate", str(tmp_path / "used.toml"), "--out", str(tmp_path / "used")]) == 2
+    assert "holds an unfinished run" in capsys.readouterr().err and (tmp_path / "used" / "result.h5.parts").exists()
 
 
 def test_the_command_has_the_defaults_of_the_function():

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.optimize
 import scipy.sparse.linalg
 
-from fitting.fits.scene_numbers import Problem, misfit, missing_or_none
+from fitting.fits.scene_numbers import Problem, misfit, missing_or_none, with_solvers
 from fitting.methods import prior as smooth
 from fitting.methods.estimate import LARGEST_BIAS
 from liverjax.core import status
@@ -245,7 +245,7 @@ def estimate(
         InputError: as `start_of`; or `file` belongs to another fit.
     """
     begin = time.perf_counter()
-    base = start_of(problem, name)
+    base, problem = start_of(problem, name), with_solvers(problem, {})
     p = smooth.prior(problem.scenes[0].mesh, length)
     options = options._replace(**changes)
     search = _Search(problem, name, base, p, options.file, options.progress)

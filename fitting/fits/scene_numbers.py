@@ -19,6 +19,7 @@ from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 from liverjax.scenes.scene import Scene, numbers_at
+from liverjax.simulation.automatic import with_solver
 
 
 class Problem(NamedTuple):
@@ -41,6 +42,11 @@ def misfit(problem: Problem, values: Mapping[str, object], store: str | int = "a
         parts.append(weighted_differences(data, scene, result.positions))
         codes.append(jnp.max(result.status))
     return jnp.concatenate(parts), jnp.stack(codes)
+
+
+def with_solvers(problem: Problem, values: Mapping[str, object]) -> Problem:
+    """The problem with the linear solvers that its scenes need at these numbers, which a program does not know."""
+    return problem._replace(scenes=tuple(with_solver(scene, [values]) for scene in problem.scenes))
 
 
 class Unknowns(NamedTuple):
@@ -70,6 +76,7 @@ def fit(
     """
     begin, codes = time.perf_counter(), [0] * len(problem.scenes)
     start, values_of, natural_of, names = unknowns
+    problem = with_solvers(problem, values_of(jnp.asarray(start, float)))
 
     @jax.jit
     def with_jacobian(problem, u):

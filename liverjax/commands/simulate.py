@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from liverjax.core import status
-    from liverjax.jobs import fields, long_run, output
+    from liverjax.jobs import fields, long_run, output, resumable_parts
     from liverjax.scenes import scene_file
     from liverjax.simulation.run import unloaded
 
@@ -54,10 +54,12 @@ def run(options: argparse.Namespace) -> int:
         scene = unloaded(scene).scene
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
+    long_run.refuse_unfinished(target, options.resume)
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
     report = None if bar.disable else lambda _: bar.update()
     try:
         ran, scene = _reduced(scene)
+        in_parts = ran is None
         if ran is None:
             ran = long_run.run(scene, text, target, options.every, options.resume, report)
     except OSError as error:
@@ -69,6 +71,8 @@ def run(options: argparse.Namespace) -> int:
         ran = ran._replace(result=_with_mesh_error(scene, ran.result))
     found = fields.fields(scene, ran.result, names) if names else {}
     _write_and_tell(scene, text, ran, target, found)
+    if in_parts and resumable_parts.beside(target).exists():
+        resumable_parts.remove(resumable_parts.beside(target))
     written = [str(target)]
     if reactions:
         output.write_reactions(options.out / "reactions.csv", scene, ran.result)
@@ -140,11 +144,11 @@ def _sizes_of_places(scene: "Scene") -> list[str]:
 
 
 def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: dict) -> None:
-    """Write the results in place of the parts of the run; print its statistics and cautions."""
+    """Write the results; print the statistics and cautions of the run."""
     import numpy as np
 
     from liverjax.core.versions import versions
-    from liverjax.jobs import output, resumable_parts
+    from liverjax.jobs import output
     from liverjax.physics import porosity
     from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
 
@@ -155,8 +159,6 @@ def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: 
     said = cautions_of_run(scene, ran.result)
     attributes |= {"warnings": said, "versions": versions()}
     output.write_hdf5(target, scene, ran.result, attributes, found, ran.beside)
-    if resumable_parts.beside(target).exists():
-        resumable_parts.remove(resumable_parts.beside(target))
     s, steps = ran.result.statistics, len(ran.result.times)
     print(
         f"{scene.mesh.number_of_nodes} nodes, {scene.mesh.number_of_elements} tetrahedra, {steps} steps: "

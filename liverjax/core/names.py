@@ -81,7 +81,7 @@ def _keys(thing: Any, path: list[str], refusal: str) -> tuple[list, list[str]]:
     if isinstance(thing, dict) and ".".join(path) in thing:
         return [".".join(path)], []
     several = isinstance(thing, tuple) or np.ndim(thing)
-    if word.isdigit() and several and int(word) < len(thing):
+    if _is_place(word) and several and int(word) < len(thing):
         return [int(word)], rest
     raise InputError(f"{refusal}: {_nowhere(word, len(thing) if several else 0)}")
 
@@ -96,7 +96,7 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, li
         unnamed = field.metadata.get("unnamed")
         if isinstance(unnamed, str):
             places = getattr(thing, unnamed)(word)
-            if rest and rest[0].isdigit() and int(rest[0]) < len(places):
+            if rest and _is_place(rest[0]) and int(rest[0]) < len(places):
                 return [field.name, places[int(rest[0])]], rest[1:]
             known += dict.fromkeys(part.section for part in getattr(thing, field.name))
         elif unnamed and (word.isdigit() or not isinstance(getattr(thing, field.name), tuple)):
@@ -105,6 +105,11 @@ def _keys_of_struct(thing: Any, path: list[str], refusal: str) -> tuple[list, li
         raise InputError(f"{refusal}: {hint(word, known)}")
     places = next((len(getattr(thing, f.name)) for f in fields if isinstance(getattr(thing, f.name), tuple)), 0)
     raise InputError(f"{refusal}: {_nowhere(word, places)}")
+
+
+def _is_place(word: str) -> bool:
+    """Whether a word is a number of a place, as Python writes it: 2, but not 02, which would be a second name of 2."""
+    return word.isascii() and word.isdigit() and str(int(word)) == word
 
 
 def _nowhere(word: str, places: int) -> str:

@@ -16,8 +16,9 @@ ADVICE = {
     "springs, rounding may allow no smaller residual), float64, or smaller steps",
     NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
     "continued_below",
-    INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles or collapses): "
-    "take kind = 'dynamic', smaller steps or robust = 'projected'",
+    INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles, collapses, or is "
+    "stiff in bulk): take linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, else "
+    "kind = 'dynamic', smaller steps or robust = 'projected'",
     INVERTED: "in equilibrium, but with inverted elements, which no body has: take smaller loads, a stiffer volumetric "
     "energy or a finer mesh",
     STEP_CUT: "the step was halved as often as allowed and still failed: take smaller steps, robust = 'projected', "

@@ -6,8 +6,20 @@ from pathlib import Path
 import numpy as np
 
 from liverjax.core.errors import InputError
+from liverjax.core.files import whole
 
 KINDS = ("grid", "latin", "sobol")
+
+
+def number_of(text: str) -> float:
+    """The number in a cell of a table. Unlike Python's own, it has no underscores and no digits of other scripts.
+
+    Raises:
+        ValueError: no number.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return float(text)
 
 
 def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
@@ -20,7 +32,7 @@ def read_ranges(given: list[str]) -> dict[str, tuple[float, float]]:
     for text in given:
         name, _, span = text.partition("=")
         try:
-            low, high = (float(v) for v in span.split(":"))
+            low, high = (number_of(v) for v in span.split(":"))
         except ValueError:
             raise InputError(f"{text!r} is not a range: write name=low:high, e.g. law.mu=500:1000") from None
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
@@ -73,10 +85,12 @@ def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> No
     """A CSV file that `liverjax.jobs.sweep.read_table` reads, with `note` as a comment.
 
     Raises:
-        InputError: a file that cannot be written.
+        InputError: a file that cannot be written, or that is there and is no such table.
     """
     try:
-        with file.open("w", newline="", encoding="utf-8") as out:
+        if file.exists() and not file.read_bytes().startswith(tuple(f"# {kind}, seed".encode() for kind in KINDS)):
+            raise InputError(f"{file} is there and is no table of design: name another file, or remove it")
+        with whole(file) as beside, beside.open("w", newline="", encoding="utf-8") as out:
             out.write(f"# {note}\n")
             writer = csv.writer(out)
             writer.writerow(names)

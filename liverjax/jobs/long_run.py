@@ -37,6 +37,17 @@ class Ran(NamedTuple):
     beside: Mapping[str, tuple[np.ndarray, str]] = {}  # further datasets of the result: name -> values, unit
 
 
+def refuse_unfinished(out: Path, resume: bool) -> None:
+    """Refuse results in the place of a run that was stopped, unless it goes on.
+
+    Raises:
+        InputError: parts on disk without `resume`.
+    """
+    folder = resumable_parts.beside(out)
+    if folder.exists() and not resume:
+        raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
+
+
 def run(
     scene: Scene,
     text: str,
@@ -63,8 +74,7 @@ def run(
     steps, folder = scene.solve.steps, resumable_parts.beside(out)
     if every < 1:
         raise InputError(f"--every {every} must be above 0: give e.g. 50")
-    if folder.exists() and not resume:
-        raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
+    refuse_unfinished(out, resume)
     scene = prepared(scene)
     if steps <= every and not folder.exists():
         return _run_parts(scene, steps, None, report)

@@ -25,6 +25,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 from liverjax.core.versions import versions
 from liverjax.jobs import resumable_parts
+from liverjax.jobs.design import number_of
 from liverjax.mesh.files import meshio_cells
 from liverjax.scenes.checks.choices import check_choices
 from liverjax.scenes.checks.conflicts import check_motion_in_planes
@@ -33,6 +34,7 @@ from liverjax.scenes.checks.rigid_motion import check_hold, holding
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
 from liverjax.scenes.scene_checks import check_physics
 from liverjax.scenes.scene_file import load_scene
+from liverjax.simulation.automatic import with_solver
 from liverjax.simulation.batch import simulate_batch
 
 #: Outputs that may be stored for every row, from its result and its reference positions (V, 3).
@@ -127,6 +129,7 @@ def read_sweep(
         "chunk": chunk,
         "versions": versions(),
     }
+    scene = with_solver(scene, (dict(zip(names, row, strict=True)) for row in rows.tolist()))
     return Sweep(scene, names, rows[numbers - 1], numbers, outputs, probes, chunk, identity)
 
 
@@ -158,12 +161,12 @@ def read_table(file: Path) -> tuple[tuple[str, ...], np.ndarray]:
             raise InputError(f"{file}: row {k + 1} has {len(row)} values for {len(names)} names: complete it")
         for name, cell in zip(names, row, strict=True):
             try:
-                finite = np.isfinite(float(cell))
+                finite = np.isfinite(number_of(cell))
             except ValueError:
                 finite = False
             if not finite:
                 raise InputError(f"{file}: row {k + 1}, {name} = {cell!r} is not a finite number: mend it")
-        rows.append([float(cell) for cell in row])
+        rows.append([number_of(cell) for cell in row])
     return names, np.array(rows)
 
 

@@ -16,6 +16,7 @@ from liverjax.core.struct import param, static, struct
 from liverjax.scenes.checks.numbers import check_bounds
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.scenes.scene_checks import check_before_run
+from liverjax.simulation import automatic
 from liverjax.simulation.run import Result, simulate, unloaded
 
 STRATEGIES = ("map", "vmap")
@@ -52,16 +53,21 @@ def simulate_batch(
         devices: devices that share the lanes; None: all devices of the process.
 
     Raises:
-        InputError: no parameters, different numbers of lanes, a name that the scene does not have; as `simulate`, with
-            the number of the lane.
+        InputError: no parameters, different numbers of lanes, a name that the scene does not have, vmap of robust
+            steps on a processor; as `simulate`, with the number of the lane.
     """
     devices = jax.local_devices() if devices is None else devices
     strategy = strategy_for(devices[0].platform) if strategy is None else strategy
     if strategy not in STRATEGIES:
         raise InputError(f"strategy = {strategy!r} is not known: use {' or '.join(STRATEGIES)}")
+    if strategy == "vmap" and scene.solve.robust != "off" and devices[0].platform == "cpu":
+        raise InputError(
+            f"strategy = 'vmap' with robust = {scene.solve.robust!r} takes minutes to compile on a processor: use "
+            "strategy = 'map'"
+        )
     parameters = {name: jnp.asarray(value, float) for name, value in parameters.items()}
     lanes = _lanes(parameters)
-    _check_lanes(scene, parameters)
+    scene = automatic.with_solver(scene, _checked_lanes(scene, parameters))
 
     def part(scene, values):
         def run(values):
@@ -100,14 +106,20 @@ def _lanes(parameters: dict[str, jax.Array]) -> int:
     return int(lengths[first] or 0)
 
 
-def _check_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> None:
-    """Refuse a lane with numbers that `simulate` refuses; traced ones pass."""
+def _checked_lanes(scene: Scene, parameters: dict[str, jax.Array]) -> list[dict[str, np.ndarray]]:
+    """The numbers of each lane, none of which `simulate` refuses; an empty list if they are traced.
+
+    Raises:
+        InputError: as `simulate`, with the number of the lane.
+    """
     if any(isinstance(value, jax.core.Tracer) for value in parameters.values()):
-        return
+        return []
     on_host = {name: np.asarray(value) for name, value in parameters.items()}
-    for k in range(_lanes(parameters)):
-        own = with_parameters(scene, {name: value[k] for name, value in on_host.items()})
+    lanes = [{name: value[k] for name, value in on_host.items()} for k in range(_lanes(parameters))]
+    for k, values in enumerate(lanes):
+        own = with_parameters(scene, values)
         try:
             check_before_run(own) if k == 0 else check_bounds(own)
         except InputError as error:
             raise InputError(f"lane {k}: {error}") from None
+    return lanes

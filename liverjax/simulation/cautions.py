@@ -9,10 +9,12 @@ import numpy as np
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
+from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.ligament import Ligament
 from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
 from liverjax.physics.contact.pressed import PressedObstacle
+from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.scenes import regions
 from liverjax.scenes.scene import Scene, histories, named_physics
 from liverjax.simulation.automatic import qualities
@@ -44,6 +46,7 @@ def cautions_of_run(scene: Scene, result: Result) -> list[str]:
         *_of_locking(scene),
         *_of_histories(scene, result),
         *_of_stress_at_start(scene, result),
+        *_of_growing_motion(scene, result),
         *_of_contacts(scene, result),
         *_of_pressures(scene, result),
         *_of_volumes(scene, result),
@@ -167,6 +170,34 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
     return [
         f"the run begins with stress that has not relaxed and lasts {lasts:.3g} s beside a relaxation time of "
         f"{slowest:.3g} s, so it does not end in the given shape: leave viscosity out, or run for longer"
+    ]
+
+
+def _of_growing_motion(scene: Scene, result: Result) -> list[str]:
+    """A sentence if a body under constant loads moves with more energy than they have given it.
+
+    Newmark's method keeps the energy of small motion only; with steps as long as a period, large motion can grow.
+    """
+    body, solve = scene.body, scene.solve
+    if solve.kind != "dynamic" or solve.integrator != "newmark" or body is None or body.mass != "lumped":
+        return []
+    driven = any(np.any(np.asarray(d.by)) for d in scene.displaced) or histories(scene) or follows(scene.traction)
+    inlets = scene.porosity is not None and (scene.porosity.inlet or scene.porosity.initial_pressure is not None)
+    if driven or inlets or named_physics(scene) or np.ndim(body.density) or solve.dt is None:
+        return []
+    mass = float(body.density) * np.asarray(nodal_volumes(scene.mesh))[:, None]
+    force = mass * np.asarray(body.gravity) + np.asarray(nodal_tractions(scene.mesh, scene.traction))
+    x = np.concatenate([np.asarray(scene.mesh.points)[None], np.asarray(result.positions)])
+    work = np.sum((x - x[0]) * force, axis=(1, 2))
+    moving = 0.5 * np.sum(mass * (np.diff(x, axis=0) / float(solve.dt)) ** 2, axis=(1, 2))
+    given = 0.5 * (work[1:] + work[:-1])
+    if not np.any(moving > given + 1e-3 * np.abs(work).max()):
+        return []
+    k = int(np.argmax(moving > given + 1e-3 * np.abs(work).max()))
+    return [
+        f"from {float(np.asarray(result.times)[k]):.4g} s on the body moves with more energy than its loads have given "
+        "it: Newmark's method lets large motion grow if a step is as long as a period. Take a step of a twentieth of "
+        "the period, or integrator = 'euler'"
     ]
 
 

@@ -18,7 +18,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import param, struct
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.scenes.scene_checks import check_before_run
-from liverjax.simulation import gradient_checkpoints
+from liverjax.simulation import automatic, gradient_checkpoints
 from liverjax.simulation.equations import equations, initial_state
 from liverjax.simulation.run import Result, simulate
 from liverjax.simulation.step import beginning
@@ -64,7 +64,9 @@ def value_and_gradient(
         raise InputError("no parameters to differentiate by: give some, e.g. {'law.mu': 770.0}")
     gradient_checkpoints.number_kept(store, scene.solve.steps)
     values = {name: jnp.asarray(value, float) for name, value in at.items()}
-    check_before_run(with_parameters(scene, {name: value for name, value in values.items() if name != START}))
+    numbers = {name: value for name, value in values.items() if name != START}
+    check_before_run(with_parameters(scene, numbers))
+    scene = automatic.with_solver(scene, [numbers])
     return _program_of_gradient(loss, store, mode)(scene, values)
 
 

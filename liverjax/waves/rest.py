@@ -1,4 +1,4 @@
-"""The state of rest under gravity, about which a body moves harmonically."""
+"""The state of rest under gravity and pre-tension, about which a body moves harmonically."""
 
 import jax
 import jax.numpy as jnp
@@ -7,30 +7,35 @@ import numpy as np
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
+from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.porosity import Porosity
+from liverjax.physics.prescribed import free_degrees
 from liverjax.scenes.by_element import by_element
-from liverjax.scenes.scene import Scene
-from liverjax.simulation.run import simulate
+from liverjax.scenes.scene import Scene, Solve
+from liverjax.simulation.equations import forces_at
+from liverjax.simulation.run import prepared, simulate
 from liverjax.simulation.unloaded import resting
 
+#: A strain whose forces are compared with those of the reference shape, and the part of them that counts as none.
+_STRAIN, _NONE = 1e-6, 1e-3
 #: A time [s] after which nothing flows any more.
 _FOR_LONG = 1e12
 
 
 def under_its_weight(scene: Scene) -> jax.Array | None:
-    """Positions (V, 3) [m] at rest under gravity alone, with stresses that have relaxed; None without gravity.
+    """Positions (V, 3) [m] at rest under gravity and what pulls in the reference shape, such as a ligament with
+    pre-tension, with stresses that have relaxed; None if nothing acts there. Tractions and inlets are amplitudes of
+    the motion: they do not act here.
 
     Traced: a body that finds no rest has NaN as positions.
 
     Raises:
         InputError: no state of rest was found.
     """
-    if scene.body is None:
+    body = None if scene.body is None else replace(scene.body, times=None, history=None)
+    still = resting(replace(by_element(scene), traction=(), body=body, porosity=_without_inflow(scene.porosity)))
+    if not (_is_heavy(scene) or _is_pulled(still)):
         return None
-    gravity = scene.body.gravity
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(gravity))
-    if not traced and not np.any(np.asarray(gravity)):
-        return None
-    still = resting(replace(by_element(scene), traction=(), body=replace(scene.body, times=None, history=None)))
     # With a sponge the steps are so long that its fluid has flowed.
     dt = None if scene.porosity is None else _FOR_LONG
     solve = replace(still.solve, dt=dt, steps=4, frequencies=None)
@@ -44,3 +49,32 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         raise InputError(
             f"no state of rest under gravity was found ({error}): hold the body, or give a state as about"
         ) from None
+
+
+def _without_inflow(sponge: Porosity | None) -> Porosity | None:
+    """The sponge with pressures of 0 where an inlet gives the pressure, and without fluxes."""
+    if sponge is None:
+        return None
+    open_ones = [inlet for inlet in sponge.inlet if inlet.nodes is not None]
+    inlets = tuple(replace(inlet, pressure=0.0, times=None, history=None) for inlet in open_ones)
+    return replace(sponge, inlet=inlets)
+
+
+def _is_heavy(scene: Scene) -> bool:
+    """Whether gravity acts, or is traced."""
+    leaves = [] if scene.body is None else jax.tree.leaves(scene.body.gravity)
+    return any(isinstance(leaf, jax.core.Tracer) or bool(np.any(np.asarray(leaf))) for leaf in leaves)
+
+
+def _is_pulled(still: Scene) -> bool:
+    """Whether a physics acts on free nodes in the reference shape; of traced numbers, whether a ligament may."""
+    if not still.physics:
+        return False
+    alone = replace(still, fixed=(), displaced=(), body=None, porosity=None)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((alone, still.fixed))):
+        return any(isinstance(physics, Ligament) for physics in still.physics)
+    alone = prepared(replace(alone, solve=Solve(volumetric=still.solve.volumetric)))
+    x = jnp.asarray(still.mesh.points)
+    free = np.asarray(free_degrees(still.mesh, still.fixed, ()))
+    at_rest, strained = (np.asarray(forces_at(alone, x * stretch)) * free for stretch in (1.0, 1.0 + _STRAIN))
+    return bool(np.linalg.norm(at_rest) > _NONE * np.linalg.norm(strained - at_rest))
