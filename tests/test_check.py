@@ -333,7 +333,7 @@ class Fibres(lj.Law):
     [
         (Gent(mu=770.0, limit=0.2, bulk=7700.0), ("only from 0.85 to 1.18", "stretch 0.78 to 1.26")),
         (Fibres(k=100.0), ("no stiffness of its own", "0.0e+00 Pa")),
-        (lj.laws.NeoHookean(mu=-770.0, bulk=7700.0), ("not even at rest",)),
+        pytest.param(lj.laws.NeoHookean(mu=-770.0, bulk=7700.0), ("not even at rest",), marks=pytest.mark.slow),
     ],
 )
 def test_laws_that_lock_and_parts_of_laws_are_no_mistakes(law, told):

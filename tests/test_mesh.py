@@ -336,6 +336,25 @@ def test_cells_in_several_groups_of_gmsh_are_in_all_of_them(tmp_path):
     assert len(mesh.node_sets["outer"]) == 4 and len(mesh.node_sets["low"]) == 3
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_files_keep_groups_of_triangles(tmp_path, order):
+    """They were lost, and a load on such a group acted on all triangles between its nodes."""
+    (tmp_path / "two.msh").write_text(_OVERLAP)
+    mesh = lj.read_mesh(tmp_path / "two.msh")
+    mesh = mesh if order == 1 else lj.quadratic(mesh)
+    lj.write_mesh(tmp_path / "again.vtu", mesh)
+    back = lj.read_mesh(tmp_path / "again.vtu")
+    for own, read in ((mesh.triangle_sets, back.triangle_sets), (mesh.element_sets, back.element_sets)):
+        assert {name: np.asarray(part).tolist() for name, part in own.items()} == {
+            name: np.asarray(part).tolist() for name, part in read.items()
+        }
+    assert {n: sorted(np.asarray(s)) for n, s in mesh.node_sets.items()} == {
+        n: sorted(np.asarray(s)) for n, s in back.node_sets.items()
+    }
+    with pytest.warns(UserWarning, match="not written in Gmsh's format"):
+        lj.write_mesh(tmp_path / "again.msh", mesh)
+
+
 def test_triangles_of_a_group_that_are_inside_are_told():
     mesh = lj.shapes.box((1, 1, 1), (2, 2, 2))
     outer = lj.boundary.boundary_triangles(mesh, mesh.node_sets["z_min"])

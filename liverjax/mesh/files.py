@@ -252,7 +252,8 @@ def _cell_groups(data: Any, cells: tuple[str, ...], dimension: int) -> dict[str,
             continue
         values = values.astype(int)
         if name.startswith("set:"):
-            sets[name.removeprefix("set:")] = np.flatnonzero(values)
+            if values.any() or all(kind in cells for kind in kinds):  # else it is a set of the other kind of cells
+                sets[name.removeprefix("set:")] = np.flatnonzero(values)
             continue
         groups = np.unique(values)
         for group in groups if len(groups) <= _MOST_GROUPS else ():
@@ -275,20 +276,35 @@ def write_mesh(path: str | os.PathLike, mesh: TetMesh, point_data: Mapping[str, 
 
     data = {name: np.asarray(values) for name, values in (point_data or {}).items()}
     for name, nodes in mesh.node_sets.items():
-        mask = np.zeros(mesh.number_of_nodes, dtype=np.int32)
-        mask[np.asarray(nodes)] = 1
-        data[f"set:{name}"] = mask
-    cell_data = {}
-    for name, elements in mesh.element_sets.items():
-        mask = np.zeros(mesh.number_of_elements, dtype=np.int32)
-        mask[np.asarray(elements)] = 1
-        cell_data[f"set:{name}"] = [mask]
+        data[f"set:{name}"] = _mask(nodes, mesh.number_of_nodes)
     cells = [meshio_cells(mesh)]
+    numbers = [{name: np.asarray(own) for name, own in mesh.element_sets.items()}]
+    groups = {name: np.asarray(own)[:, :3] for name, own in (mesh.triangle_sets or {}).items()}
+    if groups and Path(path).suffix == ".msh":
+        warnings.warn(
+            f"{path}: groups of triangles ({', '.join(groups)}) are not written in Gmsh's format: write a .vtu file",
+            stacklevel=2,
+        )
+    elif groups:
+        ends = np.cumsum([0, *(len(own) for own in groups.values())])
+        cells.append(("triangle", np.concatenate(list(groups.values()))))
+        numbers.append({name: np.arange(ends[k], ends[k + 1]) for k, name in enumerate(groups)})
+    cell_data = {
+        f"set:{name}": [_mask(own.get(name, ()), len(nodes)) for own, (_, nodes) in zip(numbers, cells, strict=True)]
+        for name in dict.fromkeys(name for own in numbers for name in own)
+    }
     # meshio would write .msh in the format of ANSYS; in this field it is Gmsh's.
     file_format = "gmsh" if Path(path).suffix == ".msh" else None
     meshio.Mesh(np.asarray(mesh.points), cells, point_data=data, cell_data=cell_data).write(
         path, file_format=file_format
     )
+
+
+def _mask(numbers: object, size: int) -> np.ndarray:
+    """1 at the numbers, 0 elsewhere (size,)."""
+    mask = np.zeros(size, dtype=np.int32)
+    mask[np.asarray(numbers, int)] = 1
+    return mask
 
 
 def meshio_cells(mesh: TetMesh) -> tuple[str, np.ndarray]:

@@ -76,5 +76,6 @@ def _is_pulled(still: Scene) -> bool:
     alone = prepared(replace(alone, solve=Solve(volumetric=still.solve.volumetric)))
     x = jnp.asarray(still.mesh.points)
     free = np.asarray(free_degrees(still.mesh, still.fixed, ()))
-    at_rest, strained = (np.asarray(forces_at(alone, x * stretch)) * free for stretch in (1.0, 1.0 + _STRAIN))
+    program = jax.jit(forces_at)
+    at_rest, strained = (np.asarray(program(alone, x * stretch)) * free for stretch in (1.0, 1.0 + _STRAIN))
     return bool(np.linalg.norm(at_rest) > _NONE * np.linalg.norm(strained - at_rest))
