@@ -485,6 +485,63 @@ def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor,
         assert np.allclose(columns["strain"], 0.01 * (5 + np.arange(1, 9)))
 
 
+@pytest.mark.parametrize(
+    ("header", "quantity", "factor"),
+    [
+        ("time_s,modulus_kPa,tensile strain [%]", "modulus", 1e3 / 3),
+        ("Time (s),Creep compliance (1/kPa),Tensile stress (kPa)", "compliance", 3e-3),
+        ("time_s,stress [kPa],tensile strain [%]", "stress", 1e3 / 3),
+        ("time_s,strain [%],tensile stress [kPa]", "strain", 1e-2),
+        ("time_s,Zugspannung [kPa],Dehnung [%]", "stress", 1e3 / 3),
+        ("time_s,G(t) [kPa],tensile strain [%]", "modulus", 1e3),
+    ],
+)
+def test_one_column_of_tension_makes_the_others_those_of_tension(header, quantity, factor, tmp_path):
+    """A modulus beside a tensile strain came out three times too large, with a note that said the opposite."""
+    rows = "".join(f"{k},{900 - k},{5 + k}\n" for k in range(1, 9))
+    (tmp_path / "t.csv").write_text(header + "\n" + rows)
+    columns, _ = read_columns(tmp_path / "t.csv")
+    assert np.allclose(columns[quantity], factor * (900 - np.arange(1, 9)))
+
+
+def test_large_strain_in_tension_is_told(tmp_path):
+    time = np.geomspace(0.1, 100, 40)
+    for strain, told in ((0.3, True), (0.005, False)):
+        stress = 3 * strain * (500 + 500 * np.exp(-time / 5))
+        file = write(tmp_path / "t.csv", "time_s,tensile strain [1],stress [Pa]", time, np.full(40, strain), stress)
+        notes = read_time_test(file, "relaxation", ramp=0.0).notes
+        assert any("too small in tension" in note for note in notes) == told
+
+
+@pytest.mark.parametrize("gap", ["", "\n"])
+@pytest.mark.parametrize("first", [60.0, 0.5])
+def test_a_second_table_is_not_appended_to_the_first(gap, first, tmp_path):
+    """The other table has another unit, and goes on or begins again: a modulus of 1000 Pa came out as 942."""
+
+    def rows(times):
+        return "".join(f"{t:g},{400 + 600 * np.exp(-t / 10):.6g}\n" for t in times)
+
+    text = "time_s,relaxation modulus [Pa]\n" + rows(np.linspace(0.5, 50, 50)) + gap
+    text += "time_s,relaxation modulus [kPa]\n" + rows(first + np.arange(30.0))
+    (tmp_path / "two.csv").write_text(text)
+    test = read_time_test(tmp_path / "two.csv", "relaxation")
+    assert test.used.sum() == 50 and any("holds 2 tables" in note for note in test.notes)
+
+
+def test_a_long_record_is_thinned_by_each_load():
+    """After a small load before the test the rows of the step itself were left out: G0 was 14 standard errors off."""
+    time = np.arange(0.0, 900.5, 0.5)
+    driven = np.where(time < 300, 0.003, 0.1)
+    own = TimeTest("relaxation", time, driven, np.ones(len(time)), time > 0)
+    rows = fits.thinned(own)
+    assert len(rows) == fits.MOST and np.all(np.diff(rows) > 0)
+    assert set(np.flatnonzero((time > 300) & (time <= 308))) <= set(rows)
+    for many in (301, 3000):
+        even = np.linspace(0.0, 200.0, many + 1)
+        own = TimeTest("relaxation", even, np.ones(many + 1), np.ones(many + 1), even > 0)
+        assert len(fits.thinned(own)) == fits.MOST
+
+
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
 def test_a_file_of_the_other_kind_is_told(kind, tmp_path):
     time = np.geomspace(0.1, 100, 40)

@@ -90,7 +90,8 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     compiled = time.perf_counter()
     found = jax.block_until_ready(program(points))
     times = (time.perf_counter() - compiled, compiled - begin)
-    law = assessed(own, _as_curves(sweep), found, scale, times)
+    # G' and G'' of one sweep are one test, and their residuals are relative.
+    law = assessed(own, _as_curves(sweep), found, scale, times, of_tests=False)
     best = found.u[int(np.nanargmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
     G, third = (np.asarray(v) for v in model(best))
     return StrainFit(law, G.real, G.imag, third)

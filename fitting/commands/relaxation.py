@@ -70,6 +70,16 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
     return test
 
 
+def _left_out(test: "TimeTest") -> list[str]:
+    """A note if a long record is fitted at some of its rows."""
+    from fitting.fits.time_tests import thinned
+
+    number, every = len(thinned(test)), int(test.used.sum())
+    if number == every:
+        return []
+    return [f"{number} of {every} answers are fitted, spread over the log of the time since each load"]
+
+
 def run(options: argparse.Namespace) -> int:
     """Fit the test; exit code 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time as fits
@@ -92,7 +102,7 @@ def run(options: argparse.Namespace) -> int:
         test = _in_its_rig(options)
     else:
         test = reader.read_time_test(options.file, options.kind, sample, options.ramp, options.min_time)
-    for note in test.notes:
+    for note in (*test.notes, *_left_out(test)):
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)

@@ -276,8 +276,13 @@ def fit(candidate: Candidate, curves: list[Curve], starts: int = STARTS) -> LawF
     return assessed(candidate, curves, found, scale, (time.perf_counter() - compiled, compiled - begin))
 
 
-def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple) -> LawFit:
-    """The best start, its quality, and warnings for the user."""
+def assessed(
+    candidate: Candidate, curves: list[Curve], found: Solution, scale: float, times: tuple, of_tests: bool = True
+) -> LawFit:
+    """The best start, its quality, and warnings for the user.
+
+    `of_tests`: each curve is a test of its own, and residuals are differences of its stress over its scale.
+    """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
     u, J, r = (np.asarray(v[best]) for v in (found.u, found.jacobian, found.residuals))
@@ -292,7 +297,8 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
     own_slope = slope[np.ix_(known, known)]
     half, s = spread(J[:n, known], noise, own_slope)
     errors, correlation = np.full(p, np.nan), np.full((p, p), np.nan)
-    its_errors, its_correlation, alike, factors = _errors_of_law(curves, (J[:n, known], misfit, noise), own_slope, half)
+    residuals = J[:n, known], misfit, noise
+    its_errors, its_correlation, alike, factors = _errors_of_law(curves, residuals, own_slope, half, of_tests)
     if n > p:
         errors[known] = its_errors
     if np.all(np.isfinite(half)):
@@ -339,7 +345,11 @@ def assessed(candidate: Candidate, curves: list[Curve], found: Solution, scale: 
 
 
 def _errors_of_law(
-    curves: list[Curve], residuals: tuple[np.ndarray, np.ndarray, float], slope: np.ndarray, half: np.ndarray
+    curves: list[Curve],
+    residuals: tuple[np.ndarray, np.ndarray, float],
+    slope: np.ndarray,
+    half: np.ndarray,
+    of_tests: bool,
 ) -> tuple[np.ndarray, np.ndarray, Alike | None, FactorNoise | None]:
     """Errors and correlation, whatever noise is in the residuals; the noise that neighbouring points share; factors of
     the tests.
@@ -349,15 +359,18 @@ def _errors_of_law(
         residuals: derivatives J (n, p), misfit (n,) and its standard deviation.
         slope: derivatives of the parameters by the unknowns (P, p).
         half: square root of the covariance for equal, independent noise.
+        of_tests: as in `assessed`; else there are no factors of tests, and no noise that grows with the stress.
     """
     J, misfit, noise = residuals
     errors, correlation = errors_and_correlation(half)
     fitted = np.concatenate([c.stress / c.scale for c in curves]) + misfit
-    roots = [uneven_root(J, misfit, slope), growing_root(J, misfit, fitted, slope)]
+    roots = [uneven_root(J, misfit, slope)]
+    if of_tests:
+        roots.append(growing_root(J, misfit, fitted, slope))
     alike, factors, counts = None, None, [len(c.stress) for c in curves]
     if J.size and noise > EXACT:  # else the residuals are roundoff
         alike = along_rows(counts, misfit, J, noise, np.linalg.pinv(J))
-        factors = factors_of_series(counts, J, misfit, fitted, slope)
+        factors = factors_of_series(counts, J, misfit, fitted, slope) if of_tests else None
     if alike is not None:
         roots.append(slope @ alike.root)
     if factors is not None:

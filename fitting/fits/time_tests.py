@@ -15,12 +15,15 @@ from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
 from fitting.methods.host import Array, arrays_of
 from fitting.methods.least_squares import Solution, from_starts
+from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.time_tests import TimeTest
 from fitting.waves import shear_waves
 from liverjax.core.errors import InputError
 from liverjax.core.struct import Content
 
-#: Most answers (measured responses) that are fitted; a longer record is thinned to equal steps of log time.
+#: Part of the largest load by which it changes from row to row if it moves; the most loads that are told apart.
+STILL, MOST_LOADS = 0.01, 10
+#: Most answers (measured responses) that are fitted; of a longer record, some at equal steps of log time.
 MOST = 300
 #: Key in `TimeFit.details`: answers of independent noise that measure as much, if neighbours share their noise.
 INDEPENDENT = "independent_answers"
@@ -69,15 +72,45 @@ def _residuals(kind: str, name: str) -> Callable[..., jax.Array]:
 
 
 def thinned(test: TimeTest) -> np.ndarray:
-    """Rows (m,) to fit: all, or about `MOST` of them, spread over log time."""
+    """Rows (m,) to fit: all, or about `MOST` of them, spread over the log of the time since a load began to move."""
     rows = np.flatnonzero(test.used)
     if len(rows) <= MOST:
         return rows
-    log_time = np.log(test.time[rows] - test.begun)
-    wanted = np.linspace(log_time[0], log_time[-1], MOST)
-    near = np.clip(np.searchsorted(log_time, wanted), 1, len(rows) - 1)
-    near -= wanted - log_time[near - 1] < log_time[near] - wanted
-    return rows[np.unique(near)]
+    begins = _begins_of_loads(test)
+    # A row at the time of a beginning belongs to what was before.
+    of_load = np.searchsorted(begins, test.time[rows]) - 1
+    picked = []
+    for k, begin in enumerate(begins):
+        own = rows[of_load == k]
+        picked.append(own[_spread(test.time[own] - begin, MOST // len(begins))])
+    return np.concatenate(picked)
+
+
+def _begins_of_loads(test: TimeTest) -> np.ndarray:
+    """Times [s] at which the driven quantity begins to move, from `TimeTest.begun` on. If there are more than
+    `MOST_LOADS`, as in cycles, only the first.
+    """
+    driven = np.abs(test.driven)
+    still = max(STILL * float(driven.max()), 8 * noise_of_series(test.driven))
+    moves = np.abs(np.diff(test.driven)) > still
+    first = np.flatnonzero(moves & ~np.concatenate([[False], moves[:-1]]))
+    begins = np.union1d([test.begun], test.time[first][test.time[first] > test.begun])
+    return begins if len(begins) <= MOST_LOADS else begins[:1]
+
+
+def _spread(time: np.ndarray, number: int) -> np.ndarray:
+    """About so many places of rising times (n,) [s] above 0: those that are far apart in log time, and of the others
+    some at equal distances.
+    """
+    if len(time) <= number:
+        return np.arange(len(time))
+    apart = np.diff(np.log(time))
+    low, high = 0.0, float(apart.max())
+    for _ in range(60):
+        step = 0.5 * (low + high)
+        low, high = (step, high) if np.sum(np.minimum(apart / step, 1.0)) > number - 1 else (low, step)
+    passed = np.concatenate([[0.0], np.cumsum(np.minimum(apart / high, 1.0))])
+    return np.flatnonzero(np.diff(np.floor(passed + 1e-9), prepend=-1.0) > 0)
 
 
 def fit(test: TimeTest, modes: int | str = "auto") -> TimeFit:

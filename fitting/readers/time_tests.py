@@ -7,7 +7,7 @@ import numpy as np
 
 from fitting.readers.noise_of_series import noise_of_series
 from fitting.readers.scattering_load import without_scatter
-from fitting.readers.tables.time_columns import FORMS, read_columns
+from fitting.readers.tables.time_columns import FORMS, beyond_small, read_columns
 from liverjax.core.errors import InputError
 
 #: A load at the first row below this part of the largest load counts as rest: its effect on answers is as small.
@@ -273,29 +273,8 @@ def _as_shear(path, form, columns, sample):
     if form == ("angle", "torque"):
         return columns["angle"] * r / h, columns["torque"] * 2 / (np.pi * r**3), []
     note = "force and displacement are taken as those of an incompressible cylinder between slippery plates: G = E / 3"
-    return columns["displacement"] / h, columns["force"] / (3 * np.pi * r**2), [note, *_beyond_small(columns, h)]
-
-
-#: Deviation [1] of the force from a straight line from which it is told.
-BENT = 0.02
-
-
-def _beyond_small(columns: dict[str, np.ndarray], height: float) -> list[str]:
-    """A note if the force of a neo-Hookean sample, stretched or compressed so far, is not in proportion."""
-    strain = float(np.nanmax(np.abs(columns["displacement"]))) / height
-
-    def off(stretch: float) -> float:
-        """The force over that of the straight line, less 1."""
-        return (stretch - stretch**-2) / (3 * (stretch - 1)) - 1
-
-    if not strain > 0 or -off(1 + strain) < BENT:
-        return []
-    shorter = f"{100 * off(1 - strain):.2g} % too large in compression, " if strain < 1 else ""
-    return [
-        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is no straight line: "
-        f"moduli come out {shorter}{-100 * off(1 + strain):.2g} % too small in tension. Describe the test in a TOML "
-        "file to have this computed"
-    ]
+    strain = columns["displacement"] / h
+    return strain, columns["force"] / (3 * np.pi * r**2), [note, *beyond_small(float(np.nanmax(np.abs(strain))))]
 
 
 #: Fewest rows at rest whose mean is an offset, and the part of the largest answer below which it does not matter.

@@ -17,6 +17,8 @@ from liverjax.core.struct import replace
 from liverjax.jobs.output import read_by_step
 from liverjax.jobs.reactions import held_forces
 from liverjax.mesh.files import meshio_cells
+from liverjax.physics.contact.obstacle import Obstacle
+from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, Solve
 from liverjax.simulation.cautions import cautions_of_waves
@@ -91,7 +93,9 @@ def _of_rest(scene: Scene, x: jax.Array, reactions: np.ndarray, name: str) -> li
     if scene.porosity is not None or not pulled.any():
         return []
     at = pulled > 0.01 * pulled.max()
-    still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=()))
+    # Capsules, ligaments and springs pull at held nodes too. Obstacles do not, and sliding supports hold.
+    pulling = tuple(own for own in scene.physics if not isinstance(own, Obstacle | SlidingSupport))
+    still = resting(replace(by_element(scene), traction=(), fixed=(), displaced=(), physics=pulling))
     still = replace(still, solve=Solve(volumetric=scene.solve.volumetric))
     relaxed = np.asarray(jax.jit(forces_at)(prepared(still), x))
     apart = float(np.linalg.norm((relaxed - reactions)[at]) / np.linalg.norm(reactions[at]))

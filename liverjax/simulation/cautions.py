@@ -16,8 +16,10 @@ from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_wi
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.scenes import regions
+from liverjax.scenes.by_element import by_element
 from liverjax.scenes.scene import Scene, histories, named_physics
 from liverjax.simulation.automatic import qualities
+from liverjax.simulation.obstacle_forces import obstacle_forces
 from liverjax.simulation.run import Result
 
 #: No organ is longer [m]: numbers in millimetres read as centimetres make a liver of 2 m.
@@ -164,7 +166,10 @@ def _of_stress_at_start(scene: Scene, result: Result) -> list[str]:
     """A sentence if a static run from a loaded shape is over before its stress has relaxed."""
     if scene.points_are != "loaded" or scene.viscosity is None or scene.solve.kind != "static":
         return []
-    lasts, slowest = float(result.times[-1]), float(np.max(np.asarray(scene.viscosity.relaxation_times)))
+    own, lasts = by_element(scene).viscosity, float(result.times[-1])
+    assert own is not None
+    ratios, times = np.broadcast_arrays(np.asarray(own.ratios, float), np.asarray(own.relaxation_times, float))
+    slowest = float(np.max(times[ratios > 0], initial=0.0))
     if scene.solve.dt is None or lasts > _RESTS * slowest:
         return []
     return [
@@ -236,12 +241,15 @@ BETWEEN = 0.25
 def _of_contacts(scene: Scene, result: Result) -> list[str]:
     """A sentence on every round obstacle that is in the body between the points at which contact is tested."""
     said, steps = [], len(result.times)
-    for name, physics in named_physics(scene):
-        if not isinstance(physics, Obstacle) or isinstance(physics, PressedObstacle) or physics.shape == "plane":
+    obstacles = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, Obstacle)]
+    pressed = any(isinstance(physics, PressedObstacle) for _, physics in obstacles)
+    found = obstacle_forces(scene, result).displacement if pressed else None
+    for number, (name, physics) in enumerate(obstacles):
+        if physics.shape == "plane":
             continue
         dt = 0.0 if scene.solve.dt is None else scene.solve.dt
         place = partial(physics.displacement, steps=scene.solve.steps, dt=dt)
-        moved = jax.vmap(place)(jnp.arange(1, steps + 1))
+        moved = jax.vmap(place)(jnp.arange(1, steps + 1)) if found is None else found[number]
         farthest = int(jnp.argmax(jnp.linalg.norm(moved, axis=1)))
         for k in {farthest, steps - 1}:
             x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)

@@ -16,6 +16,12 @@ from liverjax.core.errors import InputError
 #: Words that begin a heading, and the quantity; the longer ones come first.
 WORDS = (
     ("relaxation modulus e(t)", "tensile modulus"),
+    ("young's modulus e(t)", "tensile modulus"),
+    ("modulus e(t)", "tensile modulus"),
+    ("elastizitätsmodul", "tensile modulus"),
+    ("zugmodul", "tensile modulus"),
+    ("module d'young", "tensile modulus"),
+    ("zugspannung", "tensile stress"),
     ("relaxation modulus g(t)", "modulus"),
     ("tensile relaxation modulus", "tensile modulus"),
     ("tensile modulus", "tensile modulus"),
@@ -148,8 +154,32 @@ def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[st
         if tensile in taken and values is not None:
             columns[shear] = factor * values
     if taken:
-        notes = [*notes, f"{' and '.join(taken)} are taken as those of a sample that keeps its volume: G = E / 3"]
+        verb = "is taken as that" if len(taken) == 1 else "are taken as those"
+        notes = [*notes, f"{' and '.join(taken)} {verb} of a sample that keeps its volume: G = E / 3"]
+    if "tensile stress" in taken and "strain" in columns:
+        notes += beyond_small(float(np.nanmax(np.abs(columns["strain"]))))
     return columns, notes
+
+
+#: Deviation [1] of the force from a straight line from which it is told.
+BENT = 0.02
+
+
+def beyond_small(strain: float) -> list[str]:
+    """A note if the force of a neo-Hookean sample, stretched or compressed so far, is not in proportion."""
+
+    def off(stretch: float) -> float:
+        """The force over that of the straight line, less 1."""
+        return (stretch - stretch**-2) / (3 * (stretch - 1)) - 1
+
+    if not strain > 0 or -off(1 + strain) < BENT:
+        return []
+    shorter = f"{100 * off(1 - strain):.2g} % too large in compression, " if strain < 1 else ""
+    return [
+        f"the sample is strained by {100 * strain:.2g} %, where the force of neo-Hookean tissue is no straight line: "
+        f"moduli come out {shorter}{-100 * off(1 + strain):.2g} % too small in tension. Describe the test in a TOML "
+        "file to have this computed"
+    ]
 
 
 def _unknown_unit(line: str) -> tuple[str, str] | None:
@@ -200,7 +230,21 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
                     break  # T is a temperature
                 found.setdefault(quantity, (k, unit or rest or None))
                 break
-    return found
+    return _all_tensile(found, cells)
+
+
+#: Words of a heading that is of shear in a table of tension too.
+_SHEAR = re.compile(r"shear|g\(t\)|j\(t\)|schub|scher|cisail", re.IGNORECASE)
+
+
+def _all_tensile(found: dict[str, tuple[int, str | None]], cells: list[str]) -> dict[str, tuple[int, str | None]]:
+    """Beside a column of tension the other quantities are those of tension, if their headings do not name shear."""
+    if not TENSILE.keys() & found.keys() or {"strain", "stress"} <= found.keys():
+        return found
+    return {
+        f"tensile {q}" if f"tensile {q}" in TENSILE and not _SHEAR.search(cells[place[0]]) else q: place
+        for q, place in sorted(found.items(), key=lambda each: each[0] in TENSILE)
+    }
 
 
 def _is_own_time(cell: str) -> bool:
@@ -238,6 +282,8 @@ def _rows_in_time(path, lines, k, delimiter, found):
         named = {q: cells[p] for q, p in needed.items() if p < len(cells) and _known_column(q, cells[p])}
         if not kept and named:  # unknown units are kept here, and refused later
             units = {q: cells[p].strip('[]() "') for q, p in needed.items() if p < len(cells) and cells[p].strip()}
+        elif kept and _begins_a_table(line):
+            break
         elif kept and any(c.strip().lower() not in EMPTY for c in own) and not line.lstrip().startswith("#"):
             if not _rows_follow(lines[k:], delimiter, list(needed.values())):
                 break

@@ -309,19 +309,28 @@ def missed_depth(obstacle: Obstacle, mesh: TetMesh, x: jax.Array, moved: jax.Arr
     """How much deeper [m] a round obstacle, `moved` (3,), is in the body at positions x (V, 3) than the contact points
     tell; and its depth [m] in the reference shape, or a tenth of its radius if it is outside there.
     """
-    width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
-    radius = max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width)
-    n = int(np.clip(np.ceil(3 * width / radius), _FEWEST, _MOST))
-    lattice = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]).T / n
-    functions = jnp.asarray(surface.triangle_functions(mesh, lattice), x.dtype)
-    nodes = touching_nodes(obstacle, mesh)
 
     def depth(y: jax.Array) -> float:
-        return float(-jnp.min(distances(obstacle, jnp.einsum("aq,ami->iqm", functions, y[nodes]), moved).value))
+        return float(-jnp.min(distances(obstacle, near_points(obstacle, mesh, y), moved).value))
 
     seen = float(largest_depth(obstacle, mesh, x, moved))
     approach = depth(mesh.points)
-    return max(depth(x) - seen, 0.0), approach if approach > 0 else 0.1 * radius
+    return max(depth(x) - seen, 0.0), approach if approach > 0 else 0.1 * _radius_and_width(obstacle, mesh)[0]
+
+
+def near_points(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> jax.Array:
+    """Points of the triangles (3, Q, m) [m] at positions x (V, 3) that are nearer to each other than its radius."""
+    radius, width = _radius_and_width(obstacle, mesh)
+    n = int(np.clip(np.ceil(3 * width / radius), _FEWEST, _MOST))
+    lattice = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]).T / n
+    functions = jnp.asarray(surface.triangle_functions(mesh, lattice), x.dtype)
+    return jnp.einsum("aq,ami->iqm", functions, x[touching_nodes(obstacle, mesh)])
+
+
+def _radius_and_width(obstacle: Obstacle, mesh: TetMesh) -> tuple[float, float]:
+    """Radius [m], at least a thousandth of the width, and the width [m] of the largest triangle."""
+    width = float(jnp.sqrt(jnp.max(_triangle_areas(obstacle, mesh))))
+    return max(float(np.max(np.asarray(obstacle.radius))), 1e-3 * width), width
 
 
 def touches_without_pressure(obstacle: Obstacle, mesh: TetMesh, x: jax.Array) -> bool:

@@ -9,7 +9,7 @@ the contact, with h = d2E/dx dt. This dense matrix of rank one is not stored: pr
 corrected for it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import jax
@@ -27,6 +27,7 @@ from liverjax.physics.contact.obstacle import (
     contact_points,
     depths,
     distances,
+    near_points,
     point_functions,
     shared_out,
     three_numbers,
@@ -71,17 +72,23 @@ class PressedObstacle(Obstacle):
     def check_place(self, mesh: TetMesh, name: str) -> None:
         """Refuse also a force that leads the obstacle past the body."""
         super().check_place(mesh, name)
-        if not self._meets(mesh):
+        if not self._meets(mesh, contact_points):
+            if self._meets(mesh, near_points):
+                raise InputError(
+                    f"{name} passes between the points at which contact is tested: the triangles are too large for "
+                    "its radius; refine the mesh there"
+                )
             force = np.asarray(self.force, float).tolist()
             raise InputError(f"{name} force = {force} presses it past the body: turn it or move position")
 
-    def _meets(self, mesh: TetMesh) -> bool:
-        """Whether the obstacle reaches the surface when it moves along its force."""
+    def _meets(self, mesh: TetMesh, points: Callable[..., jax.Array]) -> bool:
+        """Whether the obstacle reaches these points of the surface when it moves along its force."""
+        at = points(self, mesh, mesh.points)
         size = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         travel = 0.0
-        far = size + max(float(_gap_after(self, mesh, travel)), 0.0)
+        far = size + max(float(_gap_after(self, at, travel)), 0.0)
         for _ in range(_MOST_STEPS):
-            gap = float(_gap_after(self, mesh, travel))
+            gap = float(_gap_after(self, at, travel))
             if gap <= 1e-3 * size:
                 return True
             travel += gap
@@ -139,9 +146,8 @@ class PressedObstacle(Obstacle):
 
 
 @jax.jit
-def _gap_after(obstacle: PressedObstacle, mesh: TetMesh, travel: Number) -> jax.Array:
-    """Least distance () [m] from the body at rest, after a travel [m] along the force."""
-    at = contact_points(obstacle, mesh, mesh.points)
+def _gap_after(obstacle: PressedObstacle, at: jax.Array, travel: Number) -> jax.Array:
+    """Least distance () [m] from points (3, Q, m), after a travel [m] along the force."""
     return jnp.min(distances(obstacle, at, jnp.asarray(travel * obstacle.direction())).value)
 
 
