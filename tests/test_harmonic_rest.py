@@ -7,7 +7,11 @@ from test_porosity import column
 
 import liverjax as lj
 from liverjax.core.struct import replace
+from liverjax.jobs import waves
 from liverjax.physics.porosity import Inlet
+from liverjax.scenes.scene_file import scene_from
+from liverjax.simulation import cautions
+from liverjax.simulation.run import Result
 from liverjax.waves.rest import under_its_weight
 
 pytestmark = pytest.mark.quick_to_compile
@@ -67,3 +71,37 @@ def test_a_body_rests_under_the_tension_of_its_ligaments(tmp_path):
     assert np.abs(x - rested).max() < 1e-6 * 0.06 and np.abs(rested - scene.mesh.points).max() > 0.005
     slack = replace(scene, physics=(replace(scene.physics[0], pre_tension=0.0),))
     assert under_its_weight(slack) is None and under_its_weight(replace(scene, physics=())) is None
+
+
+def test_a_run_whose_capsule_pulls_at_held_nodes_has_rested():
+    """Its forces were taken for those of stress that had not relaxed, of an elastic body."""
+    table = {
+        "mesh": {"shape": "box", "size": [0.08, 0.04, 0.04], "cells": [2, 1, 1]},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "body": {"density": 1000.0, "gravity": [0, 0, -2.0]},
+        "fixed": [{"where": {"x_max": 0.0}}],
+        "membrane": [{"thickness": 2e-4, "law": {"name": "neo_hookean", "mu": 1e5}}],
+        "solve": {"tolerance": 1e-10},
+    }
+    scene = scene_from(table)
+    found = lj.simulate(scene).check()
+    at = (scene, found.positions[-1], np.asarray(found.reactions[-1]))
+    assert waves._of_rest(*at, "--about run") == []
+    assert waves._of_rest(at[0], at[1], 0.9 * at[2], "--about run")
+
+
+def test_a_region_that_relaxes_slowly_counts_in_a_loaded_shape():
+    table = {
+        "mesh": {"shape": "box", "size": [0.08, 0.04, 0.04], "cells": [2, 1, 1], "is": "loaded"},
+        "law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0},
+        "viscosity": {"ratios": [0.1], "relaxation_times": [0.05]},
+        "body": {"density": 1000.0, "gravity": [0, 0, -0.6]},
+        "fixed": [{"where": {"x_min": 0.08}}],
+        "solve": {"dt": 0.05, "steps": 10},
+    }
+    slow = {"where": {"x_min": 0.04}, "viscosity": {"ratios": [0.7], "relaxation_times": [20.0]}}
+    for more, told in (({}, False), ({"region": [slow]}, True)):
+        scene = scene_from(table | more)
+        result = Result(times=0.05 * np.arange(1, 11), positions=None, reactions=None, status=None, statistics=None)
+        said = cautions._of_stress_at_start(scene, result)
+        assert bool(said) == told and (not told or "relaxation time of 20 s" in said[0])
