@@ -12,9 +12,7 @@ from liverjax.core.errors import InputError
 from liverjax.core.struct import Content, Number, Numbers, param, replace, struct
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics import viscosity
-from liverjax.physics.base import Physics
 from liverjax.physics.contact.friction import RoughObstacle
-from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.physics.porosity import Porosity
@@ -26,7 +24,7 @@ from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
 from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, free_part, operator
-from liverjax.waves.rest import under_its_weight
+from liverjax.waves.rest import at_rest, under_its_weight
 
 MASSES = ("consistent", "lumped")
 #: Values of [solve] for the equations of one instant.
@@ -213,14 +211,6 @@ def _drains(porosity: Porosity) -> bool:
     return porosity.drained is not None or any(inlet.nodes is not None for inlet in porosity.inlet)
 
 
-def _at_rest(physics: Physics) -> Physics:
-    """The same physics without a history: a support with its own stiffness, an obstacle at its place at time 0."""
-    changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
-    if isinstance(physics, Obstacle):
-        changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}
-    return replace(physics, **changed) if changed else physics
-
-
 def _small(scene: Scene, mass: str) -> Scene:
     """The scene without time and weight, for small motion. Physics that have no small motion are refused."""
     if mass not in MASSES:
@@ -242,7 +232,7 @@ def _small(scene: Scene, mass: str) -> Scene:
     if sponge is not None:
         inlets = tuple(replace(inlet, times=None, history=None) for inlet in sponge.inlet)
         sponge = replace(sponge, inlet=inlets)
-    physics = tuple(_at_rest(own) for own in scene.physics)
+    physics = tuple(at_rest(own) for own in scene.physics)
     scene = replace(scene, traction=traction, body=body, solve=solve, porosity=sponge, physics=physics)
     if scene.springpots is not None:
         for law in laws_of(scene.law, scene.region):

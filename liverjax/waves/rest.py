@@ -6,8 +6,10 @@ import numpy as np
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import replace
+from liverjax.core.struct import Content, replace
 from liverjax.physics.attached.ligament import Ligament
+from liverjax.physics.base import Physics
+from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.porosity import Porosity
 from liverjax.physics.prescribed import free_degrees
 from liverjax.scenes.by_element import by_element
@@ -33,7 +35,9 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         InputError: no state of rest was found.
     """
     body = None if scene.body is None else replace(scene.body, times=None, history=None)
-    still = resting(replace(by_element(scene), traction=(), body=body, porosity=_without_inflow(scene.porosity)))
+    changed: Content = {"body": body, "porosity": _without_inflow(scene.porosity)}
+    changed["physics"] = tuple(at_rest(own) for own in scene.physics)
+    still = resting(replace(by_element(scene), traction=(), **changed))
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
     # With a sponge the steps are so long that its fluid has flowed.
@@ -49,6 +53,14 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         raise InputError(
             f"no state of rest under gravity was found ({error}): hold the body, or give a state as about"
         ) from None
+
+
+def at_rest(physics: Physics) -> Physics:
+    """The same physics without a history: a support with its own stiffness, an obstacle at its place at time 0."""
+    changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
+    if isinstance(physics, Obstacle):
+        changed |= {"by": None, "position": jnp.asarray(physics.position) + physics.displacement(0, 1, 0.0)}
+    return replace(physics, **changed) if changed else physics
 
 
 def _without_inflow(sponge: Porosity | None) -> Porosity | None:
@@ -77,5 +89,5 @@ def _is_pulled(still: Scene) -> bool:
     x = jnp.asarray(still.mesh.points)
     free = np.asarray(free_degrees(still.mesh, still.fixed, ()))
     program = jax.jit(forces_at)
-    at_rest, strained = (np.asarray(program(alone, x * stretch)) * free for stretch in (1.0, 1.0 + _STRAIN))
-    return bool(np.linalg.norm(at_rest) > _NONE * np.linalg.norm(strained - at_rest))
+    force, strained = (np.asarray(program(alone, x * stretch)) * free for stretch in (1.0, 1.0 + _STRAIN))
+    return bool(np.linalg.norm(force) > _NONE * np.linalg.norm(strained - force))

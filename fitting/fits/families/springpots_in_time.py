@@ -15,7 +15,7 @@ import numpy as np
 from fitting.fits import time_tests, together
 from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
-from fitting.fits.honesty.alike_answers import with_alike_noise
+from fitting.fits.honesty.alike_answers import with_own_noise
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
@@ -171,7 +171,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     """
     prony = time_tests.fit(test, modes)
     if model == "prony":
-        return _with_long_times_of(with_alike_noise(prony), test)
+        return _with_long_times_of(with_own_noise(prony), test)
     tried = [prony] if model == "auto" else []
     tried += fractional_in_time(test, prony.model) if model in ("fractional", "auto") else []
     tried += [spectrum_of_tests.spectrum_in_time(test, prony.model)] if model in ("spectrum", "auto") else []
@@ -180,7 +180,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     rows = _compared_models(tried, time_tests.criterion, test)
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
-    whole = with_alike_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
+    whole = with_own_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
     return _with_long_times_of(whole, test)
 
 

@@ -10,7 +10,37 @@ from fitting.fits.time_tests import INDEPENDENT, TimeFit
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation
 from fitting.methods.noise.alike_noise import alike_noise
-from fitting.methods.noise.uneven_noise import probability_of_sizes
+from fitting.methods.noise.uneven_noise import probability_of_sizes, uneven_root
+
+#: Errors that the residuals of single answers show count from this factor above those of equal noise.
+_UNEVEN_FROM = 1.3
+
+
+def with_own_noise(fit: TimeFit) -> TimeFit:
+    """The fit with the errors of its noise: shared by neighbours (`with_alike_noise`), or of another size at some
+    answers than at others, as where it grows with time.
+    """
+    own = fit.parameters
+    if fit.kind.effective is not None or not np.all(np.isfinite((own or fit.uncertainty).standard_errors)):
+        return fit
+    fit = with_alike_noise(fit)
+    if not fit.uncertainty.noise > 0:
+        return fit
+    r, J = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian)
+    root, u, own = uneven_root(J, r, np.eye(J.shape[1])), np.asarray(fit.solution.u), fit.parameters
+    modes = _at_least(fit.uncertainty, host.with_jacobian(_modes_of(fit), u)[1] @ root)
+    if own is not None and fit.kind.values is not None:
+        own = _at_least(own, host.with_jacobian(fit.kind.values, u)[1] @ root)
+    return fit._replace(uncertainty=modes, parameters=own)
+
+
+def _at_least(estimate: Estimate, root: np.ndarray) -> Estimate:
+    """The estimate with errors as large as those of a square root (P, k) of the covariance, where these are larger."""
+    ratio = np.linalg.norm(root, axis=1) / np.where(estimate.standard_errors > 0, estimate.standard_errors, np.inf)
+    factor = np.where(np.isfinite(ratio) & (ratio > _UNEVEN_FROM), ratio, 1.0)
+    return estimate._replace(
+        root=factor[:, None] * np.asarray(estimate.root), standard_errors=factor * estimate.standard_errors
+    )
 
 
 def with_alike_noise(fit: TimeFit) -> TimeFit:
