@@ -70,14 +70,23 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
     return test
 
 
-def _left_out(test: "TimeTest") -> list[str]:
-    """A note if a long record is fitted at some of its rows."""
+#: Last time of an answer over the first one, below which it is told what the test cannot show.
+_NARROW = 100.0
+
+
+def _said_of_rows(test: "TimeTest") -> list[str]:
+    """Notes if a long record is fitted at some of its rows, and if the answers begin late."""
     from fitting.fits.time_tests import thinned
 
-    number, every = len(thinned(test)), int(test.used.sum())
-    if number == every:
-        return []
-    return [f"{number} of {every} answers are fitted, spread over the log of the time since each load"]
+    number, every, told = len(thinned(test)), int(test.used.sum()), []
+    if number < every:
+        told.append(f"{number} of {every} answers are fitted, spread over the log of the time since each load")
+    first, last = test.resolved
+    if last < _NARROW * first:
+        told.append(
+            f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: what relaxed before is not in G0"
+        )
+    return told
 
 
 def run(options: argparse.Namespace) -> int:
@@ -102,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
         test = _in_its_rig(options)
     else:
         test = reader.read_time_test(options.file, options.kind, sample, options.ramp, options.min_time)
-    for note in (*test.notes, *_left_out(test)):
+    for note in (*test.notes, *_said_of_rows(test)):
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)

@@ -330,6 +330,13 @@ def assessed(
         limits=limits,
     )
     told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
+    told += _of_noise(alike, factors, n, len(curves))
+    return result._replace(warnings=told)
+
+
+def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
+    """Sentences on noise that n points of some tests share."""
+    told = []
     if alike is not None:
         told.append(
             "neighbouring points of a curve share their residuals: the instrument drifts or a test has a factor or an "
@@ -339,9 +346,9 @@ def assessed(
     if factors is not None:
         told.append(
             f"each test seems to have a factor of its own, of {100 * factors.deviation:.2g} %, as by another sample or "
-            f"a wrong size of it; the standard errors contain such factors of {len(curves)} tests"
+            f"a wrong size of it; the standard errors contain such factors of {tests} tests"
         )
-    return result._replace(warnings=told)
+    return told
 
 
 def _errors_of_law(

@@ -82,7 +82,7 @@ def thinned(test: TimeTest) -> np.ndarray:
     picked = []
     for k, begin in enumerate(begins):
         own = rows[of_load == k]
-        picked.append(own[_spread(test.time[own] - begin, MOST // len(begins))])
+        picked.append(own[_spread_places(test.time[own] - begin, MOST // len(begins))])
     return np.concatenate(picked)
 
 
@@ -98,7 +98,7 @@ def _begins_of_loads(test: TimeTest) -> np.ndarray:
     return begins if len(begins) <= MOST_LOADS else begins[:1]
 
 
-def _spread(time: np.ndarray, number: int) -> np.ndarray:
+def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
     """About so many places of rising times (n,) [s] above 0: those that are far apart in log time, and of the others
     some at equal distances.
     """

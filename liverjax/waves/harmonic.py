@@ -24,7 +24,7 @@ from liverjax.simulation.equations import Sizes, equations, initial_state
 from liverjax.simulation.run import prepared
 from liverjax.waves import sparse
 from liverjax.waves.operator import Operator, free_part, operator
-from liverjax.waves.rest import at_rest, under_its_weight
+from liverjax.waves.rest import under_its_weight, without_history
 
 MASSES = ("consistent", "lumped")
 #: Values of [solve] for the equations of one instant.
@@ -232,7 +232,7 @@ def _small(scene: Scene, mass: str) -> Scene:
     if sponge is not None:
         inlets = tuple(replace(inlet, times=None, history=None) for inlet in sponge.inlet)
         sponge = replace(sponge, inlet=inlets)
-    physics = tuple(at_rest(own) for own in scene.physics)
+    physics = tuple(without_history(own) for own in scene.physics)
     scene = replace(scene, traction=traction, body=body, solve=solve, porosity=sponge, physics=physics)
     if scene.springpots is not None:
         for law in laws_of(scene.law, scene.region):

@@ -36,7 +36,7 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
     """
     body = None if scene.body is None else replace(scene.body, times=None, history=None)
     changed: Content = {"body": body, "porosity": _without_inflow(scene.porosity)}
-    changed["physics"] = tuple(at_rest(own) for own in scene.physics)
+    changed["physics"] = tuple(without_history(own) for own in scene.physics)
     still = resting(replace(by_element(scene), traction=(), **changed))
     if not (_is_heavy(scene) or _is_pulled(still)):
         return None
@@ -55,7 +55,7 @@ def under_its_weight(scene: Scene) -> jax.Array | None:
         ) from None
 
 
-def at_rest(physics: Physics) -> Physics:
+def without_history(physics: Physics) -> Physics:
     """The same physics without a history: a support with its own stiffness, an obstacle at its place at time 0."""
     changed: Content = {name: None for name in ("times", "history") if getattr(physics, name, None) is not None}
     if isinstance(physics, Obstacle):
