@@ -421,6 +421,7 @@ def test_a_table_is_not_written_over_other_files(files, capsys):
     scene = (files / "scene.toml").read_text()
     assert main(["design", str(files / "scene.toml"), "law.mu=500:600"]) == 2
     assert "is no table of design" in capsys.readouterr().err and (files / "scene.toml").read_text() == scene
+    (files / "d.csv").touch()  # an empty file is no other table
     for rows in ("2", "4"):
         assert main(["design", str(files / "d.csv"), "law.mu=500:600", "--rows", rows]) == 0
         assert len(sweep.read_table(files / "d.csv")[1]) == int(rows)

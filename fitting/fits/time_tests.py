@@ -79,11 +79,14 @@ def thinned(test: TimeTest) -> np.ndarray:
     begins = _begins_of_loads(test)
     # A row at the time of a beginning belongs to what was before.
     of_load = np.searchsorted(begins, test.time[rows]) - 1
-    picked = []
-    for k, begin in enumerate(begins):
+    picked: list[np.ndarray] = []
+    left = MOST
+    # What loads of few rows do not need is left to the others.
+    for done, k in enumerate(np.argsort(np.bincount(of_load, minlength=len(begins)), kind="stable")):
         own = rows[of_load == k]
-        picked.append(own[_spread_places(test.time[own] - begin, MOST // len(begins))])
-    return np.concatenate(picked)
+        picked.append(own[_spread_places(test.time[own] - begins[k], left // (len(begins) - done))])
+        left -= len(picked[-1])
+    return np.sort(np.concatenate(picked))
 
 
 def _begins_of_loads(test: TimeTest) -> np.ndarray:
@@ -105,7 +108,7 @@ def _spread_places(time: np.ndarray, number: int) -> np.ndarray:
     if len(time) <= number:
         return np.arange(len(time))
     apart = np.diff(np.log(time))
-    low, high = 0.0, float(apart.max())
+    low, high = 0.0, max(float(apart.max()), float(apart.sum()) / (number - 1))
     for _ in range(60):
         step = 0.5 * (low + high)
         low, high = (step, high) if np.sum(np.minimum(apart / step, 1.0)) > number - 1 else (low, step)

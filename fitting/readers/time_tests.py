@@ -109,7 +109,7 @@ def read_time_test(
             raise InputError(f"{path}: --ramp {ramp:g} is for a file without the {form[0]}; leave it out")
         strain, stress, told = _as_shear(str(path), form, columns, sample)
         notes += told
-        notes += _of_the_other_kind(kind, strain, stress)
+        notes += _of_the_other_kind(kind, time, strain, stress)
         driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
         time, driven, answer, told = from_rest(time, driven, answer, at_once=ramp == 0)
         return of_columns(kind, time, driven, answer, (str(path), [*notes, *told]), start)
@@ -182,12 +182,18 @@ def kind_of(path: str | os.PathLike) -> str:
     return "relaxation" if moves[0] <= moves[1] else "creep"
 
 
-def _of_the_other_kind(kind: str, strain: np.ndarray, stress: np.ndarray) -> list[str]:
-    """A note if the quantity that this kind of test drives moves in the second half, and the other one is held."""
+def _of_the_other_kind(kind: str, time: np.ndarray, strain: np.ndarray, stress: np.ndarray) -> list[str]:
+    """A note if the quantity that this kind of test drives moves in the second half, and the other one is held.
+
+    There is none if it moves at a constant rate: so a sample is driven whose stress has become steady.
+    """
     driven, answer = (strain, stress) if kind == "relaxation" else (stress, strain)
     late = len(driven) // 2
     moves, held = (np.std(v[late:]) / max(float(np.max(np.abs(v))), 1e-300) for v in (driven, answer))
     if not (held < HELD and moves > 3 * held and moves > HELD):
+        return []
+    bent = driven[late:] - np.polyval(np.polyfit(time[late:], driven[late:], 1), time[late:])
+    if np.std(bent) < STEADY * np.std(driven[late:]):
         return []
     names = ("stress", "strain", "creep") if kind == "relaxation" else ("strain", "stress", "relaxation")
     return [
@@ -198,6 +204,8 @@ def _of_the_other_kind(kind: str, strain: np.ndarray, stress: np.ndarray) -> lis
 
 #: A quantity that varies less than this in the second half [1], by its standard deviation, is held.
 HELD = 0.01
+#: It moves at a constant rate if it departs from a straight line by less than this part of its change.
+STEADY = 0.05
 
 
 def _own_table(kind: str) -> str:

@@ -1,6 +1,5 @@
 """Tables of parameters for a sweep: a grid, a Latin hypercube, a Sobol sequence."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,8 @@ from liverjax.core.errors import InputError
 from liverjax.core.files import whole
 
 KINDS = ("grid", "latin", "sobol")
+#: First bytes of a table of `design`.
+_BEGINNINGS = tuple(f"# {kind}, seed".encode() for kind in KINDS)
 
 
 def number_of(text: str) -> float:
@@ -87,13 +88,15 @@ def write_table(file: Path, names: list[str], rows: np.ndarray, note: str) -> No
     Raises:
         InputError: a file that cannot be written, or that is there and is no such table.
     """
+    lines = [names, *([repr(float(v)) for v in row] for row in rows)]
+    text = f"# {note}\n" + "".join(",".join(line) + "\n" for line in lines)
     try:
-        if file.exists() and not file.read_bytes().startswith(tuple(f"# {kind}, seed".encode() for kind in KINDS)):
+        if file.is_file() and file.stat().st_size and not file.read_bytes().startswith(_BEGINNINGS):
             raise InputError(f"{file} is there and is no table of design: name another file, or remove it")
-        with whole(file) as beside, beside.open("w", newline="", encoding="utf-8") as out:
-            out.write(f"# {note}\n")
-            writer = csv.writer(out)
-            writer.writerow(names)
-            writer.writerows([[repr(float(v)) for v in row] for row in rows])
+        if file.exists() and not file.is_file():  # the terminal, a pipe
+            file.write_text(text, encoding="utf-8")
+            return
+        with whole(file) as beside:
+            beside.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file} cannot be written ({error.strerror}): name another file") from None

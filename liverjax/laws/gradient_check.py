@@ -270,6 +270,8 @@ def _v_shape(name: str, errors: np.ndarray) -> Row:
     if not np.isfinite(errors).any():
         return Row(f"{name}, differences", "not finite", limit, False)
     k = int(np.nanargmin(errors))
+    if errors[k] == 0:
+        return Row(f"{name}, differences", "exact", limit, True)
     order = np.log10(errors[1] / errors[4]) / np.log10(STEPS[1] / STEPS[4])
     found = f"fall as h^{order:.1f} to {errors[k]:.1e} at step {STEPS[k]:.0e}"
     return Row(f"{name}, differences", found, limit, bool(errors[k] < DIFFERENCE_LIMIT))

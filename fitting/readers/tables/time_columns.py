@@ -85,13 +85,13 @@ WORDS = (
 #: Quantities that a file must have in addition to the time, best first.
 FORMS = (
     ("strain", "stress"),
+    ("tensile strain", "tensile stress"),
     ("angle", "torque"),
     ("displacement", "force"),
     ("modulus",),
     ("compliance",),
     ("tensile modulus",),
     ("tensile compliance",),
-    ("tensile strain", "tensile stress"),
 )
 #: Factors that make quantities of tension those of shear, for a sample that keeps its volume.
 TENSILE = {
@@ -132,7 +132,9 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
     for k, line in enumerate(lines):
         delimiter, cells = split_line(line.lstrip("# "))
         found = _heading(cells)
-        if "time" in found and any(set(f) <= set(found) for f in FORMS):
+        form = next((f for f in FORMS if set(f) <= set(found)), None)
+        if "time" in found and form is not None:
+            found = {q: found[q] for q in ("time", *form)}  # other columns may have empty cells and other units
             rows, units, left_out = _rows_in_time(path, lines, k + 1, delimiter, found)
             columns, notes = _of_shear(*_in_si(path, found, np.array(rows), units))
             return columns, [*_told_of_times(cells), *notes, *left_out, *_told_of_tables(lines[k + 1 :])]
@@ -226,6 +228,8 @@ def _heading(cells: list[str]) -> dict[str, tuple[int, str | None]]:
                 rest = re.sub(r"^(?:[/,]|in\b)\s*", "", name[len(word) :].strip())  # "Zeit / s", "time, s", "time in s"
                 if rest and not _known_column(quantity, rest):
                     break  # "strain rate", "stress (step)"
+                if word in ("e(t)", "d(t)") and name[0].islower():
+                    break  # e(t) is a strain, d(t) a displacement
                 if word == "t" and not (name[0] == "t" and (unit or rest) and _known_column("time", unit or rest)):
                     break  # T is a temperature
                 found.setdefault(quantity, (k, unit or rest or None))
@@ -239,7 +243,7 @@ _SHEAR = re.compile(r"shear|g\(t\)|j\(t\)|schub|scher|cisail", re.IGNORECASE)
 
 def _all_tensile(found: dict[str, tuple[int, str | None]], cells: list[str]) -> dict[str, tuple[int, str | None]]:
     """Beside a column of tension the other quantities are those of tension, if their headings do not name shear."""
-    if not TENSILE.keys() & found.keys() or {"strain", "stress"} <= found.keys():
+    if not TENSILE.keys() & found.keys():
         return found
     return {
         f"tensile {q}" if f"tensile {q}" in TENSILE and not _SHEAR.search(cells[place[0]]) else q: place
