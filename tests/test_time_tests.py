@@ -555,7 +555,7 @@ def test_a_long_record_is_thinned_by_each_load():
     ],
 )
 def test_as_many_rows_as_allowed_are_fitted(time, ramp, first):
-    strain = np.round(np.minimum(time / ramp, 1.0) if ramp else np.ones(len(time)), 3)
+    strain = 0.001 * np.round(1e3 * np.minimum(time / ramp, 1.0)) if ramp else np.ones(len(time))
     rows = fits.thinned(TimeTest("relaxation", time, strain, np.ones(len(time)), time > first))
     assert len(rows) == fits.MOST and np.all(np.diff(rows) > 0) and rows[-1] == len(time) - 1
 
