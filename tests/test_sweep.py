@@ -429,22 +429,8 @@ def test_a_table_is_not_written_over_other_files(files, capsys):
 
 def test_a_row_that_iterations_do_not_solve_is_factorised(files):
     """Of rows in one program none is known: a body that keeps its volume failed, with a pull 12 times too large."""
-    (files / "pull.toml").write_text(
-        """[mesh]
-        shape = "box"
-        size = [0.1, 0.1, 0.1]
-        cells = [2, 2, 2]
-        [law]
-        name = "neo_hookean"
-        mu = 770.0
-        bulk = 2200.0
-        [[fixed]]
-        where = {z_max = 0.0}
-        [[displaced]]
-        where = {z_min = 0.1}
-        by = [0.0, 0.0, 0.01]
-        """
-    )
+    pull = "[[displaced]]\nwhere = {z_max = 0.0}\nby = [0.0, 0.0, -0.01]\n"
+    (files / "pull.toml").write_text(SCENE + pull)
     (files / "stiff.csv").write_text("law.bulk\n7700\n7.7e6\n")
     table = sweep.read_sweep(files / "pull.toml", files / "stiff.csv", ("final_reactions",))
     assert table.scene.solve.linear_solver == "direct"

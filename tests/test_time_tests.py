@@ -14,7 +14,6 @@ from fitting.__main__ import main
 from fitting.fits import time_tests as fits
 from fitting.methods import time_response
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import Sample, TimeTest, read_time_test
 from liverjax import InputError
 
@@ -441,97 +440,6 @@ def test_what_a_sensor_shows_before_the_load_is_taken_off(tmp_path, kind, offset
     assert abs(G0 / 1000 - 1) < 0.006 and abs(G0 * (1 - ratio) / 600 - 1) < 0.006
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        "Zeit [s];Relaxationsmodul [Pa]",
-        "Zeit / s;Relaxationsmodul / Pa",
-        "Time, s;Relaxation modulus in Pa",
-        "Elapsed time in s;Shear modulus in Pa",
-        "t [s];G(t) [Pa]",
-        "Temps (s);Module de relaxation (Pa)",
-        "time (s);modulus (Pa);T (°C)",
-    ],
-)
-def test_headings_of_other_programs_are_read(header, tmp_path):
-    (tmp_path / "t.csv").write_text(header + "\n" + "".join(f"{k};{900 - k}\n" for k in range(1, 9)))
-    columns, _ = read_columns(tmp_path / "t.csv")
-    (tmp_path / "first.csv").write_text("T (°C);" + header + "\n" + "".join(f"25;{k};{900 - k}\n" for k in range(1, 9)))
-    assert np.array_equal(read_columns(tmp_path / "first.csv")[0]["time"], columns["time"])
-    assert np.allclose(columns["time"], np.arange(1, 9)) and np.allclose(columns["modulus"], 900 - np.arange(1, 9))
-
-
-@pytest.mark.parametrize(
-    ("header", "quantity", "factor"),
-    [
-        ("time [s],E(t) [kPa]", "modulus", 1e3 / 3),
-        ("t (s),Relaxation modulus E(t) (kPa)", "modulus", 1e3 / 3),
-        ("time_s,Young's modulus [Pa]", "modulus", 1 / 3),
-        ("Step time [s],Relaxation modulus G(t) [kPa]", "modulus", 1e3),
-        ("time_s,D(t) [1/Pa]", "compliance", 3.0),
-        ("time_s,tensile creep compliance (1/kPa)", "compliance", 3e-3),
-        ("time_s,tensile stress [kPa],tensile strain [%]", "stress", 1e3 / 3),
-        ("time_s,E(t) [Pa],G(t) [kPa]", "modulus", None),
-    ],
-)
-def test_quantities_of_tension_are_made_those_of_shear(header, quantity, factor, tmp_path):
-    rows = "".join(f"{k},{900 - k},{5 + k}\n" for k in range(1, 9))
-    (tmp_path / "t.csv").write_text(header + "\n" + rows)
-    columns, notes = read_columns(tmp_path / "t.csv")
-    expected = 1e3 * (5 + np.arange(1, 9)) if factor is None else factor * (900 - np.arange(1, 9))
-    assert np.allclose(columns[quantity], expected) and not any("tensile" in name for name in columns)
-    assert any("G = E / 3" in note for note in notes) == (factor != 1e3 and factor is not None)
-    if quantity == "stress":
-        assert np.allclose(columns["strain"], 0.01 * (5 + np.arange(1, 9)))
-
-
-@pytest.mark.parametrize(
-    ("header", "quantity", "factor"),
-    [
-        ("time_s,modulus_kPa,tensile strain [%]", "modulus", 1e3 / 3),
-        ("Time (s),Creep compliance (1/kPa),Tensile stress (kPa)", "compliance", 3e-3),
-        ("time_s,stress [kPa],tensile strain [%]", "stress", 1e3 / 3),
-        ("time_s,strain [%],tensile stress [kPa]", "strain", 1e-2),
-        ("time_s,Zugspannung [kPa],Dehnung [%]", "stress", 1e3 / 3),
-        ("time_s,G(t) [kPa],tensile strain [%]", "modulus", 1e3),
-        ("time_s,stress [kPa],strain [%],E(t) [Pa]", "stress", 1e3 / 3),
-        ("time_s,stress [kPa],strain [%],e(t) [%]", "stress", 1e3),
-        ("time_s,stress [kPa],strain [%],d(t) [mm]", "stress", 1e3),
-    ],
-)
-def test_one_column_of_tension_makes_the_others_those_of_tension(header, quantity, factor, tmp_path):
-    """A modulus beside a tensile strain came out three times too large, with a note that said the opposite."""
-    more = ",#DIV/0!" * (header.count(",") - 2)  # as workbooks write 0/0: of a column that is not used
-    rows = "".join(f"{k},{900 - k},{5 + k}{more}\n" for k in range(1, 9))
-    (tmp_path / "t.csv").write_text(header + "\n" + rows)
-    columns, _ = read_columns(tmp_path / "t.csv")
-    assert np.allclose(columns[quantity], factor * (900 - np.arange(1, 9)))
-
-
-def test_large_strain_in_tension_is_told(tmp_path):
-    time = np.geomspace(0.1, 100, 40)
-    for strain, told in ((0.3, True), (0.005, False)):
-        stress = 3 * strain * (500 + 500 * np.exp(-time / 5))
-        file = write(tmp_path / "t.csv", "time_s,tensile strain [1],stress [Pa]", time, np.full(40, strain), stress)
-        notes = read_time_test(file, "relaxation", ramp=0.0).notes
-        assert any("too small in tension" in note for note in notes) == told
-
-
-@pytest.mark.parametrize("gap", ["", "\n"])
-@pytest.mark.parametrize("first", [60.0, 0.5])
-def test_a_second_table_is_not_appended_to_the_first(gap, first, tmp_path):
-    """The other table has another unit, and goes on or begins again: a modulus of 1000 Pa came out as 942."""
-
-    def rows(times):
-        return "".join(f"{t:g},{400 + 600 * np.exp(-t / 10):.6g}\n" for t in times)
-
-    text = "time_s,relaxation modulus [Pa]\n" + rows(np.linspace(0.5, 50, 50)) + gap
-    text += "time_s,relaxation modulus [kPa]\n" + rows(first + np.arange(30.0))
-    (tmp_path / "two.csv").write_text(text)
-    test = read_time_test(tmp_path / "two.csv", "relaxation")
-    assert test.used.sum() == 50 and any("holds 2 tables" in note for note in test.notes)
-
-
 def test_a_long_record_is_thinned_by_each_load():
     """After a small load before the test the rows of the step itself were left out: G0 was 14 standard errors off."""
     time = np.arange(0.0, 900.5, 0.5)
@@ -558,19 +466,6 @@ def test_as_many_rows_as_allowed_are_fitted(time, ramp, first):
     strain = 0.001 * np.round(1e3 * np.minimum(time / ramp, 1.0)) if ramp else np.ones(len(time))
     rows = fits.thinned(TimeTest("relaxation", time, strain, np.ones(len(time)), time > first))
     assert len(rows) == fits.MOST and np.all(np.diff(rows) > 0) and rows[-1] == len(time) - 1
-
-
-@pytest.mark.parametrize("kind", ["relaxation", "creep"])
-def test_a_file_of_the_other_kind_is_told(kind, tmp_path):
-    time = np.geomspace(0.1, 100, 40)
-    held, moves = np.full(40, 100.0), 0.1 * (2 - np.exp(-time / 5))
-    creep = write(tmp_path / "c.csv", "time_s,stress [Pa],strain [1]", time, held, moves)
-    relaxation = write(tmp_path / "r.csv", "time_s,stress [Pa],strain [1]", time, 10 / moves, held / 1e3)
-    own, other = (relaxation, creep) if kind == "relaxation" else (creep, relaxation)
-    steady = write(tmp_path / "s.csv", "time_s,stress [Pa],strain [1]", time, 9 * (1 - np.exp(-time)), time / 1e3)
-    assert not any("python -m fitting" in note for note in read_time_test(steady, "relaxation").notes)
-    assert any("python -m fitting" in note for note in read_time_test(other, kind).notes)
-    assert not any("python -m fitting" in note for note in read_time_test(own, kind).notes)
 
 
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])

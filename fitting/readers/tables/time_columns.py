@@ -149,16 +149,15 @@ def _columns_in_time(path: str, lines: list[str]) -> tuple[dict[str, np.ndarray]
 
 
 def _of_shear(columns: dict[str, np.ndarray], notes: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Quantities of tension as those of shear, with a note; those of shear come first if both are there."""
-    taken = [tensile for tensile, (shear, _) in TENSILE.items() if tensile in columns and shear not in columns]
-    for tensile, (shear, factor) in TENSILE.items():
-        values = columns.pop(tensile, None)
-        if tensile in taken and values is not None:
-            columns[shear] = factor * values
-    if taken:
-        verb = "is taken as that" if len(taken) == 1 else "are taken as those"
-        notes = [*notes, f"{' and '.join(taken)} {verb} of a sample that keeps its volume: G = E / 3"]
-    if "tensile stress" in taken and "strain" in columns:
+    """Quantities of tension as those of shear, with a note."""
+    tensile = [name for name in TENSILE if name in columns]
+    for name in tensile:
+        shear, factor = TENSILE[name]
+        columns[shear] = factor * columns.pop(name)
+    if tensile:
+        verb = "is taken as that" if len(tensile) == 1 else "are taken as those"
+        notes = [*notes, f"{' and '.join(tensile)} {verb} of a sample that keeps its volume: G = E / 3"]
+    if "tensile stress" in tensile:
         notes += beyond_small(float(np.nanmax(np.abs(columns["strain"]))))
     return columns, notes
 
