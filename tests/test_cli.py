@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -276,3 +277,17 @@ def test_a_run_in_single_precision_writes_its_files(tmp_path):
     lines = (tmp_path / "reactions.csv").read_text().splitlines()
     last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
     assert np.isclose(float(last["support.0.z_N"]), 3.0, rtol=1e-3)
+
+
+def test_a_terminal_without_the_letter_and_a_full_disk(tmp_path):
+    """Both ended in tracebacks after the fit, the first one before the files that --cards asks for."""
+    command = [sys.executable, "-m", "fitting", str(PORCINE), "--method", "closed-form", "--out", str(tmp_path)]
+    env = os.environ | {"PYTHONIOENCODING": "ascii"}
+    run = subprocess.run([*command, "--cards"], env=env, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0 and "Traceback" not in run.stderr and "770 ? " in run.stdout
+    assert (tmp_path / "cards").is_dir()
+    if not Path("/dev/full").exists():
+        return
+    with open("/dev/full", "w") as full:
+        run = subprocess.run(command, env=env, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert run.returncode == 2 and "No space left on device" in run.stderr and "Traceback" not in run.stderr

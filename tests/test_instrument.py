@@ -161,12 +161,13 @@ def end_of_profile(fit: viscoelastic.Fit, better: Sweep, gap: float, side: int) 
     told = fit.details.get("instrument")
     before = 0.0 if told is None else told[names[0]] / told[names[1]]
     moved = np.zeros(len(OMEGA)) if told is None else told[names[1]] * better.inertia
+    scales = better.deviations
 
     def rows(v, G0):
         *others, inertia, off = v
         u = np.array([np.log(G0 / (1 + gap * off)), *others])
         storage, loss = generalised_maxwell.moduli(generalised_maxwell.natural(u), OMEGA)
-        apart = (storage - better.storage - inertia * moved) / better.storage, (loss - better.loss) / better.loss
+        apart = (storage - better.storage - inertia * moved) / scales[0], (loss - better.loss) / scales[1]
         return np.concatenate([*apart, noise * np.array([inertia + before, off])]) / noise
 
     def cost(G0):

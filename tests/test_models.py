@@ -251,6 +251,10 @@ def test_a_fluid_is_recovered_without_an_equilibrium_modulus():
     truth = np.array([1000, 0.4, 0.6, 5, 0.05])
     assert np.all(np.abs(f.uncertainty.values - truth) < 3 * f.uncertainty.standard_errors)
     assert not any("equilibrium" in w for w in f.warnings)
+    # The table said "G_inf 2.2e-13 ± inf Pa".
+    assert sweep_report.summary(f, s)["equilibrium_modulus"] == 0.0
+    assert not any("inf Pa" in row or "nan" in row for row in sweep_report._lines(f))
+    assert any("a fluid" in row for row in sweep_report._lines(f))
 
 
 def test_one_mode_of_a_fluid_leaves_nothing_free():

@@ -101,7 +101,7 @@ def test_the_draws_of_one_mode_have_the_moments_of_quadrature():
 
 
 def test_the_error_of_the_inertia_is_drawn_with_its_prior():
-    """Moments of five numbers against quadrature of the density, which is written out here for the measured moduli."""
+    """Moments of five numbers against quadrature of the density, which is written out here."""
     s = one_mode(0.1, 1)
     share, off = 40 * OMEGA, 0.6  # of a deviation of the prior, by which 120 Pa are wrong at the end
     s = s._replace(storage=s.storage - off * 0.03 * share, inertia=share)
@@ -110,13 +110,13 @@ def test_the_error_of_the_inertia_is_drawn_with_its_prior():
     assert better is not s and found.names[-1] == "inertia_off_by" and "deviation of 3 %" in found.prior
 
     axes = [c + np.linspace(-w, w, 31) for c, w in zip(fit.solution.u, (0.15, 0.35, 0.3), strict=True)]
-    errors = np.linspace(-4, 4, 33)
+    errors, scales = np.linspace(-4, 4, 33), better.deviations
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     model = generalised_maxwell.moduli(generalised_maxwell.natural(grid), OMEGA)
     square = np.stack(
         [
-            np.sum(((model[0] - s.storage - e * 0.03 * share) / better.storage) ** 2, axis=1)
-            + np.sum(((model[1] - s.loss) / better.loss) ** 2, axis=1)
+            np.sum(((model[0] - s.storage - e * 0.03 * share) / scales[0]) ** 2, axis=1)
+            + np.sum(((model[1] - s.loss) / scales[1]) ** 2, axis=1)
             for e in errors
         ],
         axis=1,

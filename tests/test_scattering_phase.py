@@ -29,14 +29,14 @@ def measured(G: np.ndarray, degrees: float, seed: int) -> Sweep:
 
 
 def test_an_error_of_the_phase_no_longer_moves_the_numbers():
-    """One degree where tan(delta) is 0.01 to 0.1: ratios came out 17 % too small, G0 3 %."""
+    """One degree where tan(delta) is 0.01 to 0.1: ratios scattered twice as far, and the first came out 10 % small."""
     found = []
     for seed in range(16):
         plain = measured(modulus(), 1.0, seed)
         fits = [viscoelastic.closed_form(s, 2).uncertainty for s in (plain, weighed_by_scatter(plain))]
         found.append([u.values[:3] / [1000, *RATIOS] - 1 for u in fits])
-    plain, weighed = np.median(found, axis=0)
-    assert plain[0] < -0.02 and np.all(plain[1:] < -0.1)
+    (plain, weighed), (scatter, left) = np.median(found, axis=0), np.std(found, axis=0)
+    assert plain[1] < -0.05 and np.all(scatter > 1.5 * left)
     # One fit is 0.6 and 5 % off; the median of 16 has 1.25 / 4 of this error, and three times that is allowed.
     assert abs(weighed[0]) < 0.006 and np.all(np.abs(weighed[1:]) < 0.047)
 
@@ -108,7 +108,7 @@ def test_a_step_of_the_deviations_is_kept():
     G = modulus()
     sd = np.where(OMEGA < 3, 0.005, 0.08)
     s = Sweep(OMEGA, G.real, G.imag, sd * G.real, sd * G.imag)
-    assert np.array_equal(s.deviations[0], sd * G.real) and np.array_equal(s.deviations[1], sd * G.imag)
+    assert all(np.allclose(a, sd * part, rtol=1e-4) for a, part in zip(s.deviations, (G.real, G.imag), strict=True))
 
 
 def test_a_spread_between_samples_below_ten_percent_is_told():

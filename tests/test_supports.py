@@ -12,7 +12,7 @@ from liverjax.core.struct import replace
 from liverjax.jobs.reactions import reaction_table
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.elastic_support import ElasticSupport
-from liverjax.physics.sliding_support import on_plane
+from liverjax.physics.sliding_support import SlidingSupport, on_plane
 from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
@@ -246,3 +246,14 @@ def test_a_scene_without_supports_pays_nothing():
     sizes = [len(str(jax.make_jaxpr(lj.simulate)(scene))) for scene in (plain, one)]
     assert sizes[0] < sizes[1]
     assert not plain.physics and len(jax.tree.leaves(one)) > len(jax.tree.leaves(plain))
+
+
+@pytest.mark.parametrize("run", [lj.simulate, lambda scene: lj.harmonic(scene, [1.0]), lj.check_scene])
+def test_two_planes_given_by_normals_share_no_node(run):
+    """The last plane alone held the nodes of their edge, and nothing was said of scenes made in Python."""
+    mesh = box()
+    places = ({"x_max": 0.0}, [1.0, 0.0, 0.0]), ({"z_max": 0.0}, [0.0, 0.0, 1.0])
+    slides = tuple(SlidingSupport(nodes=jnp.asarray(part(mesh, **w)), normal=jnp.asarray(n)) for w, n in places)
+    scene = replace(pulled(mesh, [0.0, 0.0, 10.0]), fixed=(), physics=slides)
+    with pytest.raises(InputError, match="slides in one plane given by its normal"):
+        run(scene)

@@ -169,6 +169,13 @@ def test_a_ramp_that_no_column_has_is_an_option(tmp_path):
 T = np.geomspace(0.1, 10, 12)
 
 
+def test_a_ramp_longer_than_the_record_is_no_wrong_sign(tmp_path):
+    t = np.geomspace(0.01, 100, 20)
+    file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, 500 + 300 * np.exp(-t))
+    with pytest.raises(InputError, match="ends after the last row at 100 s"):
+        read_time_test(file, "relaxation", ramp=1e4)
+
+
 def test_units_and_forms(tmp_path):
     G = relaxation(SOLID, T)
     file = write(tmp_path / "a.csv", "Time (min),Relaxation Modulus (kPa)", T / 60, G / 1e3)

@@ -116,11 +116,14 @@ def test_total_errors_contain_the_sizes_of_the_samples():
         fit = together.fit(wide_and_long(factor, seed), 2)
         shares, u = sizes_of_samples.shares_with_sizes(fit, 0.013), fit.uncertainty
         off, whole = np.abs(u.values - np.array([800, 0.3, 0.4, 30, 0.1])), total_error.root_of_squares(shares)
-        hits.append(off < u.quantile * np.array([whole[name] for name in u.names]))
+        rest = abs(float(fit.model.shear_modulus * (1 - fit.model.ratios.sum())) - 240)
+        hits.append([*(off < u.quantile * np.array([whole[name] for name in u.names])), False])
+        hits[-1][-1] = rest < u.quantile * whole["equilibrium_modulus"]
         by_noise.append(off < u.quantile * u.standard_errors)
     assert np.all(np.mean(hits, axis=0) >= 0.83) and np.mean(by_noise, axis=0).min() < 0.7
-    # A factor of both tests alike is a factor of G0 alone.
+    # A factor of both tests alike is a factor of G0 alone, and of the equilibrium modulus.
     assert shares["geometry"]["shear_modulus"] >= 0.0129 * fit.model.shear_modulus
+    assert shares["geometry"]["equilibrium_modulus"] >= 0.0128 * 240
 
 
 def test_a_factor_of_all_tests_is_one_of_the_shear_modulus_alone():
@@ -298,7 +301,7 @@ def test_a_joint_fit_of_one_sweep_has_the_errors_of_its_closed_form():
     assert found.converged and np.allclose(found.values, closed.uncertainty.values, rtol=1e-4)
     assert np.allclose(found.standard_errors, closed.uncertainty.standard_errors, rtol=0.01)
     given = with_deviations(0.05, 0.01)
-    assert np.array_equal(joint.sweep(given).sd, np.concatenate([given.storage_sd, given.loss_sd]))
+    assert np.array_equal(joint.sweep(given).sd, np.concatenate(given.deviations))
 
 
 @pytest.mark.parametrize(

@@ -148,10 +148,11 @@ def fitted(name: str, data: np.ndarray, omega: np.ndarray) -> Fits:
     """Levenberg-Marquardt of the program for all sweeps and starts at once; the best minimum of each sweep."""
     size, model = MODELS[name]
     starts = first_places(name, data, omega).reshape(-1, size)
-    own = np.repeat(data, STARTS, axis=0)
+    scales = [np.concatenate(Sweep(omega, *np.split(row, 2)).deviations) for row in data]
+    own = np.repeat(np.stack([data, np.stack(scales)], axis=1), STARTS, axis=0)
 
     def residuals(u: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        return model(u, omega) / rows[:, None, :] - 1
+        return (model(u, omega) - rows[:, :1]) / rows[:, 1:]
 
     going: np.ndarray = np.arange(len(starts))
     s = None

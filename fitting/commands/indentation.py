@@ -59,6 +59,8 @@ def run(options: argparse.Namespace) -> int:
     from fitting.rigs.thin_layer import Indenter, Layer
     from liverjax.core.files import writable
 
+    if options.shape != "cone" and options.radius == 0:
+        raise InputError(f"the radius of a {options.shape} must be above 0: give it in metres, e.g. --radius 0.001")
     if options.shape != "cone" and options.radius > LARGEST:
         raise InputError(f"--radius {options.radius:g} is in metres: give e.g. --radius {options.radius / 1000:g}")
     angle = HALF_ANGLE if options.half_angle is None else options.half_angle

@@ -253,7 +253,7 @@ def _check(options: argparse.Namespace) -> None:
     _check_friction(options)
     if options.density is not None and not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density} cannot be a sample's in kg/m^3: give e.g. --density 1060")
-    if options.density is not None and options.method == "closed-form" and options.height is None:
+    if options.density is not None and options.method == "closed-form" and not (options.height or options.others):
         raise InputError(f"--density {options.density:g} needs --height too: the inertia of the sample goes with both")
     _check_precompression(options)
     _check_master(options)
@@ -324,7 +324,7 @@ def _check_precompression(options: argparse.Namespace) -> None:
         (f"{len(options.sweep)} samples", len(options.sweep) > 1),
     ):
         if asked:
-            raise InputError(f"--precompression works for one sample only: leave out {name}")
+            raise InputError(f"--precompression works for one sample only: leave out {name}, or --precompression")
     if options.model != "prony" and options.method != "closed-form":
         raise InputError(
             f"--precompression with --model {options.model} is computed in closed form, since the modes that a "

@@ -130,7 +130,8 @@ def _check_waves(options: argparse.Namespace) -> None:
     for name in ("length", "noise"):
         value = getattr(options, name)
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"--{name} {value:g} must be above 0: give a length in metres, e.g. 0.004")
+            example = {"length": "0.004", "noise": "2e-7"}[name]
+            raise InputError(f"--{name} {value:g} must be above 0: give a length in metres, e.g. {example}")
     if not 100 <= options.density <= 25000:
         raise InputError(f"--density {options.density:g} cannot be an organ's in kg/m^3: give e.g. --density 1060")
     if options.stride is not None and options.stride < 1:

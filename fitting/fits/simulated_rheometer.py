@@ -326,11 +326,18 @@ def _simulation_details(
 
 
 def largest_shift(closed: Fit, simulated: Fit) -> float:
-    """Largest change of a parameter by the simulation, divided by its standard error."""
-    shift = np.abs(simulated.uncertainty.values - closed.uncertainty.values)
-    errors = simulated.uncertainty.standard_errors
-    known = np.isfinite(errors) & (shift > 1e-6 * np.abs(closed.uncertainty.values))
+    """Largest change of a parameter or of the equilibrium modulus by the simulation, over its standard error."""
+    (before, _), (after, errors) = (_with_equilibrium(fit) for fit in (closed, simulated))
+    shift = np.abs(after - before)
+    known = np.isfinite(errors) & (shift > 1e-6 * np.abs(before))
     return float(np.max(shift[known] / np.maximum(errors[known], 1e-300), initial=0.0))
+
+
+def _with_equilibrium(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters, then the equilibrium modulus, and their standard errors."""
+    u = fit.uncertainty
+    rest = u.values[0] * (1 - u.values[1 : 1 + (len(u.values) - 1) // 2].sum())
+    return np.append(u.values, rest), np.append(u.standard_errors, uncertainty.equilibrium_error(u))
 
 
 def _bias(closed: Fit, simulated: Fit) -> list[str]:

@@ -79,7 +79,8 @@ def _by_temperature(path: str, name: str, sweep: Sweep) -> list[tuple[float, flo
         stated = re.search(r"((?:(?<![^\W_])-)?\d+(?:[.,]\d+)?)\s*°?\s*([CK])\b", name)
         if stated is None:
             raise InputError(
-                f"{path}: the table {name or 'of the file'!r} states no temperature: add a column temperature_C"
+                f"{path}: the table {repr(name) if name else 'of the file'} states no temperature: add a column "
+                "temperature_C"
             )
         T = np.full(len(sweep.storage), float(stated[1].replace(",", ".")) + 273.15 * (stated[2] == "C"))
     if np.any(T <= 0):

@@ -68,10 +68,15 @@ def _softmax_shares(logits: Array) -> Array:
     return share / xp.sum(share, axis=-1, keepdims=True)
 
 
+#: Logarithm of a gap beyond which its time is 0 in any case; the exponential must not overflow.
+_FARTHEST = 30.0
+
+
 def _times_of_gaps(u: Array) -> Array:
     """Descending relaxation times (N,) from log(first time) and the logs of the gaps between log times."""
     xp = arrays_of(u)
-    gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(xp.exp(u[..., 1:]), axis=-1)], axis=-1)
+    apart = xp.exp(xp.minimum(u[..., 1:], _FARTHEST))
+    gaps = xp.concatenate([xp.zeros_like(u[..., :1]), xp.cumsum(apart, axis=-1)], axis=-1)
     return xp.exp(u[..., :1] - gaps)
 
 

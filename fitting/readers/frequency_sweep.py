@@ -38,12 +38,12 @@ class Sweep(NamedTuple):
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Scales of the residuals [Pa]: the given deviations, or the moduli themselves (relative errors).
+        """Scales of the residuals [Pa]: the given deviations, or smooth curves through the moduli (relative errors).
 
         Deviations that are themselves estimates from few repeats are smoothed.
         """
-        pairs = ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
-        first, second = (m if sd is None else smooth_deviations(self.angular_frequency, m, sd) for m, sd in pairs)
+        omega, pairs = self.angular_frequency, ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
+        first, second = (smooth_modulus(omega, m) if sd is None else smooth_deviations(omega, m, sd) for m, sd in pairs)
         return first, second
 
     @property
@@ -133,6 +133,33 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
     return np.array(left)
 
 
+#: Points nearer than this in the logarithm of the frequency are one place of a smooth curve; it needs so many places.
+_NEAR, _PLACES = 0.01, 5
+
+
+def smooth_modulus(omega: np.ndarray, modulus: np.ndarray) -> np.ndarray:
+    """A smooth curve through moduli (n,) at frequencies (n,): a spline of logarithms, smoothed by cross-validation.
+
+    It is the scale of relative errors. Were it the measured modulus itself, a point that is low by chance would have
+    more weight than one that is high, and the fit would be too low by twice the square of the relative noise.
+    """
+    return _curve_of_bytes(np.asarray(omega, float).tobytes(), np.asarray(modulus, float).tobytes())
+
+
+@lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
+def _curve_of_bytes(*columns: bytes) -> np.ndarray:
+    """`smooth_modulus` of the bytes of its columns."""
+    omega, modulus = (np.frombuffer(column) for column in columns)
+    x, near = np.log(omega), np.round(np.log(omega) / _NEAR)
+    counts = np.bincount(np.unique(near, return_inverse=True)[1])
+    if len(counts) < _PLACES:
+        return modulus
+    from scipy.interpolate import make_smoothing_spline
+
+    _, places, values = merged(near, x, np.log(modulus))
+    return np.exp(make_smoothing_spline(places, values, counts)(x))
+
+
 #: Standard deviation of ln(deviation / modulus) about a smooth curve above which deviations are those of few repeats:
 #: the deviation of five has 0.4, of three 0.64. Fewest points, and degree of the polynomial that replaces them.
 _FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
@@ -154,10 +181,12 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     x = np.log(omega)
     if len(np.unique(x)) < max(_POINTS, len(x)):
         return sd
-    part = np.log(sd / modulus)
-    if distance_from_smooth(x, part) < _FEW_REPEATS:
-        return sd
-    smooth = modulus * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
+    part, curve = np.log(sd / modulus), smooth_modulus(omega, modulus)
+    off = distance_from_smooth(x, part)
+    if off < _FEW_REPEATS:
+        # Deviations in percent of the measured moduli have the noise of these: they are parts of the curve.
+        return sd * curve / modulus if off < 0.5 * distance_from_smooth(x, np.log(sd)) else sd
+    smooth = curve * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
     return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # squares of deviations are right on average
 
 

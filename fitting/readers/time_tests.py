@@ -216,6 +216,8 @@ def _as_a_step(path, time, modulus, ramp):
     """Times, a driven strain (or stress) of 1 that is reached at once or over a ramp, and answers."""
     if not (np.isfinite(ramp) and ramp >= 0):
         raise InputError(f"{path}: --ramp {ramp:g} cannot be the seconds of a ramp; give 0 or more")
+    if ramp > time[-1]:
+        raise InputError(f"{path}: --ramp {ramp:g} ends after the last row at {time[-1]:g} s; give its seconds")
     kept = time > 0
     times = np.unique(np.concatenate([[0.0], time[kept], [ramp] if ramp else []]))
     answer = np.full(len(times), np.nan)

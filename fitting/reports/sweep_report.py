@@ -58,7 +58,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "converged": fit.converged,
         "modes": n,
         "shear_modulus": float(fit.model.shear_modulus),
-        "equilibrium_modulus": max(0.0, float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))),
+        "equilibrium_modulus": _modulus_at_rest(fit),
         "ratios": fit.model.ratios.tolist(),
         "relaxation_times": fit.model.relaxation_times.tolist(),
         "standard_errors": {
@@ -84,6 +84,12 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "compile_time_s": fit.compile_time,
         "details": fit.details,
     }
+
+
+def _modulus_at_rest(fit: Fit) -> float:
+    """G0 (1 - sum g) [Pa]; exactly 0 for a fluid, whose ratios add up to 1."""
+    rest = float(1 - fit.model.ratios.sum())
+    return 0.0 if fit.kind.name == "prony_fluid" else max(0.0, float(fit.model.shear_modulus) * rest)
 
 
 def ends_of_interval(details: Content) -> list[float] | None:
@@ -360,16 +366,19 @@ def _parameter_rows(fit: Fit) -> list[str]:
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
-    equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
-    decided = edges.moved(fit)
+    decided, equilibrium = edges.moved(fit), _modulus_at_rest(fit)
 
     def mark(name):
         return "*" if name in decided else " "
 
     whole = total_error.total_errors(fit)
+    error = equilibrium_error(u)
+    rest = (
+        f"{equilibrium:9.4g} ± {error:.2g} Pa {mark('equilibrium_modulus')}" if np.isfinite(error) else "0 Pa (a fluid)"
+    )
     rows = [
         f"G0    {u.values[0]:9.4g} ± {u.standard_errors[0]:.2g} Pa {mark('shear_modulus')}",
-        f"G_inf {equilibrium:9.4g} ± {equilibrium_error(u):.2g} Pa {mark('equilibrium_modulus')}",
+        f"G_inf {rest}",
         "",
         f"{'mode':4s} {'ratio [1]':>20s} {'relaxation time [s]':>22s}",
     ]
@@ -395,11 +404,11 @@ def _lines(fit: Fit) -> list[str]:
         mark = " *" if key in decided else ""
         return f"{name:5s} {value:11.5g} ± {error:<9.2g} {unit:2s}{mark}".rstrip()
 
-    equilibrium = float(fit.model.shear_modulus * (1 - fit.model.ratios.sum()))
-    rows = [
-        row("G0", u.values[0], u.standard_errors[0], "Pa", "shear_modulus"),
-        row("G_inf", equilibrium, equilibrium_error(u), "Pa", "equilibrium_modulus"),
-    ]
+    rows = [row("G0", u.values[0], u.standard_errors[0], "Pa", "shear_modulus")]
+    if np.isfinite(equilibrium_error(u)):
+        rows.append(row("G_inf", _modulus_at_rest(fit), equilibrium_error(u), "Pa", "equilibrium_modulus"))
+    else:
+        rows.append("G_inf           0 Pa, a fluid")
     for i in range(n):
         rows.append(row(f"g{i + 1}", u.values[1 + i], u.standard_errors[1 + i], "", f"ratios[{i}]"))
         time = f"relaxation_times[{i}]"

@@ -1,6 +1,8 @@
 """How a command ends: its exit code, and one sentence on the error that stopped it."""
 
 import argparse
+import errno
+import io
 import os
 import sys
 import time
@@ -26,6 +28,8 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         begin = time.time()
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="replace")  # a terminal that does not know "±" shows "?"
         try:
             with program_cache.kept_on_disk():
                 code = run(options)
@@ -40,6 +44,11 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
         except BrokenPipeError:  # the reader of a pipe has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            print(f"error: {error.strerror}: what was written last is not whole; make room and repeat", file=sys.stderr)
+            return 2
 
 
 def _tell_of_earlier_files(options: argparse.Namespace, begin: float) -> None:

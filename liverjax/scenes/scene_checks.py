@@ -34,6 +34,7 @@ def check_before_run(scene: Scene) -> None:
     check_known_nodes(scene)
     check_moved_where_fixed(scene)
     check_plates_alone(scene)
+    check_normals(scene)
 
 
 def check_time_and_mass(scene: Scene) -> None:

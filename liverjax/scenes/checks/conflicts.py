@@ -56,21 +56,34 @@ def check_plates_alone(scene: Scene) -> None:
 
 
 def check_normals(scene: Scene) -> None:
-    """Refuse a node in two oblique planes, or held along some but not all axes of its plane's normal."""
+    """Refuse a node in two planes given by normals, or held along some but not all axes of its plane's normal; traced
+    arrays pass.
+    """
+    slides = [(name, physics) for name, physics in named_physics(scene) if isinstance(physics, SlidingSupport)]
+    nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]
+    if all(slide.axis for _, slide in slides) or any(isinstance(n, jax.core.Tracer) for n in nodes):
+        return
     taken: dict[int, str] = {}
     mask = free_places(scene.mesh, scene.fixed, scene.displaced)
-    for physics in scene.physics:
-        if isinstance(physics, SlidingSupport) and physics.axis:
+    for _, physics in slides:
+        if physics.axis:
             mask[np.asarray(physics.nodes), AXES.index(physics.axis)] = False
-    for name, physics in named_physics(scene):
-        if not isinstance(physics, SlidingSupport) or physics.axis:
+    for name, physics in slides:
+        if physics.axis or isinstance(physics.normal, jax.core.Tracer):
             continue
         across = np.abs(np.asarray(physics.normal)) > 1e-12
         for node in np.asarray(physics.nodes).tolist():
             other = taken.setdefault(node, name)
-            if other != name or 0 < mask[node, across].sum() < across.sum():
-                held = f"{other} and {name} both hold" if other != name else f"{name} and a held axis both hold"
-                raise InputError(f"{held} node {node}, in directions that are not at right angles: make places differ")
+            if other != name:
+                raise InputError(
+                    f"{other} and {name} both hold node {node}, and a node slides in one plane given by its normal: "
+                    "turn the body so that planes are across x, y or z, or make places differ"
+                )
+            if 0 < mask[node, across].sum() < across.sum():
+                raise InputError(
+                    f"{name} and a held axis both hold node {node}, in directions that are not at right angles: make "
+                    "places differ"
+                )
 
 
 def check_prescribed_once(scene: Scene) -> None:
