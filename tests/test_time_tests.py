@@ -228,6 +228,7 @@ BAD = {
         "--ramp 1 is for a file without",
     ),
     "late": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "5"], "2 usable answers are left"),
+    "early": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--min-time", "-1"], "--min-time -1 cannot be seconds after"),
     "modes": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--modes", "9"], "--modes 9 is out of range"),
     "radius": ("time_s,relaxation_modulus_Pa\n" + ROWS, ["--radius", "4"], "--radius 4 cannot be"),
 }

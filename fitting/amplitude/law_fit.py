@@ -15,6 +15,7 @@ from fitting.fits.stress_stretch import STARTS, Candidate, LawFit, assessed
 from fitting.methods.generalised_maxwell import Maxwell, moduli
 from fitting.methods.least_squares import levenberg_marquardt
 from fitting.readers.curves import Curve
+from fitting.readers.frequency_sweep import smooth_curve
 from liverjax.core.errors import InputError
 from liverjax.laws import Law
 
@@ -74,6 +75,8 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
     r = cycle.reading(sweep.strain, memories, plates)
     measured = sweep.storage + 1j * sweep.loss
     scale = float(np.abs(measured[0]) / np.abs(memories[0, 1]))
+    # Relative to each measured modulus itself, points that are low by chance would weigh most.
+    sizes = smooth_curve(sweep.strain, np.abs(measured)) * np.exp(1j * np.angle(measured))
 
     def model(u: jax.Array) -> tuple[jax.Array, jax.Array]:
         values = own.values(u, scale)
@@ -81,8 +84,8 @@ def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: st
         return cycle.first_and_third(own.law(values), r, shares)
 
     def residuals(u: jax.Array) -> jax.Array:
-        ratio = model(u)[0] / measured - 1
-        return jnp.concatenate([ratio.real, ratio.imag])
+        part = (model(u)[0] - measured) / sizes
+        return jnp.concatenate([part.real, part.imag])
 
     begin = time.perf_counter()
     points = jnp.asarray(own.random(np.random.default_rng(0), STARTS))

@@ -20,7 +20,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     command.add_argument("law", metavar="LAW", help="name of a law, FILE.py:LAW of your own, or all")
     command.add_argument("files", type=Path, nargs="+", metavar="CURVES.csv", help="F11 … P33, or test, stretch, …")
     command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
-    command.add_argument("--unit", choices=("Pa", "kPa", "MPa"), default="Pa", help="for stress columns without unit")
+    command.add_argument("--unit", choices=("Pa", "kPa", "MPa"), help="for stress columns without unit (default: Pa)")
     command.add_argument(
         "--out", type=Path, default=Path("curves"), metavar="DIR", help="folder of the results (default curves)"
     )
@@ -38,7 +38,9 @@ def run(options: argparse.Namespace) -> int:
 
     shared_options.refuse_copies(options.files)
     candidates = stress_stretch.candidates(options.law, options.terms)
-    found, notes = curves.read_curves(options.files, options.unit)
+    found, notes = curves.read_curves(options.files, options.unit or "Pa")
+    if options.unit and not any("names no unit" in note for note in notes):
+        notes.append(f"--unit {options.unit} changes nothing: the stress columns name their unit")
     if options.law == "all":
         left = [n for n in laws.LAWS if not stress_stretch.incompressible_form(n)]
         notes.append(f"left out, because they are not an isochoric energy plus U(J): {', '.join(left)}")

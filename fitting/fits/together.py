@@ -85,7 +85,7 @@ def reported_numbers(test: Measured) -> tuple[tuple, np.ndarray, np.ndarray]:
         return (test.angular_frequency,), np.concatenate([test.storage, test.loss]), np.concatenate(test.deviations)
     if isinstance(test, Dispersion):
         measured = test.measured
-        return (test.angular_frequency, test.density, np.arange(len(measured))), measured, measured
+        return (test.angular_frequency, test.density, np.arange(len(measured))), measured, test.scales
     at, driven, rows, answer, scales = time_tests.data_in_time(test)
     return (at, driven, rows), answer, scales
 

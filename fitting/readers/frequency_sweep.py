@@ -43,7 +43,7 @@ class Sweep(NamedTuple):
         Deviations that are themselves estimates from few repeats are smoothed.
         """
         omega, pairs = self.angular_frequency, ((self.storage, self.storage_sd), (self.loss, self.loss_sd))
-        first, second = (smooth_modulus(omega, m) if sd is None else smooth_deviations(omega, m, sd) for m, sd in pairs)
+        first, second = (smooth_curve(omega, m) if sd is None else smooth_deviations(omega, m, sd) for m, sd in pairs)
         return first, second
 
     @property
@@ -137,27 +137,29 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
 _NEAR, _PLACES = 0.01, 5
 
 
-def smooth_modulus(omega: np.ndarray, modulus: np.ndarray) -> np.ndarray:
-    """A smooth curve through moduli (n,) at frequencies (n,): a spline of logarithms, smoothed by cross-validation.
+def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A smooth curve through positive numbers y (n,) over positive x (n,), as moduli over frequencies: a spline of the
+    logarithms, smoothed by cross-validation.
 
-    It is the scale of relative errors. Were it the measured modulus itself, a point that is low by chance would have
+    It is the scale of relative errors. Were it the measured number itself, a point that is low by chance would have
     more weight than one that is high, and the fit would be too low by twice the square of the relative noise.
     """
-    return _curve_of_bytes(np.asarray(omega, float).tobytes(), np.asarray(modulus, float).tobytes())
+    return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
 
 @lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
 def _curve_of_bytes(*columns: bytes) -> np.ndarray:
-    """`smooth_modulus` of the bytes of its columns."""
-    omega, modulus = (np.frombuffer(column) for column in columns)
-    x, near = np.log(omega), np.round(np.log(omega) / _NEAR)
+    """`smooth_curve` of the bytes of its columns."""
+    x, y = (np.frombuffer(column) for column in columns)
+    at = np.log(x)
+    near = np.round(at / _NEAR)
     counts = np.bincount(np.unique(near, return_inverse=True)[1])
     if len(counts) < _PLACES:
-        return modulus
+        return y
     from scipy.interpolate import make_smoothing_spline
 
-    _, places, values = merged(near, x, np.log(modulus))
-    return np.exp(make_smoothing_spline(places, values, counts)(x))
+    _, places, values = merged(near, at, np.log(y))
+    return np.exp(make_smoothing_spline(places, values, counts)(at))
 
 
 #: Standard deviation of ln(deviation / modulus) about a smooth curve above which deviations are those of few repeats:
@@ -181,7 +183,7 @@ def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     x = np.log(omega)
     if len(np.unique(x)) < max(_POINTS, len(x)):
         return sd
-    part, curve = np.log(sd / modulus), smooth_modulus(omega, modulus)
+    part, curve = np.log(sd / modulus), smooth_curve(omega, modulus)
     off = distance_from_smooth(x, part)
     if off < _FEW_REPEATS:
         # Deviations in percent of the measured moduli have the noise of these: they are parts of the curve.

@@ -85,6 +85,8 @@ def read_time_test(
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.
     """
+    if not (np.isfinite(start) and start >= 0):
+        raise InputError(f"--min-time {start:g} cannot be seconds after the load: give 0 or more")
     columns, notes = read_columns(path)
     time = columns["time"]
     form = next((f for f in FORMS if set(f) <= set(columns)), None)

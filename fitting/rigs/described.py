@@ -187,6 +187,8 @@ def _description(path: Path) -> Described:
     if drive not in _KINDS:
         raise InputError(f"{path}: drive = {drive!r} is not known: use displacement or force")
     first = _number_of(path, "min_time", table.get("min_time", 0.0))
+    if first < 0:
+        raise InputError(f"{path}: min_time = {first:g} cannot be seconds after the load: give 0 or more")
     ramp = table.get("ramp")
     if ramp is not None and _number_of(path, "ramp", ramp) != 0:
         raise InputError(f"{path}: ramp = {ramp} is in the rows already: leave it out, or give 0 for a step at 0 s")

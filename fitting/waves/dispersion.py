@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fitting.readers.frequency_sweep import smooth_curve
 from fitting.readers.tables.text_tables import split_line, text_of, to_number
 from fitting.readers.units import WAVE_UNITS
 from fitting.waves.shear_waves import DENSITY
@@ -45,6 +46,12 @@ class Dispersion(NamedTuple):
     def measured(self) -> np.ndarray:
         """Velocities, then attenuations if they were measured."""
         return self.velocity if self.attenuation is None else np.concatenate([self.velocity, self.attenuation])
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Smooth curves through the measured numbers, to which their errors are relative."""
+        columns = [self.velocity] if self.attenuation is None else [self.velocity, self.attenuation]
+        return np.concatenate([smooth_curve(self.angular_frequency, column) for column in columns])
 
 
 def names_velocities(path: str | os.PathLike) -> bool:
