@@ -314,8 +314,10 @@ def test_what_cannot_be_is_refused(changes, words):
     "region",
     [
         {"law": {"mu": 9000.0}},
-        {"law": {"name": "yeoh", "c1": 4500.0, "c2": 100.0, "c3": 10.0, "bulk": 90000.0}},
-        {"viscosity": {"ratios": [0.1]}},
+        pytest.param(
+            {"law": {"name": "yeoh", "c1": 4500.0, "c2": 100.0, "c3": 10.0, "bulk": 90000.0}}, marks=pytest.mark.slow
+        ),
+        pytest.param({"viscosity": {"ratios": [0.1]}}, marks=pytest.mark.slow),
     ],
     ids=["numbers", "law", "viscosity"],
 )

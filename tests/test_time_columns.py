@@ -1,9 +1,12 @@
 """Columns of tests in time: headings of other programs, quantities of tension, several tables, the other kind."""
 
+import json
+
 import numpy as np
 import pytest
 from test_time_tests import write
 
+from fitting.__main__ import main
 from fitting.readers.tables.time_columns import read_columns
 from fitting.readers.time_tests import read_time_test
 
@@ -112,3 +115,18 @@ def test_a_file_of_the_other_kind_is_told(kind, tmp_path):
     assert not any("python -m fitting" in note for note in read_time_test(steady, "relaxation").notes)
     assert any("python -m fitting" in note for note in read_time_test(other, kind).notes)
     assert not any("python -m fitting" in note for note in read_time_test(own, kind).notes)
+
+
+@pytest.mark.parametrize("sizes", [(), ("--radius", "0.004", "--height", "0.002")])
+def test_errors_of_a_test_in_time_contain_the_size_of_the_sample(sizes, tmp_path):
+    """50 um of 4 mm or 2 mm, and four times 10 um of the radius; ratios and times do not feel it."""
+    t = np.geomspace(0.01, 100, 40)
+    noisy = (500 + 300 * np.exp(-t)) * (1 + 0.002 * np.random.default_rng(0).standard_normal(40))
+    file = write(tmp_path / "t.csv", "time_s,relaxation_modulus_Pa", t, noisy)
+    assert main(["relaxation", str(file), *sizes, "--modes", "1", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "fit.json").read_text())
+    total, noise = found["total_errors"], found["standard_errors"]
+    size = np.hypot(50e-6 / 0.002, 40e-6 / 0.004) if sizes else np.hypot(50e-6 / 0.004, 40e-6 / 0.010)
+    for name in ("shear_modulus", "equilibrium_modulus"):
+        assert total[name] == pytest.approx(np.hypot(size * found[name], noise[name]), rel=1e-6)
+    assert total["ratios"] == noise["ratios"] and total["relaxation_times"] == noise["relaxation_times"]

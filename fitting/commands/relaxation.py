@@ -92,6 +92,8 @@ def _said_of_rows(test: "TimeTest") -> list[str]:
 def run(options: argparse.Namespace) -> int:
     """Fit the test; exit code 1 if the fit did not converge."""
     from fitting.fits.families import springpots_in_time as fits
+    from fitting.fits.honesty import total_error
+    from fitting.fits.simulated_rheometer import Simulation
     from fitting.readers import time_tests as reader
     from fitting.reports import time_report
     from liverjax.core.files import writable
@@ -115,6 +117,10 @@ def run(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     writable(out, ("fit.json", "fit.png"))
     found = fits.choose_in_time(test, options.model, options.modes)
+    if options.file.suffix.lower() != ".toml":  # of a described rig the sizes act otherwise
+        default = Simulation()
+        rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
+        found.details["geometry_error"] = total_error.of_geometry(rig, None)
     posterior = None
     if options.samples:
         from fitting.fits.posterior import of_time_test

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fitting.fits.families import limits
+from fitting.fits.honesty import total_error
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.posterior import Posterior
 from fitting.fits.time_tests import TimeFit
@@ -14,7 +15,7 @@ from fitting.methods import time_response
 from fitting.methods.uncertainty import equilibrium_error
 from fitting.readers.time_tests import TimeTest
 from fitting.reports import posterior_report
-from fitting.reports.sweep_report import ends_of_interval, numbers, own_numbers, own_rows
+from fitting.reports.sweep_report import by_stem, ends_of_interval, numbers, own_numbers, own_rows
 from liverjax.core.plotting import BLUE, GREY, ORANGE, pyplot, save
 from liverjax.core.struct import Content
 from liverjax.core.versions import versions
@@ -62,12 +63,24 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             "notes": list(test.notes),
             "versions": versions(),
             **own_numbers(fit.parameters, fit.kind),
+            **_total_errors_in_time(fit),
             **sampled,
         }
     )
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
     save(figure(test, fit), out / "fit.png")
     return content
+
+
+def _total_errors_in_time(fit: TimeFit) -> Content:
+    """Errors by noise, by the size of the sample and by long times; nothing for a rig that a file describes."""
+    if "geometry_error" not in fit.details:
+        return {}
+    shares = total_error.error_shares(fit)
+    return {
+        "total_errors": by_stem(total_error.root_of_squares(shares)),
+        "error_shares": {source: by_stem(part) for source, part in shares.items()},
+    }
 
 
 def _equilibrium_in_time(fit: TimeFit) -> float:
@@ -92,6 +105,10 @@ def _rows_of_modes(fit: TimeFit) -> list[str]:
     rows.append(f"G0    {u.values[0]:11.5g} ± {u.standard_errors[0]:<9.2g} Pa")
     if fit.kind.name == "prony":
         rows.append(f"G_inf {_equilibrium_in_time(fit):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
+    if "geometry_error" in fit.details:
+        whole = total_error.total_errors(fit)
+        for k, name in enumerate(n for n in ("shear_modulus", "equilibrium_modulus") if n in whole):
+            rows[k] += f" total ± {whole[name]:.2g}"
     for k in range(n):
         rows.append(f"g{k + 1:<4d} {u.values[1 + k]:11.5g} ± {u.standard_errors[1 + k]:<9.2g}".rstrip())
         rows.append(f"tau{k + 1:<2d} {u.values[1 + n + k]:11.5g} ± {u.standard_errors[1 + n + k]:<9.2g} s")

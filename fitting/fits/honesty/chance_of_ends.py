@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import scipy.special
 
+from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, Fit
 from fitting.methods import uncertainty
 from fitting.methods.estimate import with_slope
@@ -37,7 +38,7 @@ def moved_by_noise(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float]
     return dict(zip(names, np.linalg.norm(change, axis=1).tolist(), strict=True))
 
 
-def farthest_by_chance(fit: Fit, numbers: int) -> float:
+def farthest_by_chance(fit: Fit | TimeFit, numbers: int) -> float:
     """Quantile of Student's t that the largest of the changes at two ends exceeds by chance in `CHANCE` of fits.
 
     Args:

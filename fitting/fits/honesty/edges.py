@@ -7,6 +7,7 @@ import numpy as np
 from fitting.fits import viscoelastic
 from fitting.fits.honesty import chance_of_ends
 from fitting.fits.honesty.long_times import with_interval
+from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
 from fitting.methods import generalised_maxwell, host, kramers_kronig, relaxation_spectrum, springpots
 from fitting.methods.generalised_maxwell import Spectrum
@@ -87,7 +88,7 @@ def _points_left(sweep: Sweep) -> dict[str, np.ndarray]:
     return dict(zip(PARTS, kept, strict=True))
 
 
-def values(fit: Fit) -> dict[str, tuple[float, float]]:
+def values(fit: Fit | TimeFit) -> dict[str, tuple[float, float]]:
     """Parameters that are compared, with their standard errors, by the names of the report."""
     from fitting.methods.uncertainty import equilibrium_error
 
@@ -106,7 +107,7 @@ def moved(fit: Fit) -> set[str]:
     return {name for part in PARTS for name in decided_by(fit, part)}
 
 
-def decided_by(fit: Fit, part: str) -> dict[str, float]:
+def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
     """Parameters that change without one of the `PARTS`, by more than their standard error and by more than noise
     explains: the change over the larger of the two.
     """
@@ -125,11 +126,9 @@ def _change(fit: Fit, sweep: Sweep, kept: np.ndarray) -> dict[str, float] | None
     """New values minus old ones of a fit to the points kept."""
     if len(np.unique(sweep.angular_frequency[kept])) <= max(2, len(fit.solution.u) // 2 + 1):
         return None
-    # The points left keep the weights that they had among all: deviations are smoothed once.
-    if sweep.storage_sd is not None:
-        storage_sd, loss_sd = sweep.deviations
-        sweep = sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd)
-    part = some(sweep, kept)
+    # The points left keep the weights that they had among all: curves and deviations are smoothed once.
+    storage_sd, loss_sd = sweep.deviations
+    part = some(sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd), kept)
     old = {name: value for name, (value, _) in values(fit).items()}
     if fit.kind.effective is not None:
         found = fit.details["spectrum"]

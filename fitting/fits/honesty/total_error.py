@@ -9,6 +9,7 @@ import numpy as np
 from fitting.fits.honesty import edges
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.simulated_rheometer import Simulation
+from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
 
 #: Usual standard deviations [m] of the gap that an instrument states, and of the radius of the plates.
@@ -24,7 +25,7 @@ def of_geometry(simulation: Simulation, gap_error: float | None) -> float:
     return float(np.hypot(gap, 4 * RADIUS / simulation.radius))
 
 
-def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
+def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
     The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
@@ -57,7 +58,7 @@ def error_shares(fit: Fit) -> dict[str, dict[str, float]]:
     return out
 
 
-def total_errors(fit: Fit) -> dict[str, float]:
+def total_errors(fit: Fit | TimeFit) -> dict[str, float]:
     """Root of the sum of the squares of `error_shares`, by the names of `edges.values`."""
     return root_of_squares(error_shares(fit))
 
@@ -67,13 +68,13 @@ def root_of_squares(shares: dict[str, dict[str, float]]) -> dict[str, float]:
     return {name: float(np.sqrt(sum(part[name] ** 2 for part in shares.values()))) for name in shares["noise"]}
 
 
-def _moduli(fit: Fit) -> set[str]:
+def _moduli(fit: Fit | TimeFit) -> set[str]:
     if fit.parameters is None:
         return {"shear_modulus", "equilibrium_modulus"}
     return {n for n, unit in zip(fit.kind.names, fit.kind.units, strict=True) if unit.startswith("Pa")}
 
 
-def _of_modes(fit: Fit, moved: np.ndarray) -> dict[str, float]:
+def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
     """Size of the changes `moved` (P,) of G0, ratios and times, and of that of the equilibrium modulus, by name."""
     n, G0, ratios = fit.modes, fit.uncertainty.values[0], fit.uncertainty.values[1 : fit.modes + 1]
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
