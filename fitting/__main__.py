@@ -3,7 +3,7 @@
 import importlib
 import sys
 
-from liverjax.commands.exit_codes import exit_code
+from liverjax.commands.exit_codes import exit_code, show_unknown_letters
 
 #: Names of the other commands; without one of them the command line is for a frequency sweep.
 COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude", "waves")
@@ -11,6 +11,7 @@ COMMANDS = ("curves", "field", "relaxation", "creep", "indentation", "amplitude"
 
 def main(arguments: list[str] | None = None, prog: str = "python -m fitting") -> int:
     """Entry point; returns the exit code: 0 done, 1 not converged, 2 unusable input."""
+    show_unknown_letters()
     arguments = sys.argv[1:] if arguments is None else arguments
     name = "sweep"
     if arguments[:1] and arguments[0] in COMMANDS:

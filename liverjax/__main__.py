@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from liverjax.commands import check, design, fit, laws, play, plot, reduce, simulate, sweep
-from liverjax.commands.exit_codes import exit_code
+from liverjax.commands.exit_codes import exit_code, show_unknown_letters
 
 
 def _parser(prog: str) -> argparse.ArgumentParser:
@@ -21,6 +21,7 @@ def _parser(prog: str) -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
     """Entry point; returns the exit code: 0 done, 1 failed, 2 unusable input."""
+    show_unknown_letters()
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["fit"]:
         return fit.run(arguments[1:], f"{prog} fit")

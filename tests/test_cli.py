@@ -286,6 +286,8 @@ def test_a_terminal_without_the_letter_and_a_full_disk(tmp_path):
     run = subprocess.run([*command, "--cards"], env=env, cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0 and "Traceback" not in run.stderr and "770 ? " in run.stdout
     assert (tmp_path / "cards").is_dir()
+    told = subprocess.run([*command[:3], "curves", "--help"], env=env, cwd=ROOT, capture_output=True, text=True)
+    assert told.returncode == 0 and "Traceback" not in told.stderr
     if not Path("/dev/full").exists():
         return
     with open("/dev/full", "w") as full:

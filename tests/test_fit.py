@@ -82,6 +82,10 @@ def test_scales_follow_the_curve_and_not_the_noise():
     assert all(np.allclose(a, b, rtol=1e-4) for a, b in zip(exact.deviations, (exact.storage, exact.loss), strict=True))
     few = s._replace(**{k: getattr(s, k)[:4] for k in ("angular_frequency", "storage", "loss")})
     assert np.array_equal(few.deviations[0], few.storage)
+    # A reading that is wrong by a factor is no better than none: it has its own size.
+    wrong = exact._replace(storage=exact.storage * np.where(np.arange(60) == 20, 30.0, 1.0))
+    assert wrong.deviations[0][20] == wrong.storage[20]
+    assert np.allclose(np.delete(wrong.deviations[0] / exact.storage, 20), 1, rtol=1e-3)
     # Points at one place, as of repeated sweeps, are one.
     again = s._replace(angular_frequency=np.repeat(s.angular_frequency[::3], 3) * np.tile([1, 1 + 1e-9, 1 + 1e-7], 20))
     assert np.all(np.isfinite(again.deviations))
@@ -359,6 +363,22 @@ def test_the_table_says_what_the_simulation_adds(coarse_torsion):
     assert by_rest > 1.1
     shift = simulated_rheometer.largest_shift(closed, simulated._replace(uncertainty=other))
     assert shift == pytest.approx(by_rest, rel=1e-9)
+
+
+def test_torsion_fit_says_when_discretisation_exceeds_the_error(coarse_torsion):
+    _, _, f = coarse_torsion
+    assert warned(f, "discretisation moves it by")
+
+
+def test_the_biases_are_what_simulated_and_closed_form_differ_by(coarse_torsion):
+    """Same data, same model: only mesh, time steps and finite strain differ, and the last is below 1e-5 here."""
+    _, closed, f = coarse_torsion
+    u = f.uncertainty
+    moved = u.values - closed.uncertainty.values
+    assert np.abs(u.time_step_bias / u.values).max() > 1e-4
+    # First order in moves of a thousandth; finite strain moves a parameter by up to 1e-4 of its error.
+    left = np.abs(moved - u.mesh_bias - u.time_step_bias)
+    assert np.all(left < 0.05 * np.abs(u.time_step_bias) + 1e-3 * u.standard_errors)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.commands import reduce
 from liverjax.core.struct import replace
+from liverjax.mesh.nodal import nodal_volumes
 from liverjax.reduced import training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, refuse_unseen_numbers, solid_at_points, with_all_points
@@ -40,7 +41,8 @@ def _every_motion(scene: lj.Scene) -> jax.Array:
     """One mode a free degree of freedom."""
     held = [*scene.fixed, *scene.displaced]
     free = lj.boundary.free_degrees(scene.mesh, tuple(held), ())
-    return jnp.asarray(np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape))
+    modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
+    return jnp.asarray(modes / np.sqrt(np.asarray(nodal_volumes(scene.mesh)))[:, None])  # orthonormal with them
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core.struct import replace
 from liverjax.jobs import reduction
-from liverjax.mesh.nodal import integrals
+from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.porosity import Inlet
 from liverjax.reduced import step, training
 from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points
@@ -47,6 +47,7 @@ def _whole(scene: lj.Scene) -> lj.ReducedModel:
     mesh = scene.mesh
     free = lj.boundary.free_degrees(mesh, scene.fixed, ())
     modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
+    modes = modes / np.sqrt(np.asarray(nodal_volumes(mesh)))[:, None]  # orthonormal with these volumes
     unknown = np.setdiff1d(np.arange(mesh.number_of_vertices), np.asarray(scene.porosity.drained))
     volumes = np.asarray(integrals(mesh, jnp.ones_like(mesh.weights)))
     pressures = np.eye(mesh.number_of_vertices)[unknown] / np.sqrt(volumes[unknown])[:, None]

@@ -13,6 +13,7 @@ from liverjax.jobs.reactions import reaction_table
 from liverjax.mesh.tetrahedra import with_points
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.sliding_support import SlidingSupport, on_plane
+from liverjax.scenes.scene_checks import check_before_run
 from liverjax.scenes.scene_file import scene_from
 
 pytestmark = pytest.mark.quick_to_compile
@@ -257,3 +258,13 @@ def test_two_planes_given_by_normals_share_no_node(run):
     scene = replace(pulled(mesh, [0.0, 0.0, 10.0]), fixed=(), physics=slides)
     with pytest.raises(InputError, match="slides in one plane given by its normal"):
         run(scene)
+    unknown = replace(scene, physics=(replace(slides[0], nodes=jnp.array([0, 9999])), slides[1]))
+    with pytest.raises(InputError, match=r"support\.0\.nodes"):
+        run(unknown)
+
+    # Directions that a derivative is asked for pass the check.
+    def passed(normal):
+        check_before_run(replace(scene, physics=(replace(slides[0], normal=normal), slides[1])))
+        return normal
+
+    jax.eval_shape(passed, slides[0].normal)

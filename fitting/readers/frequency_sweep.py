@@ -133,16 +133,20 @@ def distances_from_polynomials(x: np.ndarray, y: np.ndarray, m: int) -> np.ndarr
     return np.array(left)
 
 
-#: Points nearer than this in the logarithm of the frequency are one place of a smooth curve; it needs so many places.
-_NEAR, _PLACES = 0.01, 5
+#: Points nearer than this in the logarithm of x are one place of a smooth curve; it needs so many places, and has at
+#: most about `_MOST` of them.
+_NEAR, _PLACES, _MOST = 0.01, 5, 400
+#: A point is far from the curve beyond this logarithm, and beyond so many robust deviations.
+_FAR, _DEVIATIONS = 0.4, 5.0
 
 
 def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """A smooth curve through positive numbers y (n,) over positive x (n,), as moduli over frequencies: a spline of the
-    logarithms, smoothed by cross-validation.
+    logarithms, smoothed by cross-validation. Where a number is far above the curve, it is the number itself.
 
-    It is the scale of relative errors. Were it the measured number itself, a point that is low by chance would have
-    more weight than one that is high, and the fit would be too low by twice the square of the relative noise.
+    It is the scale of relative errors. Were it the measured number everywhere, a point that is low by chance would have
+    more weight than one that is high, and the fit would be too low by twice the square of the relative noise. A point
+    that is far above by mistake has its own size as scale, so that it does not decide the fit.
     """
     return _curve_of_bytes(np.asarray(x, float).tobytes(), np.asarray(y, float).tobytes())
 
@@ -150,21 +154,46 @@ def smooth_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=64)  # a fit asks for the weights of the same sweep again and again
 def _curve_of_bytes(*columns: bytes) -> np.ndarray:
     """`smooth_curve` of the bytes of its columns."""
-    x, y = (np.frombuffer(column) for column in columns)
-    at = np.log(x)
-    near = np.round(at / _NEAR)
-    counts = np.bincount(np.unique(near, return_inverse=True)[1])
-    if len(counts) < _PLACES:
-        return y
     from scipy.interpolate import make_smoothing_spline
 
-    _, places, values = merged(near, at, np.log(y))
-    return np.exp(make_smoothing_spline(places, values, counts)(at))
+    x, y = (np.frombuffer(column) for column in columns)
+    at, values, counts = _cells_along(np.log(x), np.log(y))
+    if len(at) < _PLACES:
+        return y
+    far = _far_from_neighbours(values)
+    kept = ~far if np.sum(~far) >= _PLACES else np.ones(len(at), bool)
+    curve = make_smoothing_spline(at[kept], values[kept], counts[kept])(np.log(x))
+    off = np.log(y) - curve
+    scale = np.where(off > max(_FAR, _DEVIATIONS * 1.4826 * float(np.median(np.abs(off)))), y, np.exp(curve))
+    scale.setflags(write=False)  # the next caller gets the same array
+    return scale
+
+
+def _cells_along(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means of points (n,) in cells along x, ascending, and their numbers; neighbours across a border are one."""
+    near = max(_NEAR, float(np.ptp(x)) / _MOST)
+    cell = np.round(x / near)
+    for _ in range(2):
+        counts = np.bincount(np.unique(cell, return_inverse=True)[1])
+        _, at, values = merged(cell, x, y)
+        number = np.cumsum(np.append(0, np.diff(at) > 0.1 * near))
+        cell = number[np.unique(cell, return_inverse=True)[1]]
+    return at, values, counts
+
+
+def _far_from_neighbours(y: np.ndarray) -> np.ndarray:
+    """Which logarithms (n,) are far from the median of the five around them."""
+    from scipy.ndimage import median_filter
+
+    off = np.abs(y - median_filter(y, size=5, mode="nearest"))
+    return off > max(_FAR, _DEVIATIONS * 1.4826 * float(np.median(off)))
 
 
 #: Standard deviation of ln(deviation / modulus) about a smooth curve above which deviations are those of few repeats:
 #: the deviation of five has 0.4, of three 0.64. Fewest points, and degree of the polynomial that replaces them.
 _FEW_REPEATS, _POINTS, _DEGREE = 0.25, 8, 2
+#: Deviations whose part of the modulus differs by less than this were computed from one percentage.
+_ROUNDED = 0.01
 
 
 def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) -> np.ndarray:
@@ -180,13 +209,14 @@ def smooth_deviations(omega: np.ndarray, modulus: np.ndarray, sd: np.ndarray) ->
 def _smooth_of_bytes(*columns: bytes) -> np.ndarray:
     """`smooth_deviations` of the bytes of its columns."""
     omega, modulus, sd = (np.frombuffer(column) for column in columns)
-    x = np.log(omega)
+    x, part, curve = np.log(omega), np.log(sd / modulus), smooth_curve(omega, modulus)
+    # Deviations in percent of the measured moduli have the noise of these: they are parts of the curve.
+    if np.ptp(part) < _ROUNDED:
+        return sd * curve / modulus
     if len(np.unique(x)) < max(_POINTS, len(x)):
         return sd
-    part, curve = np.log(sd / modulus), smooth_curve(omega, modulus)
     off = distance_from_smooth(x, part)
     if off < _FEW_REPEATS:
-        # Deviations in percent of the measured moduli have the noise of these: they are parts of the curve.
         return sd * curve / modulus if off < 0.5 * distance_from_smooth(x, np.log(sd)) else sd
     smooth = curve * np.exp(np.polyval(np.polyfit(x - x.mean(), part, _DEGREE), x - x.mean()))
     return smooth * np.sqrt(np.mean((sd / smooth) ** 2))  # squares of deviations are right on average

@@ -14,6 +14,12 @@ from liverjax.core import program_cache
 from liverjax.core.errors import InputError
 
 
+def show_unknown_letters() -> None:
+    """Show "?" for letters such as "±" that a terminal does not know; to be called before a command line is parsed."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
 def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namespace, resumable: bool = False) -> int:
     """Run a command; return its exit code, 2 for unusable input and 130 for Ctrl-C.
 
@@ -28,8 +34,6 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
         begin = time.time()
-        if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.reconfigure(errors="replace")  # a terminal that does not know "±" shows "?"
         try:
             with program_cache.kept_on_disk():
                 code = run(options)
@@ -47,7 +51,10 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
-            print(f"error: {error.strerror}: what was written last is not whole; make room and repeat", file=sys.stderr)
+            print(
+                f"error: {os.strerror(error.errno)}: what was written last is not whole; make room and repeat",
+                file=sys.stderr,
+            )
             return 2
 
 

@@ -106,8 +106,8 @@ def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
         u = prescribed(mesh, scene.displaced, time, k / solve.steps)
         return flat_gradient(mesh, mesh.points + u)[:, model.points]
 
-    if not scene.displaced:
-        return moved(jnp.zeros((), mesh.points.dtype))[None]
+    if not scene.displaced:  # no node has moved
+        return jnp.tile(jnp.eye(3, dtype=mesh.points.dtype).reshape(9, 1), len(model.points))[None]
     return jax.lax.map(moved, jnp.arange(1, solve.steps + 1, dtype=mesh.points.dtype))
 
 
@@ -121,8 +121,12 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
     fluid = None if scene.porosity is None else fluid_at_rest(model, scene)
     if scene.solve.kind != "dynamic" or scene.body is None:
         return q, memory, fluid, None, inverse, None
-    nodal = jnp.asarray(scene.body.density) * nodal_volumes(scene.mesh)
-    mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
+    density = jnp.asarray(scene.body.density)
+    if density.ndim == 0:  # the modes are orthonormal with the lumped volumes
+        mass = density * jnp.eye(n, dtype=q.dtype)
+    else:
+        nodal = density * nodal_volumes(scene.mesh)
+        mass = jnp.tensordot(model.modes * nodal[None, :, None], model.modes, axes=((1, 2), (1, 2)))
     newmark = scene.solve.integrator == "newmark"
     if newmark and fluid is not None and scene.porosity is not None and scene.porosity.initial_pressure is not None:
         load = load - _forces_of_fluid(model, scene, fluid)

@@ -27,7 +27,7 @@ def check_before_run(scene: Scene) -> None:
 
     Raises:
         InputError: as `check_choices` and `check_bounds`; nodes that are not in the mesh; elements without volume;
-            nodes that are fixed and moved along one axis, or held while a plate moves them.
+            nodes that are fixed and moved along one axis, held while a plate moves them, or in two oblique planes.
     """
     check_choices(scene)
     check_bounds(scene)

@@ -63,6 +63,9 @@ def check_normals(scene: Scene) -> None:
     nodes = [*(f.nodes for f in scene.fixed), *(d.nodes for d in scene.displaced), *(s.nodes for _, s in slides)]
     if all(slide.axis for _, slide in slides) or any(isinstance(n, jax.core.Tracer) for n in nodes):
         return
+    for name, slide in slides:
+        if not isinstance(slide.normal, jax.core.Tracer):
+            slide.check(scene.mesh, name)
     taken: dict[int, str] = {}
     mask = free_places(scene.mesh, scene.fixed, scene.displaced)
     for _, physics in slides:
@@ -77,7 +80,7 @@ def check_normals(scene: Scene) -> None:
             if other != name:
                 raise InputError(
                     f"{other} and {name} both hold node {node}, and a node slides in one plane given by its normal: "
-                    "turn the body so that planes are across x, y or z, or make places differ"
+                    "turn the body so that planes are across x, y or z, make places differ, or leave one out"
                 )
             if 0 < mask[node, across].sum() < across.sum():
                 raise InputError(
