@@ -257,6 +257,13 @@ def test_a_fluid_is_recovered_without_an_equilibrium_modulus():
     assert any("a fluid" in row for row in sweep_report._lines(f))
 
 
+def test_times_far_apart_do_not_overflow():
+    """Of a fit that runs away: NumPy's warning on an exponential meant nothing to a reader."""
+    with np.errstate(over="raise"):
+        model = generalised_maxwell.natural(np.array([0.0, 0.0, 0.0, 0.0, 900.0]))
+    assert model.relaxation_times[1] == 0.0
+
+
 def test_one_mode_of_a_fluid_leaves_nothing_free():
     """Its only ratio is 1 by definition; it had an infinite error, and the fluid was never chosen."""
     omega = np.geomspace(0.1, 100, 31)

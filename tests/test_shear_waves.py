@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fitting.__main__ import main
+from fitting.commands import sweep as sweep_command
 from fitting.fits import together
 from fitting.methods import generalised_maxwell
 from fitting.methods.generalised_maxwell import Maxwell
@@ -101,3 +102,20 @@ def test_waves_are_cut_to_the_band_as_sweeps_are():
     assert "6 waves outside" in cut.notes[-1] and dispersion.in_band(w, 0.0, None) is w
     with pytest.raises(InputError, match="2 waves lie in the band"):
         dispersion.in_band(w, None, HIGH[1] / (2 * np.pi))
+
+
+def test_errors_of_waves_are_relative_to_smooth_curves():
+    """Relative to each measured number, velocities that are low by chance would weigh most."""
+    noisy, exact = waves(0.2), waves(0.0)
+    assert np.allclose(exact.scales, exact.measured, rtol=1e-3)
+    off = [np.std(np.log(scales / exact.measured)) for scales in (noisy.scales, noisy.measured)]
+    assert off[0] < 0.7 * off[1]
+    assert np.array_equal(together.reported_numbers(noisy)[2], noisy.scales)
+
+
+def test_the_density_of_a_common_fit_needs_no_height():
+    """The default method written out: it was refused for the height that it does without."""
+    options = sweep_command.parser("fitting").parse_args(
+        ["sweep.csv", "--with", "waves.csv", "--density", "1060", "--method", "closed-form"]
+    )
+    sweep_command._check(options)
