@@ -345,6 +345,11 @@ ROWS: dict[str, tuple[str, Callable[[], str], str]] = {
         reduced.porous_came_out,
         "weighs its model against reduced bases and names no error",
     ),
+    "reduced_quadratic": (
+        "a reduced model of the viscous liver of quadratic elements: error, stated error and time a step",
+        reduced.quadratic_came_out,
+        "weighs its model against reduced bases and names no error",
+    ),
     "separated": (
         "the phantom at rest as a sum of products (proper generalised decomposition), beside a reduced basis",
         reduced.separated_came_out,
