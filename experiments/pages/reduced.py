@@ -192,7 +192,7 @@ def quadratic_words(r: dict, took: dict) -> str:
         f"factor 2 in {percent(r['within_factor_2'])}; the size of the correction is within a factor 2 of the "
         f"uncorrected error in {percent(r['change_within_factor_2'])}. With the motion of all nodes and its error "
         f"stated a step takes {took['answer_ms']:.2g} ms; a run takes {took['iterations_per_step']:.2g} iterations a "
-        "step. Times of steps are the processor's, of one core."
+        "step. Times of steps are the processor's, of one core; other work ran beside the training."
     )
 
 
