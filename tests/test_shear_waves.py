@@ -118,4 +118,4 @@ def test_the_density_of_a_common_fit_needs_no_height():
     options = sweep_command.parser("fitting").parse_args(
         ["sweep.csv", "--with", "waves.csv", "--density", "1060", "--method", "closed-form"]
     )
-    sweep_command._check(options)
+    assert sweep_command._check(options) is None  # no refusal

@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -271,23 +271,33 @@ def ratios(found: np.ndarray) -> dict[str, Any]:
     }
 
 
+def tip_of(scene: lj.Scene, names: Iterable[str]) -> Callable[[list, lj.ReducedModel], jax.Array]:
+    """A function to differentiate: squares of the last coordinates, of the values of some numbers.
+
+    The model is an argument: what a program is closed over, XLA computes with while it compiles.
+    """
+
+    def tip(values: list, model: lj.ReducedModel) -> jax.Array:
+        own = lj.with_parameters(scene, dict(zip(names, values, strict=True)))
+        return jnp.sum(lj.simulate_reduced(model, own).coordinates[-1] ** 2)
+
+    return tip
+
+
+def answer(scene: lj.Scene, model: lj.ReducedModel) -> tuple[jax.Array, jax.Array]:
+    """Motion of all nodes, and its stated error."""
+    found = lj.simulate_reduced(model, scene)
+    return lj.reduced_positions(model, scene, found), lj.stated_error(model, scene, found)
+
+
 def times(scene: lj.Scene, model: lj.ReducedModel) -> dict[str, Any]:
     """Milliseconds a step on one core: reduced run, its gradient, 64 at once, and the full run."""
     back, steps, small = one_core(), scene.solve.steps, loosely(scene)
     start = [jnp.asarray(v, float) for v in (715.0, 0.235, 0.27)]
 
-    # The model is an argument: what a program is closed over, XLA computes with while it compiles.
-    def tip(values: list, model: lj.ReducedModel) -> jax.Array:
-        own = lj.with_parameters(small, dict(zip(NAMES, values, strict=True)))
-        return jnp.sum(lj.simulate_reduced(model, own).coordinates[-1] ** 2)
-
+    tip = tip_of(small, NAMES)
     lanes = [jnp.linspace(0.9, 1.1, 64) * v for v in start]
     result, run = timed(lambda s, model: lj.simulate_reduced(model, s), small, model, rounds=9)
-
-    def answer(s: lj.Scene, model: lj.ReducedModel) -> tuple[jax.Array, jax.Array]:
-        found = lj.simulate_reduced(model, s)
-        return lj.reduced_positions(model, s, found), lj.stated_error(model, s, found)
-
     _, whole = timed(answer, small, model, rounds=9)
     _, plain = timed(tip, start, model, rounds=9)
     _, gradient = timed(jax.value_and_grad(tip), start, model, rounds=9)

@@ -92,11 +92,7 @@ def times(scene: lj.Scene, model: lj.ReducedModel) -> dict:
     """Milliseconds a step on one core: reduced run, its gradient, many lanes, and the full run."""
     back, steps, small = one_core(), scene.solve.steps, loosely(scene)
     start = [jnp.asarray(v, float) for v in (715.0, 2e-5)]
-
-    def tip(values: list, model: lj.ReducedModel) -> jax.Array:
-        own = lj.with_parameters(small, dict(zip(("law.mu", "porosity.permeability"), values, strict=True)))
-        return jnp.sum(lj.simulate_reduced(model, own).coordinates[-1] ** 2)
-
+    tip = reduced.tip_of(small, ("law.mu", "porosity.permeability"))
     result, run = processor_s(lambda s, model: lj.simulate_reduced(model, s), small, model, rounds=15)
     _, plain = processor_s(tip, start, model, rounds=15)
     _, gradient = processor_s(jax.value_and_grad(tip), start, model, rounds=9)

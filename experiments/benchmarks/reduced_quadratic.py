@@ -61,17 +61,9 @@ def times(scene: lj.Scene, model: lj.ReducedModel) -> dict[str, float]:
     """Milliseconds a step on one core: reduced run, with the motion of all nodes and its error, gradient, full run."""
     back, steps, small = one_core(), scene.solve.steps, loosely(scene)
     start = [jnp.asarray(v, float) for v in (715.0, 0.235, 0.27)]
-
-    def tip(values: list, model: lj.ReducedModel) -> jax.Array:
-        own = lj.with_parameters(small, dict(zip(NAMES, values, strict=True)))
-        return jnp.sum(lj.simulate_reduced(model, own).coordinates[-1] ** 2)
-
-    def answer(s: lj.Scene, model: lj.ReducedModel) -> tuple[jax.Array, jax.Array]:
-        found = lj.simulate_reduced(model, s)
-        return lj.reduced_positions(model, s, found), lj.stated_error(model, s, found)
-
+    tip = reduced.tip_of(small, NAMES)
     result, run = processor_s(lambda s, model: lj.simulate_reduced(model, s), small, model, rounds=15)
-    _, whole = processor_s(answer, small, model, rounds=15)
+    _, whole = processor_s(reduced.answer, small, model, rounds=15)
     _, plain = processor_s(tip, start, model, rounds=15)
     _, gradient = processor_s(jax.value_and_grad(tip), start, model, rounds=15)
     _, full = processor_s(lj.simulate, scene, rounds=2)

@@ -56,13 +56,23 @@ def estimate(
     return own
 
 
+#: Ratios that leave less than this to the equilibrium modulus are those of a fluid.
+NO_REST = 1e-10
+
+
 def equilibrium_error(u: Estimate) -> float:
     """Standard error of the equilibrium modulus G0 (1 - sum g) [Pa]; infinite for a fluid."""
     modes = (len(u.values) - 1) // 2
     rest = 1 - u.values[1 : modes + 1].sum()
     # By the square root of the covariance, so that the variance is never negative.
     slope = np.concatenate([[rest], np.full(modes, -u.values[0]), np.zeros(modes)])
-    return float(np.linalg.norm(slope @ u.root)) if rest > 1e-10 else np.inf
+    return float(np.linalg.norm(slope @ u.root)) if rest > NO_REST else np.inf
+
+
+def equilibrium_change(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Change [Pa] of G0 (1 - sum g) by changes (1 + 2N, ...) of G0, ratios and times, to first order."""
+    ratios = slice(1, 1 + (len(values) - 1) // 2)
+    return moved[0] * (1 - values[ratios].sum()) - values[0] * moved[ratios].sum(axis=0)
 
 
 def profile_intervals(found: Solution, sweep: Sweep, uncertainty: Estimate, points: int = 21) -> Content:

@@ -17,7 +17,7 @@ from fitting.fits.simulated_rheometer import largest_shift
 from fitting.fits.viscoelastic import Fit, Kind
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import moduli, weighed
-from fitting.methods.uncertainty import equilibrium_error
+from fitting.methods.uncertainty import equilibrium_change, equilibrium_error
 from fitting.readers.rheometer import Sweep
 from fitting.reports import posterior_report
 from fitting.waves import shear_waves
@@ -58,7 +58,7 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
         "converged": fit.converged,
         "modes": n,
         "shear_modulus": float(fit.model.shear_modulus),
-        "equilibrium_modulus": _modulus_at_rest(fit),
+        "equilibrium_modulus": limits.equilibrium_of(fit.model),
         "ratios": fit.model.ratios.tolist(),
         "relaxation_times": fit.model.relaxation_times.tolist(),
         "standard_errors": {
@@ -86,12 +86,6 @@ def summary(fit: Fit, sweep: Sweep) -> Content:
     }
 
 
-def _modulus_at_rest(fit: Fit) -> float:
-    """G0 (1 - sum g) [Pa]; exactly 0 for a fluid, whose ratios add up to 1."""
-    rest = float(1 - fit.model.ratios.sum())
-    return 0.0 if fit.kind.name == "prony_fluid" else max(0.0, float(fit.model.shear_modulus) * rest)
-
-
 def ends_of_interval(details: Content) -> list[float] | None:
     """Ends of the interval of the equilibrium modulus; None for another model than Prony modes."""
     found = details.get(INTERVAL)
@@ -117,11 +111,9 @@ def _bias_by_name(u: Estimate, n: int, moved: np.ndarray | None) -> Content | No
     """Bias by the names of `standard_errors`; None if it is not known."""
     if moved is None:
         return None
-    G0, ratios = u.values[0], u.values[1 : n + 1]
-    equilibrium = moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()
     return {
         "shear_modulus": moved[0],
-        "equilibrium_modulus": equilibrium,
+        "equilibrium_modulus": equilibrium_change(u.values, moved),
         "ratios": moved[1 : n + 1].tolist(),
         "relaxation_times": moved[n + 1 :].tolist(),
     }
@@ -366,7 +358,7 @@ def _parameter_rows(fit: Fit) -> list[str]:
     u, n = fit.uncertainty, fit.modes
     if fit.parameters is not None:
         return own_rows(fit.parameters, fit.kind, fit.details, edges.moved(fit))
-    decided, equilibrium = edges.moved(fit), _modulus_at_rest(fit)
+    decided, equilibrium = edges.moved(fit), limits.equilibrium_of(fit.model)
 
     def mark(name):
         return "*" if name in decided else " "
@@ -406,7 +398,7 @@ def _lines(fit: Fit) -> list[str]:
 
     rows = [row("G0", u.values[0], u.standard_errors[0], "Pa", "shear_modulus")]
     if np.isfinite(equilibrium_error(u)):
-        rows.append(row("G_inf", _modulus_at_rest(fit), equilibrium_error(u), "Pa", "equilibrium_modulus"))
+        rows.append(row("G_inf", limits.equilibrium_of(fit.model), equilibrium_error(u), "Pa", "equilibrium_modulus"))
     else:
         rows.append("G_inf           0 Pa, a fluid")
     for i in range(n):

@@ -40,7 +40,7 @@ def write(out: Path, test: TimeTest, fit: TimeFit, posterior: Posterior | None =
             "converged": fit.converged,
             "modes": n,
             "shear_modulus": float(fit.model.shear_modulus),
-            "equilibrium_modulus": _equilibrium_in_time(fit),
+            "equilibrium_modulus": limits.equilibrium_of(fit.model),
             "ratios": fit.model.ratios.tolist(),
             "relaxation_times": fit.model.relaxation_times.tolist(),
             "standard_errors": {
@@ -83,10 +83,6 @@ def _total_errors_in_time(fit: TimeFit) -> Content:
     }
 
 
-def _equilibrium_in_time(fit: TimeFit) -> float:
-    return max(0.0, float(fit.model.shear_modulus * (1 - fit.model.ratios.sum())))
-
-
 def table(test: TimeTest, fit: TimeFit) -> str:
     """Parameters ± standard error, and the criterion of each number of modes."""
     rows = [f"{test.kind}, {fit.kind.name}{'' if fit.converged else ' (not converged)'}"]
@@ -104,7 +100,7 @@ def _rows_of_modes(fit: TimeFit) -> list[str]:
     u, n, rows = fit.uncertainty, fit.modes, []
     rows.append(f"G0    {u.values[0]:11.5g} ± {u.standard_errors[0]:<9.2g} Pa")
     if fit.kind.name == "prony":
-        rows.append(f"G_inf {_equilibrium_in_time(fit):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
+        rows.append(f"G_inf {limits.equilibrium_of(fit.model):11.5g} ± {equilibrium_error(u):<9.2g} Pa")
     if "geometry_error" in fit.details:
         whole = total_error.total_errors(fit)
         for k, name in enumerate(n for n in ("shear_modulus", "equilibrium_modulus") if n in whole):

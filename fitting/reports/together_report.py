@@ -54,7 +54,7 @@ def write(out: Path, found: Together, relative: float) -> Content:
             "converged": found.converged,
             "modes": n,
             "shear_modulus": float(found.model.shear_modulus),
-            "equilibrium_modulus": _equilibrium(found),
+            "equilibrium_modulus": limits.equilibrium_of(found.model),
             "ratios": found.model.ratios.tolist(),
             "relaxation_times": found.model.relaxation_times.tolist(),
             "standard_errors": _by_name(u.standard_errors, n) | limits.limit_errors(u, found.model, found.parameters),
@@ -92,10 +92,6 @@ def _waves(found: Together) -> Content:
     omega = np.geomspace(low, high, max(2, 1 + int(4 * np.log10(high / low))))
     density = next((t.density for t in found.tests if isinstance(t, Dispersion)), None)
     return shear_waves.waves_of_moduli(*moduli(found.model, omega), omega, density)
-
-
-def _equilibrium(found: Together) -> float:
-    return max(0.0, float(found.model.shear_modulus * (1 - found.model.ratios.sum())))
 
 
 def _by_name(values: np.ndarray, n: int) -> Content:
@@ -154,7 +150,7 @@ def table(found: Together, relative: float) -> str:
         value = f"{u.values[j]:11.5g} ± {_error(u.standard_errors[j]):8s} {unit}"
         rows.append(f"{label:{wide}s}{value:26s}{without}".rstrip())
     if found.kind.name == "prony":
-        rows.append(f"G_inf {_equilibrium(found):11.5g} ± {_error(equilibrium_error(u))} Pa")
+        rows.append(f"G_inf {limits.equilibrium_of(found.model):11.5g} ± {_error(equilibrium_error(u))} Pa")
     if found.kind.effective is not None:
         rows.append(f"G0 {float(found.model.shear_modulus):.5g} Pa, of the {n} Prony modes that represent it")
     rows += spectrum_rows(found.details or {})

@@ -13,6 +13,9 @@ from pathlib import Path
 from liverjax.core import program_cache
 from liverjax.core.errors import InputError
 
+#: What a disk without room answers; not every system knows quotas.
+FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}
+
 
 def show_unknown_letters() -> None:
     """Show "?" for letters such as "±" that a terminal does not know; to be called before a command line is parsed."""
@@ -49,7 +52,7 @@ def exit_code(run: Callable[[argparse.Namespace], int], options: argparse.Namesp
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno is None or error.errno not in FULL:
                 raise
             print(
                 f"error: {os.strerror(error.errno)}: what was written last is not whole; make room and repeat",

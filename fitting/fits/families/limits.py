@@ -8,7 +8,7 @@ import numpy as np
 
 from fitting.methods.estimate import Estimate
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.uncertainty import equilibrium_error
+from fitting.methods.uncertainty import NO_REST, equilibrium_error
 
 #: Differences above this many standard errors get a sentence.
 TOLD = 2.0
@@ -28,8 +28,13 @@ def of_the_model(own: Estimate | None) -> dict[str, float]:
 
 def of_the_modes(model: Maxwell) -> dict[str, float]:
     """The same moduli [Pa] of Prony modes."""
-    G = float(model.shear_modulus)
-    return {"shear_modulus": G, "equilibrium_modulus": max(0.0, G * (1 - float(np.sum(np.asarray(model.ratios)))))}
+    return {"shear_modulus": float(model.shear_modulus), "equilibrium_modulus": equilibrium_of(model)}
+
+
+def equilibrium_of(model: Maxwell) -> float:
+    """G0 (1 - sum g) [Pa]; 0 for a fluid, whose ratios add up to 1 but for roundoff."""
+    rest = 1 - float(np.sum(np.asarray(model.ratios)))
+    return float(model.shear_modulus) * rest if rest > NO_REST else 0.0
 
 
 def limit_errors(modes: Estimate, model: Maxwell, own: Estimate | None) -> dict[str, float]:

@@ -32,15 +32,9 @@ def shares_with_sizes(fit: Together, relative: float) -> dict[str, dict[str, flo
     found = {source: dict(zip(names, part.tolist(), strict=True)) for source, part in shares.items()}
     if fit.parameters is None and np.isfinite(uncertainty.equilibrium_error(own)):
         found["noise"]["equilibrium_modulus"] = uncertainty.equilibrium_error(own)
-        rest = _of_equilibrium(own.values, by_size)
+        rest = uncertainty.equilibrium_change(own.values, by_size)
         found["geometry"]["equilibrium_modulus"] = float(max(np.linalg.norm(rest), abs(rest.sum())))
     return found
-
-
-def _of_equilibrium(values: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Changes (K,) of G0 (1 - sum g) by changes (1 + 2N, K) of G0, ratios and times."""
-    ratios = slice(1, 1 + (len(values) - 1) // 2)
-    return moved[0] * (1 - values[ratios].sum()) - values[0] * moved[ratios].sum(axis=0)
 
 
 def _by_sizes(fit: Together) -> np.ndarray:

@@ -11,6 +11,7 @@ from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
+from fitting.methods.uncertainty import equilibrium_change
 
 #: Usual standard deviations [m] of the gap that an instrument states, and of the radius of the plates.
 GAP, RADIUS = 50e-6, 10e-6
@@ -76,7 +77,6 @@ def _moduli(fit: Fit | TimeFit) -> set[str]:
 
 def _of_modes(fit: Fit | TimeFit, moved: np.ndarray) -> dict[str, float]:
     """Size of the changes `moved` (P,) of G0, ratios and times, and of that of the equilibrium modulus, by name."""
-    n, G0, ratios = fit.modes, fit.uncertainty.values[0], fit.uncertainty.values[1 : fit.modes + 1]
     out = {name: abs(float(d)) for name, d in zip(fit.uncertainty.names, moved, strict=True)}
-    out["equilibrium_modulus"] = abs(float(moved[0] * (1 - ratios.sum()) - G0 * moved[1 : n + 1].sum()))
+    out["equilibrium_modulus"] = abs(float(equilibrium_change(fit.uncertainty.values, moved)))
     return {name: out[name] for name in edges.values(fit)}
