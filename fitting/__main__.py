@@ -3,6 +3,7 @@
 import importlib
 import sys
 
+from liverjax.commands.arguments import with_joined_numbers
 from liverjax.commands.exit_codes import exit_code, show_unknown_letters
 
 #: Names of the other commands; without one of them the command line is for a frequency sweep.
@@ -18,7 +19,7 @@ def main(arguments: list[str] | None = None, prog: str = "python -m fitting") ->
         name, arguments = arguments[0], arguments[1:]
         prog = f"{prog} {name}"
     command = importlib.import_module(f"fitting.commands.{name}")  # other commands stay unloaded, for a quick start
-    return exit_code(command.run, command.parser(prog).parse_args(arguments))
+    return exit_code(command.run, command.parser(prog).parse_args(with_joined_numbers(arguments)))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import argparse
 import sys
 
 from liverjax.commands import check, design, fit, laws, play, plot, reduce, simulate, sweep
+from liverjax.commands.arguments import with_joined_numbers
 from liverjax.commands.exit_codes import exit_code, show_unknown_letters
 
 
@@ -25,7 +26,7 @@ def main(arguments: list[str] | None = None, prog: str = "liverjax") -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["fit"]:
         return fit.run(arguments[1:], f"{prog} fit")
-    options = _parser(prog).parse_args(arguments)
+    options = _parser(prog).parse_args(with_joined_numbers(arguments))
     return exit_code(options.run, options, resumable="resume" in options)
 
 

@@ -16,6 +16,7 @@ from conftest import ROOT
 from fitting.__main__ import main
 from fitting.fits import sample_inertia
 from liverjax.__main__ import main as liverjax_main
+from liverjax.commands.arguments import with_joined_numbers
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -123,6 +124,7 @@ BAD = {
     "radius in mm": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "4"], "give e.g. --radius 0.004"),
     "radius": (HEADER + "1,300,30\n2,310,40\n", ["--radius", "-1"], "--radius -1.0 cannot be"),
     "height in mm": (HEADER + "1,300,30\n2,310,40\n", ["--height", "nan"], "--height nan cannot be"),
+    "gap error": (HEADER + "1,300,30\n2,310,40\n", ["--gap-error", "-1e-5"], "--gap-error -1e-05"),
     "density": (HEADER + "1,300,30\n2,310,40\n", ["--density", "1.06"], "give e.g. --density 1060"),
     "density without height": (
         HEADER + "1,300,30\n2,310,40\n",
@@ -277,6 +279,21 @@ def test_a_run_in_single_precision_writes_its_files(tmp_path):
     lines = (tmp_path / "reactions.csv").read_text().splitlines()
     last = dict(zip(lines[0].split(","), lines[-1].split(","), strict=True))
     assert np.isclose(float(last["support.0.z_N"]), 3.0, rtol=1e-3)
+
+
+def test_numbers_with_exponents_are_values_and_an_unknown_backend_is_no_matter(tmp_path):
+    """`--gap-error -1e-5` was an unknown option to argparse; a wrong MPLBACKEND ended in a traceback."""
+    command = [sys.executable, "-m", "fitting", str(PORCINE), "--method", "closed-form", "--out", str(tmp_path)]
+    env = os.environ | {"MPLBACKEND": "nonsense"}
+    run = subprocess.run([*command, "--modes", "2"], env=env, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0 and "Traceback" not in run.stderr and (tmp_path / "fit.png").is_file()
+    assert with_joined_numbers(["a", "--b", "-1e-5", "--c", "-2.5E+3", "-1", "--d"]) == [
+        "a",
+        "--b=-1e-5",
+        "--c=-2.5E+3",
+        "-1",
+        "--d",
+    ]
 
 
 def test_a_terminal_without_the_letter_and_a_full_disk(tmp_path):

@@ -65,9 +65,28 @@ def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):
 
 def test_what_is_not_told_changes_nothing(tmp_path):
     s = export(tmp_path / "a.txt", sample=False, phase=False)
-    assert without_inertia(s) is s  # neither the torque of the sample nor its size
+    told = without_inertia(s)  # neither the torque of the sample nor its size
+    assert told.grey is None and told.inertia is None and "give --radius and --height for it" in told.notes[-1]
     light = export(tmp_path / "b.txt", inertia=1e-12)
     assert without_inertia(light).grey is None and len(without_inertia(light).storage) == 20
+
+
+def test_phases_written_as_lags_are_turned(tmp_path):
+    s = export(tmp_path / "l.txt", sample=False)
+    turned = without_inertia(s._replace(raw={"phase": -s.raw["phase"]}))
+    assert "their sign is turned" in turned.notes[0]
+    assert np.allclose(turned.inertia, without_inertia(s).inertia, rtol=1e-9)
+
+
+def test_raw_columns_without_a_unit_are_named_and_degrees_are_read(tmp_path):
+    M, rows = (K * G - INERTIA * OMEGA**2) * 1e-3, []
+    for w, g, m in zip(OMEGA, G, M, strict=True):
+        rows.append([w, g.real, g.imag, 1e6 * abs(m), np.degrees(1e-3), np.angle(m)])
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa,torque_uN.m,angle_deg,raw_phase"
+    np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=head, comments="")
+    s = read_sweep(tmp_path / "d.csv")
+    assert [n for n in s.notes if "column 'raw_phase' is not used" in n and "name it e.g. raw_phase_deg" in n]
+    assert without_inertia(s, RADIUS, HEIGHT).inertia[0] == pytest.approx(INERTIA * OMEGA[0] ** 2 / K, rel=1e-3)
 
 
 def test_a_sweep_of_nothing_but_the_instrument_is_refused(tmp_path):

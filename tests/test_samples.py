@@ -133,6 +133,27 @@ def test_a_sample_that_is_not_of_the_others_is_named():
         assert len(said) == told and all(s.startswith("s4.csv: its shear_modulus is 4.9 times") for s in said)
 
 
+def test_few_samples_of_another_unit_are_named():
+    """One of three in kPa gave a new sample 2e-5 to 5e12 Pa, without a word."""
+    for moduli, names in (((800.0, 950.0, 1.1e6), "s2.csv: the shear_modulus is"), ((800.0, 950.0, 2000.0), None)):
+        found = SimpleNamespace(
+            sweeps=[SimpleNamespace(source=f"s{k}.csv") for k in range(3)],
+            fits=moduli,
+            populations={"shear_modulus": None},
+            values=lambda k, own=moduli: {"shear_modulus": (own[k], 10.0)},
+        )
+        said = outliers(found)
+        assert [s.startswith(names) for s in said] == [True] if names else not said
+
+
+def test_one_measurement_in_two_files_is_refused(tmp_path, capsys):
+    files, _ = write_samples(tmp_path, 1)
+    again = tmp_path / "again.csv"
+    again.write_text("# another comment\n" + (tmp_path / "sample0.csv").read_text())
+    assert main([*files, str(again), "--out", str(tmp_path / "fit")]) == 2
+    assert "it has the same moduli as" in capsys.readouterr().err
+
+
 def write_samples(folder, count=5, spread=0.3, noise=0.01):
     """Synthetic: a solid with one mode whose moduli and times vary between samples; the truths as well."""
     rng, omega, files = np.random.default_rng(1), np.geomspace(0.5, 50, 12), []

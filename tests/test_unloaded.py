@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import liverjax as lj
+from liverjax.__main__ import main
 from liverjax.core import status
 from liverjax.core.errors import InputError
 from liverjax.core.struct import replace
@@ -72,6 +73,20 @@ def test_a_viscous_run_that_is_too_short_to_end_in_the_given_shape_is_told():
     (sentence,) = said(0.15, dt=0.05, steps=3)
     assert "lasts 0.15 s beside a relaxation time of 0.3 s" in sentence
     assert said(3.0, dt=1.0, steps=3) == said(0.15, dt=0.05, kind="dynamic") == []
+
+
+def test_the_command_tells_it_too(tmp_path, capsys):
+    """The command runs the unloaded scene, whose points are the reference shape: the caution was lost."""
+    text = """mesh = {shape = "box", size = [0.02, 0.02, 0.02], cells = [1, 1, 1], is = "loaded"}
+law = {name = "neo_hookean", mu = 770.0, bulk = 2200.0}
+viscosity = {ratios = [0.3], relaxation_times = [0.3]}
+body = {density = 1000.0, gravity = [0, 0, -5.0]}
+fixed = [{where = {z_max = 0.0}}]
+solve = {dt = 0.05, steps = 3}
+"""
+    (tmp_path / "scene.toml").write_text(text)
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path)]) == 0
+    assert "lasts 0.15 s beside a relaxation time of 0.3 s" in capsys.readouterr().out
 
 
 @pytest.mark.slow

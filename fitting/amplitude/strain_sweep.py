@@ -33,7 +33,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         max_strain: points of larger strain [1] are left out.
 
     Raises:
-        InputError: no table with a strain, several frequencies, too few points.
+        InputError: no table with a strain, moduli of tension, several frequencies, too few points.
     """
     found = [t for t in tables_of(str(path), text_of(path).splitlines()) if "strain" in t.raw]
     if not found:
@@ -43,18 +43,19 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
     columns = {c.quantity: (c, j) for j, c in reversed(list(enumerate(chosen.columns)))}
     rows = np.asarray(chosen.rows)
     in_si = {q: (c, column_in_si(str(path), c, rows[:, j], notes)) for q, (c, j) in columns.items()}
-    notes += to_shear(in_si)
+    if told := to_shear(in_si):
+        raise InputError(
+            f"{path}: {told[0].partition(':')[0]}, and E = 3 G does not hold at large strain: give a strain sweep in "
+            "shear, or fit curves of stress and stretch (python -m fitting curves)"
+        )
     values = {q: v for q, (_, v) in in_si.items()}
     omega, both = values["frequency"], storage_and_loss(values, notes)
     G = both["storage"], both["loss"]
     strain = chosen.raw["strain"]
     good = np.all([np.isfinite(column) & (column > 0) for column in (strain, omega, *G)], axis=0)
     kept = good & (strain <= (np.inf if max_strain is None else max_strain))
-    notes += (
-        [f"{(~good).sum()} points without a positive strain, frequency or modulus are left out"]
-        if not good.all()
-        else []
-    )
+    if not good.all():
+        notes.append(f"{(~good).sum()} points without a positive strain, frequency or modulus are left out")
     if good.sum() > kept.sum():
         notes.append(f"{good.sum() - kept.sum()} points above a strain of {max_strain:g} are left out as requested")
     if len(np.unique(strain[kept])) < FEWEST_POINTS:

@@ -2,20 +2,30 @@
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from fitting.commands import shared_options
 from fitting.commands.progress import named_bar
+from liverjax.core.errors import InputError
+
+if TYPE_CHECKING:
+    from fitting.readers.frequency_sweep import Sweep
 
 
 def run(options: argparse.Namespace) -> int:
     """Fit all samples with one model in closed form; exit code 1 if one of the fits did not converge."""
+    import numpy as np
+
     from fitting.fits import samples
     from fitting.reports import samples_report
     from liverjax.core.files import writable
 
-    sweeps = []
+    sweeps: list[Sweep] = []
     for path in options.sweep:
         sweeps.append(shared_options.usable_sweep(options, path))
+        for earlier in sweeps[:-1]:
+            if all(np.array_equal(*own) for own in zip(sweeps[-1][:3], earlier[:3], strict=True)):
+                raise InputError(f"{path}: it has the same moduli as {earlier.source}: give each measurement once")
         for note in sweeps[-1].notes:
             print(f"note: {path.name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png", "fit.h5"))

@@ -1,6 +1,6 @@
 """Errors of the instrument in a fit, shared by all points: inertia, friction, gap, each with a prior; and compression.
 
-The instrument subtracts its inertia I, so G' is off by delta I omega^2 / K if I is off by the relative error delta.
+The instrument subtracts its inertia I. If its true inertia is I (1 + delta), G' is too small by delta I omega^2 / K.
 Without a prior, such a term would fit the model's misfit. Here delta has a normal prior around 0 with the standard
 deviation `raw_torque.UNCERTAINTY`. It is fitted only if the file has raw columns, and it is used only if it stays the
 same when the end of the band is left out. The friction b of the bearing adds b omega / K to G''; its error has a normal
@@ -32,17 +32,20 @@ class Nuisance(NamedTuple):
     name: str
     moved: np.ndarray  # (n,) change of G* [Pa] by one standard deviation
     unit: float  # the standard deviation in the unit of the report
-    words: str  # what is off, for a sentence; {} is the number
 
     @property
     def reported(self) -> str:
-        """Its name in fit.json."""
+        """Its name in fit.json, for what is true less what was subtracted."""
         return "friction_off_by_N_m_s" if self.name == "friction" else "inertia_off_by"
 
     def told(self, deviations: float) -> str:
         """The size of this error as text, for a sentence."""
         value = self.unit * deviations
         return _cent(value) if self.name == "inertia" else f"{value:.2g} N m s"
+
+    def compared(self, deviations: float) -> str:
+        """What is true beside what was subtracted, for a sentence."""
+        return f"{self.told(abs(deviations))} {'larger' if deviations > 0 else 'smaller'} than what it subtracted"
 
 
 class InstrumentErrors(NamedTuple):
@@ -65,11 +68,9 @@ def nuisances_of(sweep: Sweep) -> list[Nuisance]:
     """The errors of the instrument for which the sweep has the inertia or the friction."""
     out = []
     if sweep.inertia is not None:
-        moved, words = raw_torque.UNCERTAINTY * sweep.inertia, "the inertia that the instrument subtracted is off by {}"
-        out.append(Nuisance("inertia", moved + 0j, raw_torque.UNCERTAINTY, words))
+        out.append(Nuisance("inertia", raw_torque.UNCERTAINTY * sweep.inertia + 0j, raw_torque.UNCERTAINTY))
     if sweep.friction is not None:
-        words = "the friction that the instrument subtracted is off by {}"
-        out.append(Nuisance("friction", -1j * sweep.friction, sweep.friction_error, words))
+        out.append(Nuisance("friction", -1j * sweep.friction, sweep.friction_error))
     return out
 
 
@@ -95,8 +96,8 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
         return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
     corrected = _shifted(sweep, known, values)
     notes = [
-        f"{n.words.format(n.told(v))} (standard error {n.told(e)}, prior {n.told(1.0)}), and the moduli are corrected "
-        "for it"
+        f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}), and the "
+        "moduli are corrected for it"
         for n, v, e in zip(known, values, np.sqrt(np.diag(covariance)), strict=True)
     ]
     corrected = corrected._replace(notes=(*sweep.notes, *notes))
@@ -122,7 +123,7 @@ def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]
         if errors.part is not None:
             there = f"it is {n.told(errors.part[k])} there"
         out.append(
-            f"the instrument's {n.name} seems off by {n.told(errors.values[k])} (standard error {n.told(e[k])}), but "
+            f"the instrument's {n.name} seems {n.compared(errors.values[k])} (standard error {n.told(e[k])}), but "
             f"not without the last half decade ({there}): the misfit of the model poses as {n.name}, so it is not "
             "corrected"
         )

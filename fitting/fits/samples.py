@@ -145,6 +145,8 @@ def _populations(fits: list[Fit]) -> dict[str, Population | None]:
 _STRANGE, _FEWEST = 0.05, 4
 #: Least ratio to the others of a sample that is named, and largest error of the logarithm with which it is judged.
 _APART, _UNSURE = 1.3, 0.5
+#: Ratio of moduli of one material from which their units are in doubt.
+_OTHER_UNIT = 100.0
 
 
 def outliers(found: Samples) -> list[str]:
@@ -152,10 +154,8 @@ def outliers(found: Samples) -> list[str]:
     name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
     pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
     known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
-    if len(known) < _FEWEST:
-        return []
     logs, errors, out = np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0], []
-    for k, sample in enumerate(known):
+    for k, sample in enumerate(known if len(known) >= _FEWEST else ()):
         sweep, others = found.sweeps[sample], np.delete(logs, k)
         deviation = np.sqrt(others.var(ddof=1) * (1 + 1 / len(others)) + errors[k] ** 2)
         apart = float((logs[k] - others.mean()) / max(deviation, 1e-12))
@@ -166,7 +166,22 @@ def outliers(found: Samples) -> list[str]:
                 f"others, {np.exp(others.mean()):.4g} (by chance: {chance:.1g}): check its units and sizes; it "
                 "widens the population's intervals"
             )
-    return out
+    return out or _of_another_unit(logs, [Path(found.sweeps[k].source).name for k in known], name)
+
+
+def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:
+    """A sentence if some samples have a modulus far above that of the others; few samples allow no test."""
+    order = np.argsort(logs)
+    gaps = np.diff(logs[order])
+    if not len(gaps) or gaps.max() < np.log(_OTHER_UNIT):
+        return []
+    first = int(np.argmax(gaps)) + 1
+    below, above = ([sources[k] for k in own] for own in (order[:first], order[first:]))
+    fewer, way = (above, "above") if len(above) < len(below) else (below, "below")
+    return [
+        f"{', '.join(fewer)}: the {name} is {np.exp(gaps.max()):.2g} times {way} that of the other samples: check "
+        "units and sizes; the population's intervals are as wide as that"
+    ]
 
 
 def _place(name: str) -> int:

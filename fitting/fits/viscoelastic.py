@@ -14,6 +14,7 @@ from fitting.methods.estimate import Estimate, errors_and_correlation, with_slop
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
+from fitting.methods.noise.paired_noise import paired_root
 from fitting.methods.noise.uneven_noise import grouped_root
 from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
@@ -187,9 +188,12 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
 
 
 def _of_two_noises(estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution) -> Estimate:
-    """The estimate with the errors of G' and G'' that have noise of their own, if their residuals show it."""
-    J, r = np.asarray(found.jacobian), np.asarray(found.residuals)
-    root = grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, with_slope(natural_of, found.u)[1])
+    """The estimate with the errors of G' and G'' that share noise at each frequency, as that of the torque, or that
+    have noise of their own, if their residuals show it."""
+    J, r, slope = np.asarray(found.jacobian), np.asarray(found.residuals), with_slope(natural_of, found.u)[1]
+    root = paired_root(J, r, slope)
+    if root is None:
+        root = grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, slope)
     if root is None:
         return estimate
     errors, correlation = errors_and_correlation(root)

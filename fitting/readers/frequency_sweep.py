@@ -277,13 +277,22 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     This needs raw torque and angle in the file, and the torque of the sample or its radius and height [m]; or it needs
     the raw phase.
     """
-    if not sweep.raw:
+    raw = sweep.raw
+    if not raw:
         return sweep
     geometry = np.pi * radius**4 / (2 * height) if radius and height else None
     G = sweep.storage + 1j * sweep.loss
     omega = sweep.angular_frequency
-    found = raw_torque.share(omega, G, sweep.raw, geometry) or raw_torque.share_by_phase(omega, G, sweep.raw)
+    found = raw_torque.share(omega, G, raw, geometry) or raw_torque.share_by_phase(omega, G, raw)
+    if found is None and "phase" in raw:
+        found = raw_torque.share_by_phase(omega, G, {"phase": -raw["phase"]})
+        if found is not None:
+            sign = "the raw phases fit the moduli with the other sign, as lags of the angle: their sign is turned"
+            sweep = sweep._replace(notes=(*sweep.notes, sign))
     if found is None:
+        if {"torque", "angle"} <= set(raw) and geometry is None:
+            size = "raw torque and angle could show the inertia of the instrument: give --radius and --height for it"
+            return sweep._replace(notes=(*sweep.notes, size))
         return sweep
     sweep = sweep._replace(inertia=found.modulus)
     unknown = raw_torque.UNCERTAINTY * found.modulus

@@ -5,6 +5,7 @@ the software has subtracted. I omega^2 / K is its share of the modulus, known up
 """
 
 import re
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -55,8 +56,31 @@ def unit_of(quantity: str, cells: list[str], units: list[str]) -> str:
     return _places_and_units(cells, units).get(quantity, (0, ""))[1]
 
 
+#: A heading with its unit, for each raw column of the instrument.
+_EXAMPLES = {"torque": "torque_uN.m", "angle": "angle_mrad", "phase": "raw_phase_deg"}
+
+
+def without_unit(cells: list[str], units: list[str]) -> list[str]:
+    """A note on each raw column of the instrument that cannot be used, for its unit is not known."""
+    known = _places_and_units(cells, units)
+    return [
+        f"column {cells[k].strip()!r} is not used to look for the inertia of the instrument: its unit "
+        f"{f'{unit!r} is not known' if unit else 'is not stated'}; name it e.g. {_EXAMPLES[quantity]}"
+        for k, quantity, _, unit in _known_headings(cells, units)
+        if quantity in _EXAMPLES and quantity not in known
+    ]
+
+
 def _places_and_units(cells: list[str], units: list[str]) -> dict[str, tuple[int, str]]:
     found: dict[str, tuple[int, int, str]] = {}
+    for k, quantity, rank, unit in _known_headings(cells, units):
+        if unit in RAW_TORQUE_UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
+            found[quantity] = (rank, k, unit)
+    return {quantity: (k, unit) for quantity, (_, k, unit) in found.items()}
+
+
+def _known_headings(cells: list[str], units: list[str]) -> Iterator[tuple[int, str, int, str]]:
+    """Place, quantity, rank in `HEADINGS` and unit of each heading that is known."""
     for k, cell in enumerate(cells):
         name = cell.strip().strip('"')
         plain = name.lower().replace("_", " ")
@@ -65,10 +89,7 @@ def _places_and_units(cells: list[str], units: list[str]) -> dict[str, tuple[int
             continue
         word, quantity = HEADINGS[rank]
         rest = re.sub(r"^[\s_\[(]+|[\s\])]+$", "", name[len(word) :])
-        unit = _plain_unit(rest or (units[k] if k < len(units) else ""))
-        if unit in RAW_TORQUE_UNITS[quantity] and rank < found.get(quantity, (len(HEADINGS),))[0]:
-            found[quantity] = (rank, k, unit)
-    return {quantity: (k, unit) for quantity, (_, k, unit) in found.items()}
+        yield k, quantity, rank, _plain_unit(rest or (units[k] if k < len(units) else ""))
 
 
 def _plain_unit(unit: str) -> str:

@@ -104,7 +104,8 @@ def read_time_test(
             word = "strain" if kind == "relaxation" else "stress"
             notes.append(
                 f"no column shows how the {word} rose: a step at 0 s is assumed. If it took some time, give --ramp "
-                "SECONDS: what relaxed meanwhile is missing from G0 otherwise"
+                "SECONDS, with times that count from its beginning: otherwise G0 is too large, or too small if the "
+                "times count from its end"
             )
     else:
         if ramp:

@@ -24,8 +24,8 @@ _TORQUE = {"N.m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "mNm": 1e-3, "uN.m": 1e-6, "uNm"
 RAW_TORQUE_UNITS = {
     "torque": _TORQUE,
     "sample_torque": _TORQUE,
-    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6},
-    "phase": {"°": np.pi / 180, "deg": np.pi / 180, "rad": 1.0},
+    "angle": ANGLE_UNITS | {"urad": 1e-6},
+    "phase": ANGLE_UNITS,
     "strain": {"%": 0.01, "percent": 0.01, "1": 1.0, "": 1.0},
 }
 _PER_PA = {f"1/{unit}": 1 / factor for unit, factor in MODULUS_UNITS.items()} | {"Pa-1": 1.0, "Pa^-1": 1.0}

@@ -331,23 +331,18 @@ def demodulate(run: Run, omega: Number, drive: Drive) -> tuple[jax.Array, jax.Ar
     return jnp.sum(carrier * run.torque[-drive.steps :]), jnp.sum(carrier * run.angle[-drive.steps :])
 
 
-@partial(jax.jit, static_argnames=("drive", "corrected"))
+@partial(jax.jit, static_argnames=("drive",))
 def moduli(
-    rig: Rig,
-    law: Law,
-    prony: Prony | None,
-    omega: jax.Array,
-    amplitude: jax.Array,
-    drive: Drive = Drive(),
-    corrected: bool = True,
+    rig: Rig, law: Law, prony: Prony | None, omega: jax.Array, amplitude: jax.Array, drive: Drive = Drive()
 ) -> Moduli:
     """G* = 2 h / (pi r^4) M / theta of many oscillations at once (section 5.3), one compiled program for all.
 
+    The moduli are divided by the bias of the mesh, `geometry_factor` (if only the isochoric part relaxes, each
+    frequency has its own bias, because the bulk has more effect as the modulus falls). With a density the inertial part
+    is divided as well: refine the mesh instead. The moduli times `Moduli.bias` are those of the mesh itself.
+
     Args:
         omega, amplitude: (n,) or numbers, broadcast; see `oscillate`.
-        corrected: divide by the bias of the mesh, `geometry_factor` (if only the isochoric part relaxes, each frequency
-            has its own bias, because the bulk has more effect as the modulus falls). With a density the inertial part
-            is divided as well: refine the mesh instead.
     """
     rest = linearised_rig(rig, law, prony)
     omega, amplitude = jnp.broadcast_arrays(jnp.asarray(omega, float), jnp.asarray(amplitude, float))
@@ -355,7 +350,7 @@ def moduli(
     def one(omega, amplitude):
         run, bias = _oscillate(_Oscillation(rig, law, prony, omega, amplitude, drive), rest)
         torque, angle = demodulate(run, omega, drive)
-        G = 2 * rig.height / (jnp.pi * rig.radius**4) * torque / angle / (bias if corrected else 1.0)
+        G = 2 * rig.height / (jnp.pi * rig.radius**4) * torque / angle / bias
         defect = jnp.abs(run.angle[-1] - run.angle[-1 - drive.steps]) / jnp.abs(angle)
         worst = newton.NewtonStatistics(*(jnp.max(field) for field in run.statistics))
         return Moduli(jnp.real(G), jnp.imag(G), jnp.abs(angle) * rig.radius / rig.height, defect, bias, worst)

@@ -1,6 +1,8 @@
 """Arguments that several sub-commands have."""
 
 import argparse
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 LAW = "name of a shipped law (typical parameters), or FILE.py:LAW, a law object or class of your own"
@@ -9,3 +11,14 @@ LAW = "name of a shipped law (typical parameters), or FILE.py:LAW, a law object 
 def add_out(command: argparse.ArgumentParser) -> None:
     """Add --out, the folder of the results."""
     command.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder of the results (here)")
+
+
+def with_joined_numbers(arguments: Sequence[str]) -> list[str]:
+    """The command line with "--gap -1e-5" as "--gap=-1e-5": argparse takes a number such as -1e-5 for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and re.fullmatch(r"-[0-9.]+[eE][-+]?[0-9]+", argument) and re.fullmatch(r"--[a-z0-9-]+", joined[-1]):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined

@@ -40,8 +40,10 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from liverjax.core import status
+    from liverjax.core.struct import replace
     from liverjax.jobs import fields, long_run, output, resumable_parts
     from liverjax.scenes import scene_file
+    from liverjax.simulation.cautions import cautions_of_run
     from liverjax.simulation.run import unloaded
 
     scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8")
@@ -50,7 +52,8 @@ def run(options: argparse.Namespace) -> int:
         return harmonic.run(options, scene, text)
     if options.about:
         raise InputError("--about is for [solve] kind = 'harmonic': leave it out")
-    if scene.points_are == "loaded":
+    given = scene.points_are
+    if given == "loaded":
         scene = unloaded(scene).scene
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
@@ -70,7 +73,8 @@ def run(options: argparse.Namespace) -> int:
     if options.mesh_error:
         ran = ran._replace(result=_with_mesh_error(scene, ran.result))
     found = fields.fields(scene, ran.result, names) if names else {}
-    _write_and_tell(scene, text, ran, target, found)
+    said = cautions_of_run(replace(scene, points_are=given), ran.result)
+    _write_and_tell((scene, text, said), ran, target, found)
     if in_parts and resumable_parts.beside(target).exists():
         resumable_parts.remove(resumable_parts.beside(target))
     written = [str(target)]
@@ -143,20 +147,20 @@ def _sizes_of_places(scene: "Scene") -> list[str]:
     return out
 
 
-def _write_and_tell(scene: "Scene", text: str, ran: "Ran", target: Path, found: dict) -> None:
-    """Write the results; print the statistics and cautions of the run."""
+def _write_and_tell(given: tuple["Scene", str, list[str]], ran: "Ran", target: Path, found: dict) -> None:
+    """Write the results of a scene with its text and its cautions; print them and the statistics of the run."""
     import numpy as np
 
     from liverjax.core.versions import versions
     from liverjax.jobs import output
     from liverjax.physics import porosity
-    from liverjax.simulation.cautions import cautions_of_run, mesh_sentence
+    from liverjax.simulation.cautions import mesh_sentence
 
+    scene, text, said = given
     attributes = {"scene": text, "run_time_s": ran.run_time, "compile_time_s": ran.compile_time}
     if scene.porosity is not None:
         attributes["bulk"] = porosity.bulk_in_force(scene.porosity, scene.law)
         print(attributes["bulk"])
-    said = cautions_of_run(scene, ran.result)
     attributes |= {"warnings": said, "versions": versions()}
     output.write_hdf5(target, scene, ran.result, attributes, found, ran.beside)
     s, steps = ran.result.statistics, len(ran.result.times)

@@ -1,5 +1,6 @@
 """Pictures: colours, and a Matplotlib that draws to files."""
 
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 def pyplot() -> Any:
     """Matplotlib's `pyplot`, set to work without a screen; imported only for a picture, because the import is slow."""
+    os.environ["MPLBACKEND"] = "Agg"  # a name there that Matplotlib does not know would end the import
     import matplotlib
 
     matplotlib.use("Agg")

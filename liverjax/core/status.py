@@ -12,8 +12,8 @@ ONE_STEP = 8
 
 ADVICE = {
     CONVERGED: "converged",
-    STALLED: "the residual stopped falling above the tolerance: take a looser one (in float32, or with very stiff "
-    "springs, rounding may allow no smaller residual), float64, or smaller steps",
+    STALLED: "the residual stopped falling above the tolerance: take a looser one (in float32, with very stiff "
+    "springs or with very short time steps, rounding may allow no smaller residual), float64, or else smaller steps",
     NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
     "continued_below",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles, collapses, or is "

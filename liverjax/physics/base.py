@@ -267,6 +267,11 @@ class Physics:
         """Memory at the beginning of a run; None: it remembers nothing."""
         return None
 
+    @classmethod
+    def acts_without_memory(cls) -> bool:
+        """Whether `freeze` takes None for the memory of a body at rest, at the beginning of a run."""
+        return cls.begin is Physics.begin
+
     def freeze(self, memory: Any, step: Step) -> Any:
         """The part that acts during a step; None: nothing acts."""
         return None

@@ -2,9 +2,8 @@
 
 Springs on a surface have a stiffness per area, one along the normal of the reference surface and one along the surface
 (a Winkler foundation). They begin without tension. A history of factors changes their stiffness in time. A history of
-displacements moves the wall, and the springs with it. Each node of a triangle gets a third of its stiffness; in
-quadratic elements the middles of its edges get these thirds. For the functions of order 3, which the estimate of the
-mesh's error uses, the springs are integrated over the triangle.
+displacements moves the wall, and the springs with it. In linear elements each node of a triangle gets a third of its
+stiffness. In other elements the springs are integrated over the triangle.
 """
 
 from collections.abc import Callable
@@ -24,8 +23,8 @@ from liverjax.physics.base import NodalForce, Physics, Step
 from liverjax.solvers.attached import Attached
 from liverjax.solvers.block_matrix import Block
 
-#: Degree of the rule on triangles for functions of order 3.
-_DEGREE = 5
+#: Degree of the rule on triangles, by the order of the mesh.
+_DEGREE = {2: 4, 3: 5}
 
 
 @struct
@@ -84,8 +83,8 @@ class ElasticSupport(Physics):
             bounds.check_bound(f"{name} history", {"lower": 0.0}, self.history)
 
     def freeze(self, memory: None, step: Step) -> "Springs | Foundation":
-        """The springs: one symmetric block per node, or one per point of a triangle if the mesh has order 3."""
-        kind: Any = Foundation if self.triangles is not None and step.mesh.order == 3 else Springs
+        """The springs: one symmetric block per node, or one per point of a triangle if the mesh is not linear."""
+        kind: Any = Foundation if self.triangles is not None and step.mesh.order > 1 else Springs
         own = point_blocks(self, step.mesh) if kind is Foundation else blocks(self, step.mesh)
         given = {"triangles": self.triangles} if kind is Foundation else {}
         if self.history is None:
@@ -134,7 +133,7 @@ def blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
 
 def point_blocks(support: ElasticSupport, mesh: TetMesh) -> Block:
     """Stiffness of the points of triangles: 3 x 3 blocks of arrays (Q, m) [N/m]."""
-    weights = triangle_rule(_DEGREE)[0]
+    weights = triangle_rule(_DEGREE[mesh.order])[0]
     return _each(support, mesh, lambda whole: jnp.asarray(weights, whole.dtype)[:, None] * whole[None])
 
 
@@ -183,18 +182,18 @@ class Springs(NodalForce):
 
 @struct
 class Foundation(NodalForce):
-    """Springs during a step at the points of triangles, for functions of order 3, integrated over triangles."""
+    """Springs during a step at the points of triangles, integrated over triangles."""
 
-    triangles: Indices = param("1", "(m, 4), as in `liverjax.mesh.promotion.with_faces`")
+    triangles: Indices = param("1", "(m, 3), or (m, 4) of order 3 as in `liverjax.mesh.promotion.with_faces`")
     blocks: Block = param("N/m", "3 x 3 of (Q, m)")
     wall: jax.Array | None = param(
         "m", "displacement of the wall at the beginning and at the end of the step (2, 3)", default=None
     )
 
     def _at_points(self, mesh: TetMesh, x: jax.Array, s: Number) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Nodes (10, m), their functions (10, Q), and stretch of the springs (3, Q, m) [m]."""
+        """Nodes (n, m), their functions (n, Q), and stretch of the springs (3, Q, m) [m]."""
         nodes = jnp.stack(surface.triangle_nodes(mesh, self.triangles))
-        N = jnp.asarray(surface.triangle_functions(mesh, triangle_rule(_DEGREE)[1]), x.dtype)
+        N = jnp.asarray(surface.triangle_functions(mesh, triangle_rule(_DEGREE[mesh.order])[1]), x.dtype)
         u = jnp.einsum("aq,ami->iqm", N, (x - mesh.points)[nodes])
         if self.wall is not None:
             u = u - (self.wall[0] + s * (self.wall[1] - self.wall[0]))[:, None, None]

@@ -42,8 +42,16 @@ class Inertia(Physics):
             acceleration = _accelerations(*self._masses(start.mesh), start.free, start.free.vectors(-start.force()))
         return Motion(jnp.zeros_like(start.x), acceleration)
 
-    def freeze(self, memory: Motion, step: Step) -> "Moving":
+    @classmethod
+    def acts_without_memory(cls) -> bool:
+        """At rest its force is 0, but it has a stiffness."""
+        return True
+
+    def freeze(self, memory: Motion | None, step: Step) -> "Moving":
         """Masses, and the motion at the beginning of the step."""
+        if memory is None:
+            still = jnp.zeros_like(step.x)
+            memory = Motion(still, still if self.integrator == "newmark" else None)
         mass, shared = self._masses(step.mesh)
         mask, axes = step.free.mask, None
         for nodes in step.free.tied:

@@ -111,7 +111,7 @@ def initial_state(scene: Scene, start: jax.Array | None = None) -> State:
             return _forces_at_beginning(scene, x)
         # At rest in the reference positions only nodal forces act.
         begin = _first_step(scene, x, free)
-        acting = [p.freeze(None, begin) for p in physics if type(p).begin is Physics.begin]
+        acting = [p.freeze(None, begin) for p in physics if p.acts_without_memory()]
         forces = [a.force(scene.mesh, x, 0.0) for a in acting if isinstance(a, NodalForce)]
         return sum(forces, jnp.zeros_like(x))
 
@@ -150,13 +150,13 @@ def force_sizes(scene: Scene) -> Sizes:
 
 
 def _roundoff_at_nodes(scene: Scene, rounded: jax.Array) -> jax.Array:
-    """Size [N] of the springs' forces by rounded positions, a motion (V, 3) [m], in the reference shape.
+    """Size [N] of the forces of springs and masses by rounded positions, a motion (V, 3) [m], in the reference shape.
 
     Contact is left out: the points of contact are not known before the step.
     """
     x = scene.mesh.points
     begin = _first_step(scene, x, free_directions(scene))
-    acting = [p.freeze(None, begin) for p in physics_of(scene) if type(p).begin is Physics.begin]
+    acting = [p.freeze(None, begin) for p in physics_of(scene) if p.acts_without_memory()]
     springs = [a for a in acting if isinstance(a, NodalForce) and _is_spring(a) and not a.kinked]
     if not springs:
         return jnp.zeros((), x.dtype)

@@ -133,7 +133,8 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
             unit = raw_torque.unit_of("strain", cells, units[-1] if units else [])
             others = [c for c in columns_beside(cells, units[-1] if units else [], columns) if c.place < len(cells)]
             beside = tuple((c, _cells_of(c.place, own, delimiter, sign)) for c in others)
-            told = (*_nameless_deviations(cells), *_perhaps_thousands(own, columns, sign))
+            unread = raw_torque.without_unit(cells, units[-1] if units else [])
+            told = (*_nameless_deviations(cells), *_perhaps_thousands(own, columns, sign), *unread)
             tables.append(Table(name, columns, rows, numbers, raw, unit, beside, told))
         free = k
     return tables, headers

@@ -124,6 +124,11 @@ class PressedObstacle(Obstacle):
         """The travel () [m] at the beginning of a run: 0."""
         return jnp.zeros((), start.x.dtype)
 
+    @classmethod
+    def acts_without_memory(cls) -> bool:
+        """The force may act from time 0 on."""
+        return True
+
     def freeze(self, memory: Any, step: Step) -> "Pressing":
         """The force at the beginning and at the end of the step, and the travel of the obstacle before."""
         dt, dtype = 0.0 if step.dt is None else step.dt, step.x.dtype
