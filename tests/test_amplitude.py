@@ -182,6 +182,14 @@ def test_tension_and_a_frequency_that_is_missing(tmp_path, tanned):
     assert any("1 points without" in n for n in hole.notes)
 
 
+def test_strains_below_one_percent_may_be_fractions(tmp_path, tanned):
+    """Fractions under strain_% gave c2 = 5e6 Pa beside c1 = 500 Pa, without a word."""
+    law, memories, shares = tanned
+    for part, told in ((0.01, True), (1.0, False)):
+        sweep = strain_sweep.read_strain_sweep(written(tmp_path / "s.csv", law, memories, 0.0, shares, part * STRAIN))
+        assert any("if they are fractions, name the column strain_1" in n for n in sweep.notes) == told
+
+
 def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):
     law, memories, shares = tanned
     path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)

@@ -295,6 +295,17 @@ def test_errors_of_a_law_contain_uneven_noise():
     assert np.sqrt(np.mean(np.square(z))) < 2.0, z
 
 
+def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
+    """Ogden's law with alpha = 6: in simple shear alpha = -6 is the same, in tension 0.3 times the stress."""
+    law = lj.laws.Ogden(mu=(333.3,), alpha=(6.0,), bulk=None)
+    (shear,) = (c for c in synthetic(law, 0.02, 0) if c.label.startswith("simple"))
+    (candidate,) = stress_stretch.candidates("ogden", terms=1)
+    told = [s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other numbers follow")]
+    assert len(told) == 1 and "add a test of tension or compression" in told[0]
+    every = stress_stretch.fit(candidate, synthetic(law, 0.02, 0), 32).warnings
+    assert not [s for s in every if s.startswith("other numbers follow")]
+
+
 def test_a_parameter_without_data_is_told():
     law = lj.laws.NeoHookean(mu=770.0, bulk=None)
     (candidate,) = stress_stretch.candidates("fung_demiray")

@@ -378,6 +378,20 @@ def _heavier(scene, density):
     return lj.with_parameters(scene, {"body.density": density})
 
 
+def test_without_the_correction_its_size_is_the_stated_error(trained):
+    """If the correction is right, it is the error of the motion without it."""
+    scene, model, *_ = trained
+    found, V = lj.simulate_reduced(model, scene), len(scene.mesh.points)
+    rng = np.random.default_rng(6)
+    q, fields = rng.normal(size=(12, 6, model.number_of_modes)), rng.normal(size=(2, V, 3))
+    model = replace(model, correction=learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(V), 0.1)))
+    plain, moved = (lj.reduced_positions(model, scene, found, corrected) for corrected in (False, True))
+    assert np.array_equal(plain, lj.reduced_positions(replace(model, correction=None), scene, found))
+    farthest = np.linalg.norm(moved - plain, axis=-1).max(axis=1)
+    stated = lj.stated_error(model, scene, found, corrected=False)
+    assert farthest.max() > 0 and np.allclose(stated, np.maximum.accumulate(farthest), rtol=1e-12)
+
+
 def test_another_scene_and_other_physics_are_refused(trained, tmp_path):
     scene, model, *_ = trained
     q = np.random.default_rng(6).normal(size=(12, 6, 3))

@@ -356,6 +356,7 @@ def test_what_cannot_be_resumed_is_refused(files, capsys):
         ("law.nu\n700\n", "did you mean mu"),
         ("mesh.points.0\n700\n", "'mesh.points.0' is a list in the scene file"),
         ("mesh.points.0.1\n700\n", "only all points can change"),
+        ("mesh.cells.0\n3\n", "of a mesh only all points can change"),
         ("fixed.0.nodes.0\n3\n", "is not a number of the scene file"),
         ("solve.tolerance\n0.1\n0\n", "row 2: .*tolerance = 0.0 must be above 0"),
     ],

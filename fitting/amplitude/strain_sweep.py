@@ -11,6 +11,8 @@ from fitting.readers.tables.text_tables import text_of
 from liverjax.core.errors import InputError
 
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
+#: Largest strain of a sweep in percent below which the numbers may be fractions.
+SMALLEST_LARGEST = 0.01
 
 
 class StrainSweep(NamedTuple):
@@ -65,14 +67,7 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         raise InputError(
             f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a sweep of the strain alone"
         )
-    if not chosen.strain_unit:
-        notes.append("the strain column states no unit: the unit 1 is assumed, not %")
-    largest = LARGEST_STRAIN if chosen.strain_unit else LARGEST_WITHOUT_UNIT
-    if strain[kept].max() > largest:
-        raise InputError(
-            f"{path}: a strain of {strain[kept].max():g} is too large: write it in % (strain_%), or as a fraction "
-            "(strain_1)"
-        )
+    notes += _of_unit(path, chosen.strain_unit, float(strain[kept].max()))
     order = np.argsort(strain[kept], kind="stable")
     return StrainSweep(
         strain[kept][order],
@@ -82,3 +77,16 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         str(path),
         tuple(notes),
     )
+
+
+def _of_unit(path: Path, unit: str, largest: float) -> list[str]:
+    """A note if the unit of the strains is missing or may be another one; refuse strains that are too large."""
+    if largest > (LARGEST_STRAIN if unit else LARGEST_WITHOUT_UNIT):
+        raise InputError(
+            f"{path}: a strain of {largest:g} is too large: write it in % (strain_%), or as a fraction (strain_1)"
+        )
+    if not unit:
+        return ["the strain column states no unit: the unit 1 is assumed, not %"]
+    if unit != "1" and largest <= SMALLEST_LARGEST:
+        return [f"the strains end at {100 * largest:.3g} %: if they are fractions, name the column strain_1"]
+    return []

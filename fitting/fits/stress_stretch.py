@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
+from fitting.fits.honesty.other_minima import of_other_minima
 from fitting.fits.viscoelastic import EXACT
 from fitting.methods.estimate import errors_and_correlation, noise_factor, spread
 from fitting.methods.generalised_maxwell import HOPELESS
@@ -285,6 +286,7 @@ def assessed(
     """
     costs = np.where(np.isfinite(found.cost), np.asarray(found.cost), np.inf)
     best = int(np.argmin(costs))
+    lowest = costs[best] * (1 + 1e-6) + 1e-20  # of all starts that reached the minimum
     u, J, r = (np.asarray(v[best]) for v in (found.u, found.jacobian, found.residuals))
     n, p = sum(len(c.stress) for c in curves), len(u)
     misfit = r[:n]
@@ -323,7 +325,7 @@ def assessed(
         bic=float(criterion + k * np.log(n)),
         converged=bool(found.converged[best]),
         iterations=int(found.iterations[best]),
-        starts_at_minimum=int(np.sum(costs < costs[best] * (1 + 1e-6) + 1e-20)),
+        starts_at_minimum=int(np.sum(costs <= lowest)),
         warnings=[],
         run_time=times[0],
         compile_time=times[1],
@@ -331,6 +333,9 @@ def assessed(
     )
     told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
     told += _of_noise(alike, factors, n, len(curves))
+    if of_tests and not limits:
+        F = np.concatenate([c.F for c in curves])
+        told += of_other_minima(candidate, u, np.asarray(found.u)[costs <= lowest], scale, F)
     return result._replace(warnings=told)
 
 

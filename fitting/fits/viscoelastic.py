@@ -14,6 +14,7 @@ from fitting.methods.estimate import Estimate, errors_and_correlation, with_slop
 from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
+from fitting.methods.noise.factor_noise import factors_of_series
 from fitting.methods.noise.paired_noise import paired_root
 from fitting.methods.noise.uneven_noise import grouped_root
 from fitting.readers.frequency_sweep import check_sweep
@@ -172,8 +173,9 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
         rows = (2 * len(storage), sweep.noise_given, kind.effective)
         own = uncertainty.estimated(kind.names, kind.values, found, *rows)
     if not sweep.noise_given and kind.effective is None and len(found.residuals) == 2 * len(storage):
-        spread = _of_two_noises(spread, partial(uncertainty.parameter_vector, maxwell=kind.maxwell), found)
-        own = None if own is None or kind.values is None else _of_two_noises(own, kind.values, found)
+        omega, natural_of = sweep.angular_frequency, partial(uncertainty.parameter_vector, maxwell=kind.maxwell)
+        spread = _of_noise_shown(spread, natural_of, found, omega)
+        own = None if own is None or kind.values is None else _of_noise_shown(own, kind.values, found, omega)
     sentences = _misfit(sweep, storage, loss, kind)
     sentences += tuple(uncertainty.cautions(sweep, spread, kind.name) if own is None else ())
     converged = bool(found.converged)
@@ -187,11 +189,15 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
     return Fit(at.method, model, found, spread, converged, storage, loss, sentences, *seconds, details, kind, own)
 
 
-def _of_two_noises(estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution) -> Estimate:
-    """The estimate with the errors of G' and G'' that share noise at each frequency, as that of the torque, or that
-    have noise of their own, if their residuals show it."""
+def _of_noise_shown(
+    estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution, omega: np.ndarray
+) -> Estimate:
+    """The estimate with the errors for noise that repeats of a frequency share, that G' and G'' share, as that of the
+    torque, or of which G' and G'' each have their own, whatever the residuals show first."""
     J, r, slope = np.asarray(found.jacobian), np.asarray(found.residuals), with_slope(natural_of, found.u)[1]
-    root = paired_root(J, r, slope)
+    root = _of_repeats(J, r, slope, omega)
+    if root is None:
+        root = paired_root(J, r, slope)
     if root is None:
         root = grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, slope)
     if root is None:
@@ -199,6 +205,17 @@ def _of_two_noises(estimate: Estimate, natural_of: Callable[[Array], Array], fou
     errors, correlation = errors_and_correlation(root)
     errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)
     return estimate._replace(root=root, standard_errors=errors, correlation=correlation)
+
+
+def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
+    """Square root of the covariance for noise that the repeats of G', or of G'', at a frequency share; None if none."""
+    of_row = np.concatenate([omega, omega + 2 * omega.max()])  # G'' is measured for itself
+    _, group, counts = np.unique(of_row, return_inverse=True, return_counts=True)
+    if np.median(counts) < 2:
+        return None
+    order = np.argsort(group, kind="stable")
+    shared = factors_of_series(counts.tolist(), J[order], r[order], np.ones(len(r)), slope)
+    return None if shared is None else shared.root
 
 
 #: N modes without an equilibrium modulus: their ratios add up to one.

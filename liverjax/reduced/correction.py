@@ -77,6 +77,11 @@ def correction_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array
     return jnp.tensordot(terms(q, own.scale, own.products, dt) @ own.factors, own.fields, axes=1)
 
 
+def size_at(own: Correction, q: jax.Array, dt: Number | None) -> jax.Array:
+    """Largest distance by which the correction moves a node up to each step: (T,) [m]."""
+    return jax.lax.cummax(_largest_of_steps(correction_at(own, q, dt)))
+
+
 def stated_at(own: Correction, q: jax.Array, moved: jax.Array, dt: Number | None) -> jax.Array:
     """Stated largest distance of a node from the full model up to each step, after the correction: (T,) [m].
 

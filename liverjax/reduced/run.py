@@ -9,14 +9,14 @@ import jax.numpy as jnp
 
 from liverjax.core import status
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import param, replace, struct
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.promotion import on_middles
 from liverjax.physics.base import End, Free, Step
 from liverjax.physics.loads import Loads, dead_loads
 from liverjax.physics.prescribed import prescribed
 from liverjax.physics.viscosity import initial_history
-from liverjax.reduced.correction import correction_at, stated_at
+from liverjax.reduced.correction import correction_at, size_at, stated_at
 from liverjax.reduced.fluid import (
     ReducedFluid,
     advanced_fluid,
@@ -211,10 +211,10 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
     return _reduced_run(without_rows(model), scene)
 
 
-def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Positions (T, V, 3) [m] of the nodes, with the correction that the model has learnt."""
+def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
+    """Positions (T, V, 3) [m] of the nodes, with the correction that the model has learnt, or without it."""
     mesh, solve = scene.mesh, scene.solve
-    u = _free_motion(model, scene, result)
+    u = _free_motion(model if corrected else replace(model, correction=None), scene, result)
     if scene.displaced:
         numbers = jnp.arange(1, solve.steps + 1, dtype=u.dtype)
         u = u + jax.vmap(lambda k, t: prescribed(mesh, scene.displaced, t, k / solve.steps))(numbers, result.times)
@@ -240,13 +240,16 @@ def _free_motion(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
     return u
 
 
-def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:
-    """Estimated largest distance of a node from the full model (T,) [m], learnt from the runs left out.
+def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
+    """Estimated largest distance of a node from the full model up to each step (T,) [m].
 
-    It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` uses the full mesh.
+    It needs no full mesh, and may be differentiated, vmapped and jitted. `reduced_error` uses the full mesh. The error
+    of the corrected motion is learnt from the runs left out. Without the correction the motion is less exact, but the
+    size of the correction states its error well (`experiments/TABLES.md` has both).
 
     Args:
         model, scene, result: as in `simulate_reduced`.
+        corrected: of `reduced_positions` with, or without the correction.
 
     Raises:
         InputError: a model without a correction: made from few rows, or none made its errors smaller; numbers that
@@ -255,5 +258,7 @@ def stated_error(model: ReducedModel, scene: Scene, result: ReducedResult) -> ja
     if model.correction is None:
         raise InputError("this reduced model has no correction: make it from more rows, or take lj.reduced_error")
     refuse_unseen_numbers(model, scene)
+    if not corrected:
+        return size_at(model.correction, result.coordinates, scene.solve.dt)
     moved = _free_motion(model, scene, result)
     return stated_at(model.correction, result.coordinates, moved, scene.solve.dt)

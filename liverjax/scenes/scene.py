@@ -139,6 +139,8 @@ def numbers_at(scene: Scene, name: str) -> Any:
     Raises:
         InputError: a name that the scene does not have, or the name of something else than floating-point numbers.
     """
+    if name.startswith("mesh.") and not name.startswith("mesh.points"):
+        raise InputError(f"{_refusal(name)}: of a mesh only all points can change, mesh.points")
     found = names.get(scene, name, _refusal(name))
     # Whole numbers are allowed where a user wrote one (`mu = 770`); an array of them names places in the mesh.
     if not all(isinstance(v, int) or np.issubdtype(np.asarray(v).dtype, np.floating) for v in jax.tree.leaves(found)):

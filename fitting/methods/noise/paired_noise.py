@@ -9,8 +9,9 @@ _GAIN = 3.3
 #: Largest size of a correlation, and of the logarithm of the ratio of the two deviations. A lower limit of the
 #: correlation, as 0.9, would give a wrong level to noise that is wholly in common.
 _MOST, _RATIO = 1 - 1e-9, 5.0
-#: Smallest condition of J at which it is tried.
-_CONDITION = 1e-8
+#: Pairs beyond the number of unknowns from which it is tried: with few pairs independent noise looks shared. Smallest
+#: condition of J.
+_BEYOND, _CONDITION = 8, 1e-8
 
 
 def paired_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray | None:
@@ -25,7 +26,7 @@ def paired_root(J: np.ndarray, r: np.ndarray, slope: np.ndarray) -> np.ndarray |
         slope: derivatives of the numbers by u (P, p).
     """
     (n, p), scale = J.shape, np.linalg.norm(J, axis=0)
-    if n % 2 or n <= p + 3 or not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and np.all(scale > 0)):
+    if n % 2 or n // 2 < p + _BEYOND or not (np.all(np.isfinite(J)) and np.all(np.isfinite(r)) and np.all(scale > 0)):
         return None
     J = J / scale
     values = np.linalg.svd(J, compute_uv=False)
