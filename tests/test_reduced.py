@@ -383,8 +383,8 @@ def test_without_the_correction_its_size_is_the_stated_error(trained):
     scene, model, *_ = trained
     found, V = lj.simulate_reduced(model, scene), len(scene.mesh.points)
     rng = np.random.default_rng(6)
-    q, fields = rng.normal(size=(12, 6, model.number_of_modes)), rng.normal(size=(2, V, 3))
-    model = replace(model, correction=learnt_correction(Learnt(q, _missing(q, fields), np.ones(12), np.ones(V), 0.1)))
+    q, fields = rng.normal(size=(40, 6, model.number_of_modes)), rng.normal(size=(2, V, 3))
+    model = replace(model, correction=learnt_correction(Learnt(q, _missing(q, fields), np.ones(40), np.ones(V), 0.1)))
     plain, moved = (lj.reduced_positions(model, scene, found, corrected) for corrected in (False, True))
     assert np.array_equal(plain, lj.reduced_positions(replace(model, correction=None), scene, found))
     farthest = np.linalg.norm(moved - plain, axis=-1).max(axis=1)
