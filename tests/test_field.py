@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from types import SimpleNamespace
 
 import h5py
 import jax
@@ -454,6 +455,13 @@ def test_tables_of_displacements_of_other_programs(tmp_path, written):
     found = displacements.read_displacements(tmp_path / "u.csv", _scene(tmp_path), 1e-4, "mm")
     assert found.nodes[:, 0].tolist() == [5, 6] and found.components == 5
     assert np.allclose(found.measured, 1e-3 * np.array([[1e-3, 0, -2e-4], [0, 0.25, 1]]), rtol=1e-14)
+
+
+def test_chance_in_the_residuals_of_a_map_is_no_warning():
+    """Of 240 components chi2 is 1 +- 0.09 each."""
+    for chi2, told in ((1.01, False), (1.25, False), (1.3, True)):
+        found = SimpleNamespace(reached=False, chi2=240 * chi2, components=240)
+        assert (field_report.noise_sentence(found) is not None) == told
 
 
 def test_a_fit_that_misses_the_data_says_so():

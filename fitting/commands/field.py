@@ -112,12 +112,7 @@ def _map(options: argparse.Namespace, problem: Problem) -> int:
     good = all(c == status.CONVERGED for c in found.codes) and found.distance <= field.FAR
     print(field_report.table_of_field(found))
     content = _files(options) | {"map": field_report.of_field(found) | {"mesh_error_over_noise": beside}}
-    if not found.reached and found.chi2 > found.components + 3 * (2 * found.components) ** 0.5:  # more than chance
-        print(
-            f"warning: chi2 stays at {found.chi2 / found.components:.3g} per component: the stated noise is too small, "
-            "or the scene misses something (mesh, supports, loads)",
-            file=sys.stderr,
-        )
+    _warn(field_report.noise_sentence(found))
     _warn(field.distance_sentence(found))
     _warn(field.bias_sentence(found))
     if options.sphere:

@@ -40,6 +40,17 @@ def misfit_sentence(found: Estimate) -> str | None:
     )
 
 
+def noise_sentence(found: Field) -> str | None:
+    """A warning if the residuals of a map stay above the stated noise by more than chance; else None."""
+    chance = 3 * np.sqrt(2 * found.components)
+    if found.reached or found.chi2 <= found.components + chance:
+        return None
+    return (
+        f"chi2 stays at {found.chi2 / found.components:.3g} per component: the stated noise is too small, or the scene "
+        "misses something (mesh, supports, loads)"
+    )
+
+
 def of_numbers(found: Estimate) -> Content:
     """The content of field.json for a few numbers."""
     return {
