@@ -334,9 +334,16 @@ def assessed(
     told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
     told += _of_noise(alike, factors, n, len(curves))
     if of_tests and not limits:
-        F = np.concatenate([c.F for c in curves])
-        told += of_other_minima(candidate, u, np.asarray(found.u)[costs <= lowest], scale, F)
+        told += _of_other_minima(candidate, values, np.asarray(found.u)[costs <= lowest], scale, curves)
     return result._replace(warnings=told)
+
+
+def _of_other_minima(
+    candidate: Candidate, values: np.ndarray, us: np.ndarray, scale: float, curves: list[Curve]
+) -> list[str]:
+    """`of_other_minima` for the unknowns (S, p) of the starts that reached the minimum."""
+    every = np.asarray(jax.vmap(lambda u: candidate.values(u, scale))(jnp.asarray(us)))
+    return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
 def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
