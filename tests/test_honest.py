@@ -356,7 +356,7 @@ def test_storage_and_loss_have_noise_of_their_own(noises):
     assert np.any(np.abs(np.log(np.median(equal, axis=0) / scatter)) > 0.5)
 
 
-@pytest.mark.parametrize("own", [0.0, 0.01])
+@pytest.mark.parametrize("own", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
 def test_storage_and_loss_share_the_noise_of_the_torque(own):
     """Errors of independent noise held G0 in 83 to 88 % of the 95 % intervals."""
     hertz = np.logspace(-1, 1.2, 20)
