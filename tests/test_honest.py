@@ -17,7 +17,6 @@ from fitting.fits.honesty import edges, total_error
 from fitting.fits.viscoelastic import SHORT
 from fitting.methods import generalised_maxwell, kramers_kronig, uncertainty
 from fitting.methods.kramers_kronig import runs_probability
-from fitting.methods.noise.paired_noise import paired_root
 from fitting.readers.frequency_sweep import scatter
 from fitting.readers.rheometer import Sweep, read_sweep, some, within, without_inertia
 from liverjax import InputError
@@ -354,37 +353,6 @@ def test_storage_and_loss_have_noise_of_their_own(noises):
     scatter = np.std(values, axis=0)  # of 60 draws: to 9 %
     assert np.all(np.abs(np.log(np.median(errors, axis=0) / scatter)) < 0.3), np.median(errors, axis=0) / scatter
     assert np.any(np.abs(np.log(np.median(equal, axis=0) / scatter)) > 0.5)
-
-
-@pytest.mark.parametrize("own", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
-def test_storage_and_loss_share_the_noise_of_the_torque(own):
-    """Errors of independent noise held G0 in 83 to 88 % of the 95 % intervals."""
-    hertz = np.logspace(-1, 1.2, 20)
-    iwt = 2j * np.pi * hertz * np.array([[0.5], [0.05]])
-    G = 1000 * (0.4 + np.sum(np.array([[0.3], [0.3]]) * iwt / (1 + iwt), axis=0))
-    held, alone = [], []
-    for seed in range(150):
-        rng = np.random.default_rng(seed)
-        noise = 1 + 0.03 * rng.normal(size=20) + own * rng.normal(size=(2, 20))
-        fit = viscoelastic.closed_form(Sweep(2 * np.pi * hertz, G.real * noise[0], G.imag * noise[1]), 2)
-        off = np.abs(fit.uncertainty.values - [1000, 0.3, 0.3, 0.5, 0.05])
-        held.append(off < 2.03 * fit.uncertainty.standard_errors)
-        alone.append(off < 2.03 * uncertainty.estimate(fit.solution, False).standard_errors)
-    # 150 draws: the binomial spread is 0.018 at 95 %.
-    assert np.all(np.mean(held, axis=0) > 0.895), np.mean(held, axis=0)
-    assert np.mean(alone, axis=0)[0] < 0.9
-
-
-def test_few_independent_points_share_no_noise():
-    """With 5 numbers 61 % of independent noise looked shared, and errors were up to 9 times too small."""
-    hertz = np.logspace(-1, 1.2, 5)
-    iwt = 2j * np.pi * hertz * np.array([[0.5], [0.05]])
-    G = 1000 * (0.4 + np.sum(np.array([[0.3], [0.3]]) * iwt / (1 + iwt), axis=0))
-    for seed in range(12):
-        noise = 1 + 0.03 * np.random.default_rng(seed).normal(size=(2, 5))
-        fit = viscoelastic.closed_form(Sweep(2 * np.pi * hertz, G.real * noise[0], G.imag * noise[1]), 2)
-        J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
-        assert paired_root(J, r, np.eye(5)) is None
 
 
 def test_repeats_share_the_noise_of_their_frequency():

@@ -15,7 +15,6 @@ from fitting.methods.generalised_maxwell import Maxwell, Spectrum
 from fitting.methods.host import Array
 from fitting.methods.least_squares import ZERO, Solution, bfgs, from_starts
 from fitting.methods.noise.factor_noise import factors_of_series
-from fitting.methods.noise.paired_noise import paired_root
 from fitting.methods.noise.uneven_noise import grouped_root
 from fitting.readers.frequency_sweep import check_sweep
 from fitting.readers.rheometer import Sweep
@@ -192,12 +191,10 @@ def fit_at(sweep: Sweep, at: BestPoint, kind: Kind, seconds: tuple[float, float]
 def _of_noise_shown(
     estimate: Estimate, natural_of: Callable[[Array], Array], found: Solution, omega: np.ndarray
 ) -> Estimate:
-    """The estimate with the errors for noise that repeats of a frequency share, that G' and G'' share, as that of the
-    torque, or of which G' and G'' each have their own, whatever the residuals show first."""
+    """The estimate with the errors for noise that repeats of a frequency share, or of which G' and G'' each have their
+    own, if their residuals show it."""
     J, r, slope = np.asarray(found.jacobian), np.asarray(found.residuals), with_slope(natural_of, found.u)[1]
     root = _of_repeats(J, r, slope, omega)
-    if root is None:
-        root = paired_root(J, r, slope)
     if root is None:
         root = grouped_root(J, r, np.arange(len(r)) >= len(r) // 2, slope)
     if root is None:
