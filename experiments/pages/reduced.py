@@ -200,7 +200,7 @@ def quadratic_words(r: dict, took: dict) -> str:
     return (
         f"The largest displacement is {r['largest_displacement_mm']:.0f} mm. The error of the modes alone is stated by "
         f"the size of the correction. A run takes {took['iterations_per_step']:.2g} iterations a step. Times of steps "
-        "are the processor's, of one core."
+        "are the processor's, of one core; tests of low priority ran beside the training."
     )
 
 
