@@ -80,6 +80,13 @@ def test_a_scene_file_says_what_it_says(folder):
     assert scene.solve.steps == 3 and scene.solve.dt == 0.05
 
 
+def test_a_byte_order_mark_is_no_part_of_a_scene(folder):
+    """Some editors of Windows write it first."""
+    text = (folder / "scene.toml").read_text()
+    (folder / "marked.toml").write_text(text, encoding="utf-8-sig")
+    assert lj.load_scene(folder / "marked.toml").solve.steps == 3
+
+
 def test_parameters_by_the_files_own_names(folder):
     scene = lj.load_scene(folder / "scene.toml")
     changed = lj.with_parameters(

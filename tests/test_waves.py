@@ -236,6 +236,44 @@ def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     assert "map: chi2" in capsys.readouterr().out
 
 
+def test_regions_of_a_run_that_was_killed_are_not_searched_for_again(tmp_path, monkeypatch):
+    """Killed in the map: the regions are read from their file, to the last bit, and only for the same waves."""
+    from fitting.waves import regions
+
+    labels = np.ones((7, 7, 9), int)
+    labels[..., 5:] = 4
+    path = written(tmp_path, ".npz", plane_waves((7, 7, 9), noise=1e-7, labels=labels))
+    ask = ["waves", str(path), "--density", "1000", "--out", str(tmp_path / "out"), "--samples", "0"]
+
+    def killed(*_: object, **__: object):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stiffness_map, "map_of", killed)
+        assert command.main(ask) > 2
+    searched, search = [], regions.moduli_of_regions
+    monkeypatch.setattr(regions, "moduli_of_regions", lambda *a: searched.append(a) or search(*a))
+    assert command.main([*ask, "--resume", "--no-map"]) == 0 and not searched
+    again = json.loads((tmp_path / "out" / "waves.json").read_text())
+    assert command.main([*ask, "--no-map"]) == 0 and len(searched) == 2
+    unbroken = json.loads((tmp_path / "out" / "waves.json").read_text())
+    for key in ("whole", "regions"):
+        assert again[key] == unbroken[key]
+    assert command.main([*ask, "--resume", "--no-map", "--noise", "3e-7"]) == 2
+    (tmp_path / "out" / "progress_of_regions.h5").write_bytes(b"half")
+    assert command.main([*ask, "--resume", "--no-map"]) == 2
+
+
+def test_too_few_balances_and_a_length_in_millimetres_are_refused(tmp_path, capsys):
+    """4 x 4 x 4 voxels have one brick, with fewer balances than pressures."""
+    path = written(tmp_path, ".npz", plane_waves((4, 4, 4)))
+    assert command.main(["waves", str(path), "--noise", "1e-7", "--out", str(tmp_path / "out")]) == 2
+    assert "give 0 equations beside the unknown pressures: waves need at least 10" in capsys.readouterr().err
+    path = written(tmp_path, ".npz", plane_waves((7, 7, 9), noise=1e-7))
+    assert command.main(["waves", str(path), "--out", str(tmp_path / "out"), "--length", "4"]) == 2
+    assert "--length 4 m is much longer than the organ (0.016 m)" in capsys.readouterr().err
+
+
 def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
     """Text, and HDF5 of another program."""
     own = organ()
@@ -243,7 +281,7 @@ def test_a_progress_file_that_is_none_gets_a_sentence(tmp_path):
     for write in (lambda file: file.write_text("no progress"), lambda file: h5py.File(file, "w").close()):
         file = tmp_path / "progress.h5"
         write(file)
-        with pytest.raises(InputError, match=r"belongs to another fit.*: leave out --resume"):
+        with pytest.raises(InputError, match=r"belongs to another fit|is damaged, or of another program: leave out"):
             stiffness_map._first_or_resumed(course, file)
 
 

@@ -17,10 +17,13 @@ from liverjax.core.files import writable
 
 if TYPE_CHECKING:
     from fitting.waves.elastography import Organ
+    from fitting.waves.kept_regions import Keep
 
-FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5")
+FILES = ("waves.json", "waves.h5", "waves.vtu", "waves.png", "progress.h5", "progress_of_regions.h5")
 #: Largest memory of one factor [GB]; if a grid needs more, it is made coarser, or a larger --stride is demanded.
 MOST_MEMORY = 4.0
+#: Longest length of a map over the organ's size: above it the map is uniform.
+LONGEST = 5.0
 
 
 def parser(prog: str) -> argparse.ArgumentParser:
@@ -67,11 +70,13 @@ def run(options: argparse.Namespace) -> int:
     field = wave_field.with_noise(field, options.noise)
     writable(options.out, FILES)
     organ = _organ(options, field)
+    if not options.no_map:
+        _check_length_of_map(options.length, organ)
     for note in field.notes:
         print(f"note: {note}", file=sys.stderr)
     bar, told = cost_bar("steps")
     with bar, _forces_that_balance(options.data):
-        found = elastography.regions_of(organ, told)
+        found = elastography.regions_of(organ, told, _kept_regions(options, organ))
         drawn = None
         if not options.no_map:
             length = options.length or float(4 * np.mean(organ.field.spacing))
@@ -83,10 +88,31 @@ def run(options: argparse.Namespace) -> int:
     print(waves_report.table(content))
     for sentence in content["warnings"]:
         print(f"warning: {sentence}", file=sys.stderr)
-    files = FILES[:-1] if drawn is not None else FILES[:2]
+    files = FILES[:4] if drawn is not None else FILES[:2]
     print(f"written: {options.out}/{', '.join(files)}")
     good = np.all(found.whole.converged) and (found.parts is None or np.all(found.parts.converged))
     return 0 if good and (drawn is None or drawn.distance <= stiffness_map.FAR) else 1
+
+
+def _check_length_of_map(length: float | None, organ: "Organ") -> None:
+    size = float(np.ptp(np.asarray(organ.body.mesh.points), axis=0).max())
+    if length is not None and length > LONGEST * size:
+        raise InputError(
+            f"--length {length:g} m is much longer than the organ ({size:.2g} m), so that the map is uniform: give "
+            f"metres, e.g. {size / 4:.1g}, or --no-map"
+        )
+
+
+def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
+    from fitting.waves import kept_regions
+
+    marks = kept_regions.marks_of(
+        *organ.waves, organ.body.voxel, spacing=organ.field.spacing, labels=organ.field.labels, density=organ.density
+    )
+    file = options.out / FILES[5]
+    if options.resume and not file.is_file():
+        print(f"note: {options.out} has nothing to resume: the search begins", file=sys.stderr)
+    return kept_regions.kept_in(file, options.resume, marks)
 
 
 @contextmanager

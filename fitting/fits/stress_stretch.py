@@ -67,6 +67,8 @@ class LawFit(NamedTuple):
     limits: dict[str, str]  # parameters that ran away to 0 or infinity
 
 
+#: Factors of the tests that the residuals do not show are told if they move a number by so many standard errors.
+_HIDDEN = 2.0
 #: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law.
 RUNAWAY = 1e6
 #: Ratio of an error of uneven noise and that of equal noise from which the correlation is that of uneven noise.
@@ -333,6 +335,7 @@ def assessed(
     )
     told = _warnings(result, curves, s, bool(np.any(r[n:] < 0)))
     told += _of_noise(alike, factors, n, len(curves))
+    told += _of_hidden_factors(factors, np.array(candidate.names)[known], values[known], errors[known])
     if of_tests and not limits:
         told += _of_other_minima(candidate, values, np.asarray(found.u)[costs <= lowest], scale, curves)
     return result._replace(warnings=told)
@@ -355,12 +358,27 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
             f"offset of its own, or the law misses something; {n} points measure as much as {alike.independent:.0f} of "
             "independent noise, and the standard errors are those of such noise"
         )
-    if factors is not None:
+    if factors is not None and factors.shown:
         told.append(
             f"each test seems to have a factor of its own, of {100 * factors.deviation:.2g} %, as by another sample or "
             f"a wrong size of it; the standard errors contain such factors of {tests} tests"
         )
     return told
+
+
+def _of_hidden_factors(
+    factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
+) -> list[str]:
+    """A sentence on factors of the tests that the residuals do not show: the parameters can take them up."""
+    if factors is None or factors.shown or not np.any(factors.moves > _HIDDEN * errors):
+        return []
+    worst = int(np.argmax(factors.moves / np.maximum(errors, 1e-300)))
+    return [
+        f"a factor of its own of each test, as by the size of another sample, would hardly show in the residuals: "
+        f"factors of {100 * factors.hidden:.2g} % would move {names[worst]} by some {factors.moves[worst]:.2g}, and "
+        f"{names[worst]} = {values[worst]:.4g} ± {errors[worst]:.2g} does not contain them; measure all tests on one "
+        "sample, or one of them on several samples"
+    ]
 
 
 def _errors_of_law(
@@ -394,6 +412,9 @@ def _errors_of_law(
         roots.append(slope @ alike.root)
     if factors is not None:
         roots.append(factors.root)
+        # Errors that factors make much wider are told too, though chance may have shown these factors.
+        wide = np.any(errors_and_correlation(factors.root)[0] > _HIDDEN * errors)
+        factors = factors._replace(shown=factors.shown or bool(wide))
     for root in roots:
         uneven = errors_and_correlation(root)
         if np.any(uneven[0] > _UNEVEN * errors):

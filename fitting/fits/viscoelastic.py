@@ -212,7 +212,7 @@ def _of_repeats(J: np.ndarray, r: np.ndarray, slope: np.ndarray, omega: np.ndarr
         return None
     order = np.argsort(group, kind="stable")
     shared = factors_of_series(counts.tolist(), J[order], r[order], np.ones(len(r)), slope)
-    return None if shared is None else shared.root
+    return shared.root if shared is not None and shared.shown else None
 
 
 #: N modes without an equilibrium modulus: their ratios add up to one.

@@ -81,8 +81,8 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     end = next((k for k in range(first, len(cells)) if cells[k][:1] == ["[step]"]), len(cells))  # the next sheet
     if end < first + 2:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
-    names, between = cells[first], _delimiter_of_curves(lines[first])
-    rows = [dict(zip(names, own, strict=False)) for own in cells[first + 1 : end]]
+    names, between = [_known_heading(name) for name in cells[first]], _delimiter_of_curves(lines[first])
+    rows = [_row_under(names, own, file) for own in cells[first + 1 : end]]
     if between != ",":  # decimals may have commas then
         sign = decimal_sign(cell for row in rows for cell in row.values())
         rows = [{k: _with_point(v, between, sign) for k, v in row.items()} for row in rows]
@@ -97,12 +97,30 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     return rows
 
 
+def _row_under(names: list[str], cells: list[str], file: Path) -> dict[str, str]:
+    if any(cells[len(names) :]):
+        raise InputError(
+            f"{file}: {len(cells)} cells under {len(names)} headings in {','.join(cells)[:60]!r}; write decimals with "
+            "a point, and name every column"
+        )
+    return dict(zip(names, cells, strict=False))  # cells at the end may be missing
+
+
 def _delimiter_of_curves(line: str) -> str:
     found = find_delimiter(line)
     return found if found in ";\t" else ","
 
 
-def _names_curves(names: list[str]) -> bool:
+def _known_heading(name: str) -> str:
+    """A heading as it is documented: capital letters and the unit [-] do not matter."""
+    plain = re.sub(r"\s*[\[(][-1][\])]$", "", name)
+    if plain.lower() in ("test", "stretch", "shear"):
+        return plain.lower()
+    return re.sub(r"(?i)^nominal[ _]stress", "nominal_stress", name)
+
+
+def _names_curves(headings: list[str]) -> bool:
+    names = [_known_heading(name) for name in headings]
     return "F11" in names or ("test" in names and bool({"stretch", "shear"} & set(names)))
 
 

@@ -158,7 +158,7 @@ def curve_of(curve: Callable[[float], float], d: np.ndarray) -> np.ndarray:
 
 def _description(path: Path) -> Described:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); give a description of a test") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -10,6 +10,7 @@ import scipy.ndimage
 
 from fitting.waves import balance, edge_places, edges, regions, stiffness_map, voxels
 from fitting.waves.balance import Matrices, gigabytes
+from fitting.waves.kept_regions import Keep
 from fitting.waves.regions import MeasuredWaves, Regions
 from fitting.waves.voxels import VoxelBody
 from fitting.waves.wave_field import WaveField
@@ -20,6 +21,10 @@ __all__ = ["Found", "Organ", "body_of", "gigabytes", "organ_of", "plane_wave_bia
 #: directions than the data's count for less.
 DIRECTIONS = tuple(n for n in itertools.product((1, 0, -1), repeat=3) if n > (0, 0, 0))
 SHARPNESS = 4
+
+
+#: Fewest equations of one frequency that are left beside the pressures: there are two numbers to find, and noise.
+FEWEST_BALANCES = 10
 
 
 class Organ(NamedTuple):
@@ -81,22 +86,41 @@ def organ_of(field: WaveField, body: VoxelBody, density: float) -> Organ:
     motion = field.displacement[(slice(None), *body.voxel.T)]
     omega = 2 * np.pi * field.frequencies
     waves = MeasuredWaves(omega, motion.reshape(len(omega), -1), np.maximum(field.noise, 1e-9 * np.abs(motion).max()))
-    return Organ(field, body, balance.matrices(body, density), waves, density)
+    m = balance.matrices(body, density)
+    if m.balances < FEWEST_BALANCES:
+        raise InputError(
+            f"the {len(body.voxel)} measured voxels of the mask give {max(0, m.balances)} equations beside the unknown "
+            f"pressures: waves need at least {FEWEST_BALANCES}; give a larger mask or a smaller --stride"
+        )
+    return Organ(field, body, m, waves, density)
 
 
-def regions_of(organ: Organ, progress: Callable[[int, float], None] = lambda k, cost: None) -> Found:
-    """Moduli of the whole organ, and of its regions if labels are given."""
+def regions_of(
+    organ: Organ,
+    progress: Callable[[int, float], None] = lambda k, cost: None,
+    keep: Keep = lambda name, find: find(),
+) -> Found:
+    """Moduli of the whole organ, and of its regions if labels are given; `keep` as from `kept_regions.kept_in`."""
     m, waves, body = organ.matrices, organ.waves, organ.body
-    start = regions.first_modulus(m, waves)
-    whole = regions.moduli_of_regions(_uniform(m, body, organ.density), waves, np.array([start]), progress, body.voxel)
+
+    def of_whole() -> Regions:
+        start, uniform = np.array([regions.first_modulus(m, waves)]), _uniform(m, body, organ.density)
+        return regions.moduli_of_regions(uniform, waves, start, progress, body.voxel)
+
+    whole = keep("whole", of_whole)
     bias, left = (each[:, 0] for each in _biases(organ, whole.modulus))
     labels = organ.field.labels
     if labels is None:
         return Found(whole, None, None, bias, left)
     known = np.unique(labels[tuple(body.voxel.T)])
-    each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
-    matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
-    parts = regions.moduli_of_regions(matrices, waves, np.full(len(known), whole.modulus[0, 0]), progress, body.voxel)
+
+    def of_parts() -> Regions:
+        each = [edge_places.places(labels, body, known, farther) for farther in (0.0, edge_places.FARTHER)]
+        matrices = edges.region_matrices(m, body, organ.density, *each[: len(known)])
+        start = np.full(len(known), whole.modulus[0, 0])
+        return regions.moduli_of_regions(matrices, waves, start, progress, body.voxel)
+
+    parts = keep("parts", of_parts)
     return Found(whole, known, parts, bias, left, *_biases(organ, parts.modulus))
 
 

@@ -400,8 +400,8 @@ def _first_or_resumed(course: Course, file: Path | None) -> _Begun:
             refuse_other(file, f.attrs, course.marks())
             history = [dict(zip(_HISTORY, map(float, row), strict=True)) for row in f["history"][:]]
             z, ends = f["z"][:], f["visited"][:]
-    except (OSError, KeyError):  # not HDF5, or from another program
-        raise InputError(f"{file} belongs to another fit: leave out --resume or name another --out") from None
+    except (OSError, KeyError):
+        raise InputError(f"{file} is damaged, or of another program: leave out --resume") from None
     visited = []
     for k, end in enumerate(ends):
         point = _reached(course, end, k)

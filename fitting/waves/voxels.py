@@ -35,7 +35,7 @@ def voxel_body(mask: np.ndarray, spacing: np.ndarray, origin: np.ndarray | None 
     if min(cells) < 1:
         raise InputError(
             f"the mask reaches over {' x '.join(map(str, np.array(mask.shape) - first))} voxels: waves need at least "
-            "5 along every axis; measure more slices"
+            "3 along every axis, and better 5 or more; measure more slices"
         )
     kept = _whole_bricks(mask[tuple(slice(f, None) for f in first)], cells)
     inner = _surrounded(kept)

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     from liverjax.simulation.cautions import cautions_of_run
     from liverjax.simulation.run import unloaded
 
-    scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8")
+    scene, text = scene_file.load_scene(options.scene), options.scene.read_text(encoding="utf-8-sig")
     names, reactions = _asked_for(options, scene, text)
     if scene.solve.kind == "harmonic":
         return harmonic.run(options, scene, text)

@@ -58,7 +58,7 @@ def make(
     scene = replace(table.scene, solve=replace(table.scene.solve, reduced=""))
     rows = {name: table.rows[:, k] for k, name in enumerate(table.names)}
     model = reduce_scene(scene, rows, tolerance, modes, runs=runs)
-    save_reduced(model, out, scene_file.read_text(encoding="utf-8"))
+    save_reduced(model, out, scene_file.read_text(encoding="utf-8-sig"))
     return model
 
 

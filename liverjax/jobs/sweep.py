@@ -121,7 +121,7 @@ def read_sweep(
     chunk = min(chunk, len(numbers))
     own_shapes = ["reference"] if scene.points_are == "loaded" else []
     identity = {
-        "scene": scene_file.read_text(encoding="utf-8"),
+        "scene": scene_file.read_text(encoding="utf-8-sig"),
         "numbers": resumable_parts.digest(*jax.tree.leaves(scene)),
         "parameters": resumable_parts.digest(rows) + " " + " ".join(names),
         "rows": resumable_parts.digest(numbers),

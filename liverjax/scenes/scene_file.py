@@ -75,7 +75,7 @@ def load_scene(path: str | Path) -> Scene:
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except IsADirectoryError:
         raise InputError(f"{path} is a folder: give a scene file (TOML)") from None
     except OSError as error:

@@ -34,6 +34,8 @@ SLOW_PART = 0.1
 BISECTIONS, ITERATIONS = 6, 60
 #: Distance of the farther end that is told, over that of the 95 % interval of the standard error, and over the number.
 WIDER, LARGE = 2.0, 0.05
+#: Half width of a 95 % interval over the standard error, of many independent residuals.
+NORMAL = 1.96
 
 
 class Interval(NamedTuple):
@@ -177,18 +179,19 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
         return fit
     low, high = factor * found.low, factor * found.high
     rest = max(0.0, float(fit.model.shear_modulus * (1 - np.sum(fit.model.ratios))))
-    errors, whole = (error, fit.uncertainty.quantile * error), float(fit.model.shear_modulus)
-    told: list[str] = _told_interval((low, rest, high), errors, found, whole)
+    whole = float(fit.model.shear_modulus)
+    told: list[str] = _told_interval((low, rest, high), error, found, whole)
     numbers = {"low": low, "high": high, "longest_relaxation_time": found.longest, "modes": found.modes}
     details = details | {INTERVAL: numbers | {"wider_than_standard_error": bool(told)}}
     return fit._replace(details=details, warnings=(*fit.warnings, *told))
 
 
-def _told_interval(
-    ends: tuple[float, float, float], errors: tuple[float, float], found: Interval, whole: float
-) -> list[str]:
-    """A sentence if the `ends` (low, value, high) are farther away than the standard error and its 95 % half width."""
-    (low, rest, high), (error, half) = ends, errors
+def _told_interval(ends: tuple[float, float, float], error: float, found: Interval, whole: float) -> list[str]:
+    """A sentence if the `ends` (low, value, high) are much farther away than two standard errors.
+
+    It does not count that Student's t of few independent residuals is larger: a reader takes ± for a standard error.
+    """
+    low, rest, high = ends
     where = f"if parts of the material relax in up to {found.longest:.3g} s"
     if rest <= 1e-9 * whole:
         if high < LARGE * whole:
@@ -197,7 +200,7 @@ def _told_interval(
             f"a solid follows the data as well as the fluid: {where}, its equilibrium modulus is 0 to {high:.3g} Pa "
             "(95 %); a longer test decides"
         ]
-    if max(rest - low, high - rest) <= max(WIDER * half, LARGE * rest):
+    if max(rest - low, high - rest) <= max(WIDER * NORMAL * error, LARGE * rest):
         return []
     return [
         f"{SHORT}: {where}, the equilibrium modulus is {low:.3g} to {high:.3g} Pa (95 %); {rest:.4g} ± "

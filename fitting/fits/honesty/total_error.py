@@ -7,7 +7,7 @@ is not among them: the numbers describe the measured curve, not the material.
 import numpy as np
 
 from fitting.fits.honesty import edges
-from fitting.fits.honesty.long_times import INTERVAL
+from fitting.fits.honesty.long_times import INTERVAL, NORMAL
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
@@ -31,7 +31,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
 
     The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
     the square of what noise causes is subtracted from its square. The share of long times is that of the farther end
-    of `long_times.equilibrium_interval`.
+    of `long_times.equilibrium_interval`, as a standard deviation.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -53,7 +53,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     interval = fit.details.get(INTERVAL)
     if interval and interval["wider_than_standard_error"] and "equilibrium_modulus" in known:
         value, error = known["equilibrium_modulus"]
-        half = max(value - interval["low"], interval["high"] - value) / fit.uncertainty.quantile
+        half = max(value - interval["low"], interval["high"] - value) / NORMAL
         beyond = float(np.sqrt(max(0.0, half**2 - error**2)))
         out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": beyond}
     return out

@@ -8,22 +8,32 @@ import scipy.special
 
 #: Gain in the logarithm of the restricted likelihood from which series have factors; chance reaches it in 1 of 140.
 _GAIN = 3.0
+#: Fall of this logarithm to the end of a 95 % interval of the factors' deviation.
+_FALL = 1.92
+#: The largest deviation of factors that is asked for where the residuals do not show it: sizes of samples.
+HIDDEN = 0.1
+#: Singular values below this part of the factors' size are roundoff: the unknowns take up all factors.
+_ROUNDOFF = 1e-8
 
 
 class FactorNoise(NamedTuple):
-    """FactorNoise of series that the residuals show."""
+    """Factors of series."""
 
-    deviation: float  # standard deviation of a factor [1]
+    deviation: float  # the most probable standard deviation of a factor [1]; it may be 0
     root: np.ndarray  # (P, n + K) square root of the covariance of the numbers
+    shown: bool  # independent noise alone does not explain the residuals
+    hidden: float  # deviation, at most `HIDDEN`, of factors that the residuals do not exclude [1]
+    moves: np.ndarray  # (P,) standard deviations of the numbers by such factors
 
 
 def factors_of_series(
     counts: list[int], J: np.ndarray, r: np.ndarray, fitted: np.ndarray, slope: np.ndarray
 ) -> FactorNoise | None:
-    """Noise of variance s^2 (I + q^2 f_k f_k^T) of each series k; None if independent noise explains the residuals.
+    """Noise of variance s^2 (I + q^2 f_k f_k^T) of each series k; None for one series, or too few residuals.
 
     The factors are few, so their deviation is not known well: it is enlarged by Student's t of K - 1 degrees of
-    freedom.
+    freedom. If the unknowns can take up most of the factors, the residuals hardly show them: `hidden` and `moves` tell
+    what they leave open.
 
     Args:
         counts: rows of each of K series.
@@ -41,20 +51,23 @@ def factors_of_series(
     y, m = beside.T @ r, beside.shape[1]
     along = (U.T @ y) ** 2
     rest = max(float(y @ y) - float(along.sum()), 0.0)
-    if not (S[0] > 0 and rest + along.sum() > 0):
+    if rest + along.sum() <= 0:
         return None
+    S = np.where(_ROUNDOFF * np.linalg.norm(F) < S, S, 0.0)
 
     def at(q: float) -> tuple[float, float]:
         stretched = 1 + (q * S) ** 2
         square = max(rest + float(np.sum(along / stretched)), 1e-300)
         return -0.5 * (float(np.sum(np.log(stretched))) + m * np.log(square / m)), square / m
 
-    qs = np.concatenate([[0.0], np.geomspace(0.1, 1e4, 60) / S[0]])
-    found = [at(q) for q in qs]
-    best = int(np.argmax([value for value, _ in found]))
-    if found[best][0] - found[0][0] < _GAIN:
-        return None
-    level, inverse = np.sqrt(found[best][1]), np.linalg.pinv(J)
+    qs = np.concatenate([[0.0], np.geomspace(0.1, 1e4, 60) / S[0]]) if S[0] > 0 else np.zeros(1)
+    values, squares = np.array([at(q) for q in qs]).T
+    best, levels, inverse = int(np.argmax(values)), np.sqrt(squares), np.linalg.pinv(J)
+    by_factors = slope @ inverse @ F
     few = float(scipy.special.stdtrit(K - 1, 0.975) / scipy.special.ndtri(0.975))
-    root = slope @ np.hstack([inverse * level, inverse @ F * (level * qs[best] * few)])
-    return FactorNoise(float(level * qs[best]), root)
+    root = np.hstack([slope @ inverse * levels[best], by_factors * (levels[best] * qs[best] * few)])
+    likely = values >= values[best] - _FALL
+    hidden = HIDDEN if likely[-1] else min(HIDDEN, float((levels * qs)[likely].max()))
+    shown = bool(values[best] - values[0] >= _GAIN)
+    moves = hidden * np.linalg.norm(by_factors, axis=1)
+    return FactorNoise(float(levels[best] * qs[best]), root, shown, hidden, moves)
