@@ -100,7 +100,7 @@ def test_noise_that_grows_with_time_is_in_the_errors():
     time = np.concatenate([[0.0], np.arange(0.5, 100.1, 0.5)])
     G = 400 + 300 * np.exp(-time) + 300 * np.exp(-time / 20)
     off = {with_own_noise: [], with_alike_noise: []}
-    for seed in range(30):
+    for seed in range(16):
         noise = np.random.default_rng(seed).standard_normal(len(time))
         answer = np.where(time > 0, G * (1 + 0.002 * (1 + time / 10) * noise), np.nan)
         test = TimeTest("relaxation", time, np.ones(len(time)), answer, time > 0)

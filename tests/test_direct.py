@@ -54,22 +54,27 @@ def test_a_factorisation_finds_the_same():
 
 
 def test_programs_of_several_runs_have_the_solver_that_one_of_them_needs():
-    """Inside a program numbers are not known: batches and derivatives failed where a single run was solved."""
+    """Inside a program numbers are not known: batches failed where a single run was solved."""
     pulled = replace(PULLED, law=replace(LAW, bulk=7.7e6), solve=lj.Solve())
     alone = lj.simulate(pulled).check()
     batch = lj.simulate_batch(pulled, {"law.bulk": [7.7e4, 7.7e6]}).result
     assert np.all(np.asarray(batch.status) == status.CONVERGED)
     assert np.allclose(batch.positions[1], alone.positions, rtol=0, atol=1e-12)
-    top = MESH.node_sets["z_max"]
+    assert automatic.with_solver(PULLED, [{"law.bulk": 2200.0}]) is PULLED
+    flat = {"mesh.points": np.asarray(MESH.points) * np.array([1.0, 1.0, 1e-4])}
+    assert automatic.with_solver(PULLED, [flat]).solve.linear_solver == "direct"
+
+
+@pytest.mark.slow
+def test_a_gradient_has_the_solver_that_its_run_needs():
+    pulled = replace(PULLED, law=replace(LAW, bulk=7.7e6), solve=lj.Solve())
+    alone, top = lj.simulate(pulled).check(), MESH.node_sets["z_max"]
 
     def pull(result):
         return result.reactions[-1, top, 2].sum()
 
     found = lj.value_and_gradient(pull, pulled, {"law.mu": 770.0})
     assert int(found.status) == 0 and np.isclose(found.value, pull(alone), rtol=1e-12) and found.gradient["law.mu"] > 0
-    assert automatic.with_solver(PULLED, [{"law.bulk": 2200.0}]) is PULLED
-    flat = {"mesh.points": np.asarray(MESH.points) * np.array([1.0, 1.0, 1e-4])}
-    assert automatic.with_solver(PULLED, [flat]).solve.linear_solver == "direct"
 
 
 @pytest.mark.slow

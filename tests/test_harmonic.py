@@ -313,7 +313,7 @@ def test_what_cannot_be_is_refused(changes, words):
 @pytest.mark.parametrize(
     "region",
     [
-        {"law": {"mu": 9000.0}},
+        pytest.param({"law": {"mu": 9000.0}}, marks=pytest.mark.slow),
         pytest.param(
             {"law": {"name": "yeoh", "c1": 4500.0, "c2": 100.0, "c3": 10.0, "bulk": 90000.0}}, marks=pytest.mark.slow
         ),
@@ -430,9 +430,11 @@ def test_what_acts_in_one_direction_is_told_and_a_motion_without_a_drive():
     assert said.startswith("nothing drives the motion")
 
 
+HEAVY = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]") + "frequencies = [40.0]\n"
+
+
 def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
-    heavy = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]") + "frequencies = [40.0]\n"
-    (tmp_path / "scene.toml").write_text(heavy)
+    (tmp_path / "scene.toml").write_text(HEAVY)
     assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "out")]) == 0
     still = FILE.split("[[displaced]]")[0].replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]")
     still += "[[fixed]]\nwhere = {x_max = 0.0}\n"
@@ -446,8 +448,14 @@ def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
     scene = lj.load_scene(tmp_path / "scene.toml")
     bare = lj.harmonic(scene, about=scene.mesh.points).displacement
     assert np.abs(bare - expected).max() > 1e-3 * np.abs(expected).max()
-    # In Python as from the command line; there gravity has a derivative, through the state of rest too.
+    # In Python as from the command line.
     assert np.allclose(lj.harmonic(scene).displacement, expected, rtol=1e-5, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_gravity_has_a_derivative_through_the_state_of_rest(tmp_path):
+    (tmp_path / "scene.toml").write_text(HEAVY)
+    scene = lj.load_scene(tmp_path / "scene.toml")
     sharp = replace(scene, solve=replace(scene.solve, tolerance=1e-12))
 
     @jax.jit
@@ -478,6 +486,7 @@ def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words)
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_obstacle_stands_where_it_begins():
     """Scenes of Python may have histories for their runs in time: harmonic motion takes where they begin."""
     scene = slab(2, 1)

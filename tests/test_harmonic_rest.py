@@ -73,6 +73,7 @@ def test_a_body_rests_under_the_tension_of_its_ligaments(tmp_path):
     assert under_its_weight(slack) is None and under_its_weight(replace(scene, physics=())) is None
 
 
+@pytest.mark.slow
 def test_a_run_whose_capsule_pulls_at_held_nodes_has_rested():
     """Its forces were taken for those of stress that had not relaxed, of an elastic body."""
     table = {

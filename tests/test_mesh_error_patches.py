@@ -51,7 +51,7 @@ def test_a_following_pressure_on_a_cube():
     [
         pytest.param(None, marks=pytest.mark.slow),
         pytest.param(jnp.array([0.5, 1.0]), marks=pytest.mark.slow),
-        jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]]),
+        pytest.param(jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]]), marks=pytest.mark.slow),
     ],
 )
 def test_a_cube_between_planes_and_an_elastic_foundation(history):

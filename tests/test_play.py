@@ -103,7 +103,8 @@ def test_loads_act_before_anyone_pulls(still, monkeypatch):
         pulling.at_rest(raised())
 
 
-@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_motions_end_where_a_run_ends_and_stay_there(precision):
     """A plane that presses and nodes that move within 2 steps of time: as in the run, then at rest."""
     content = {

@@ -14,10 +14,13 @@ from liverjax.core.struct import replace
 from liverjax.jobs import reduction
 from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.porosity import Inlet
+from liverjax.reduced import fluid as reduced_fluid
 from liverjax.reduced import step, training
-from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points
-from liverjax.reduced.model import solid_at_points, with_all_points
+from liverjax.reduced.fluid import flowing, fluid_at_rest, sponge_at_points, storage_and_flow
+from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
+from liverjax.reduced.sampling import _at
 from liverjax.reduced.tangent import in_single_precision, tangent_matrix
+from liverjax.tensors.matrices import determinant
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -86,6 +89,25 @@ def test_all_motions_pressures_and_points_are_the_full_model(order, scheme, solv
     _assert_same(scene, full.positions, full.pressure)
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_storage_at_vertices_is_that_of_the_points(order):
+    """Sampled points of several elements that share vertices, at uneven volumes."""
+    scene = _sponge((2, 1, 1))
+    scene = replace(scene, mesh=lj.quadratic(scene.mesh)) if order == 2 else scene
+    rng, V = np.random.default_rng(4), scene.mesh.number_of_vertices
+    modes = jnp.asarray(rng.normal(size=(2, scene.mesh.number_of_nodes, 3)))
+    model = with_all_points(scene, modes, jnp.asarray(rng.normal(size=(3, V))))
+    model = _at(model, np.arange(0, len(model.points), 2), 2 * model.weights[::2])
+    F = fluid_at_rest(model, scene).F + 0.02 * rng.normal(size=(9, len(model.points)))
+    sponge = sponge_at_points(model, scene)
+    own = reduced_fluid._stored_at_vertices(model, sponge, determinant(as_matrix(F)))
+    stores = storage_and_flow(model, sponge.porosity, F, 0.05)[0]
+    exact = np.einsum("kas,las->kl", stores, stores)
+    np.testing.assert_allclose(own, exact, rtol=1e-13, atol=1e-13 * np.abs(exact).max())
+    one = _at(model, np.arange(1), model.weights[:1])
+    assert sponge_at_points(one, scene).lumped is None  # fewer points than vertices
+
+
 @pytest.mark.parametrize("scheme", ["implicit", "lagged"])
 def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     scene = _sponge((1, 1, 1), scheme=scheme)
@@ -93,7 +115,7 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     rng, n = np.random.default_rng(2), model.number_of_modes
     memory = fluid_at_rest(model, scene)
     memory = memory._replace(pressure=jnp.asarray(rng.normal(size=len(memory.pressure))), F=memory.F + 0.01)
-    fluid = flowing(model, porosity_at_points(model, scene), memory, 0.05)
+    fluid = flowing(model, sponge_at_points(model, scene), memory, 0.05)
     elastic = replace(scene, viscosity=None, porosity=None)
     acting = solid_at_points(model, elastic).freeze(None, None)
     rest, none = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)), jnp.zeros(n)

@@ -45,6 +45,7 @@ def pulled(mesh: lj.TetMesh, value, **more) -> lj.Scene:
     return lj.Scene(mesh=mesh, law=LAW, traction=traction, **more)
 
 
+@pytest.mark.slow
 def test_springs_stiffer_than_the_digits_allow_are_told_as_roundoff():
     """1e14 Pa/m times the rounding of positions is above the tolerance: no shorter step helps, and none is tried."""
     mesh = box()

@@ -21,6 +21,7 @@ from liverjax.core.struct import Number, replace
 from liverjax.laws.terms import invariant_terms
 from liverjax.laws.terms.invariant_terms import Scalars
 from liverjax.mesh.nodal import integrals
+from liverjax.mesh.shape_functions import basis
 from liverjax.physics import darcy
 from liverjax.physics.porosity import Porosity, volumetric_slope, volumetric_stress
 from liverjax.reduced.model import ReducedModel, as_matrix
@@ -28,6 +29,7 @@ from liverjax.scenes.by_element import porosity_of_elements
 from liverjax.scenes.regions import POROUS
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import IDENTITY, Matrix, cofactor, determinant, matvec
+from liverjax.tensors.places import given
 
 
 class ReducedFluid(NamedTuple):
@@ -38,6 +40,20 @@ class ReducedFluid(NamedTuple):
     J_before: jax.Array | None  # volume ratios of the step before (S,); the lagged scheme
 
 
+class Lumped(NamedTuple):
+    """Where the points store their fluid: at the vertices of their elements."""
+
+    vertices: jax.Array  # of each point's element (4, S)
+    parts: jax.Array  # of a point's volume that each of them has (4, S) [1]
+
+
+class SpongeAtPoints(NamedTuple):
+    """What of the sponge is the same in all steps."""
+
+    porosity: Porosity  # numbers at the points
+    lumped: Lumped | None  # None: there are more vertices than four a point, and each point stores for itself
+
+
 class Flowing(NamedTuple):
     """The fluid during a step."""
 
@@ -46,6 +62,17 @@ class Flowing(NamedTuple):
     stored: jax.Array  # S p_before, with the volumes that are known before the step's end (m,) [m^3]
     averages: jax.Array  # modes at the points, times their weights (S, m) [m^3]
     J: jax.Array  # volume ratios at the beginning (S,)
+
+
+def sponge_at_points(model: ReducedModel, scene: Scene) -> SpongeAtPoints:
+    """The sponge of a run. Storage is a sum over vertices or over points, of which there are fewer."""
+    porosity, mesh = porosity_at_points(model, scene), scene.mesh
+    if mesh.number_of_vertices > 4 * len(model.points):
+        return SpongeAtPoints(porosity, None)
+    E = mesh.number_of_elements
+    of_point = jnp.full((4, 1), 0.25) if mesh.order == 1 else jnp.asarray(basis(mesh.order).L)
+    parts = of_point[:, model.points // E].astype(model.weights.dtype)
+    return SpongeAtPoints(porosity, Lumped(mesh.tetrahedra[model.points % E].T, parts))
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
@@ -69,11 +96,12 @@ def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
     return ReducedFluid(modes.modes @ (start * volumes), rest, J)
 
 
-def flowing(model: ReducedModel, porosity: Porosity, memory: ReducedFluid, dt: Number) -> Flowing:
-    """The fluid of a step of dt [s]; `porosity` as `porosity_at_points` gives it."""
+def flowing(model: ReducedModel, sponge: SpongeAtPoints, memory: ReducedFluid, dt: Number) -> Flowing:
+    """The fluid of a step of dt [s]."""
     assert model.pressures is not None
-    J = determinant(as_matrix(memory.F))
-    store, flow = (_squares(parts) for parts in storage_and_flow(model, porosity, memory.F, dt))
+    porosity, lumped, J = sponge.porosity, sponge.lumped, determinant(as_matrix(memory.F))
+    stores, flows = storage_and_flow(model, porosity, memory.F, dt)
+    store, flow = _squares(stores) if lumped is None else _stored_at_vertices(model, sponge, J), _squares(flows)
     averages, stored = model.weights[:, None] * model.pressures.values, store @ memory.pressure
     if memory.J_before is not None:
         stored = stored - (J - memory.J_before) @ averages
@@ -91,6 +119,15 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: 
     scaled = tuple(tuple((root * entry)[None] for entry in row) for row in cofactor(matrix))
     g = matvec(scaled, tuple(jnp.moveaxis(modes.slopes, 1, 0)))
     return jnp.sqrt(volume / porosity.limit_bulk)[None, None] * modes.parts, jnp.stack(g, axis=1)
+
+
+def _stored_at_vertices(model: ReducedModel, sponge: SpongeAtPoints, J: jax.Array) -> jax.Array:
+    """S (m, m) [m^3/Pa] at volume ratios J (S,), as the sum over vertices."""
+    modes, lumped = model.pressures, sponge.lumped
+    assert modes is not None and lumped is not None
+    capacity = model.weights * jnp.maximum(J, darcy.LEAST_J) / sponge.porosity.limit_bulk
+    of_vertices = given(jnp.zeros(modes.modes.shape[1], J.dtype), lumped.vertices, lumped.parts * capacity[None])
+    return (modes.modes * of_vertices[None]) @ modes.modes.T
 
 
 def _squares(a: jax.Array) -> jax.Array:

@@ -18,7 +18,14 @@ from liverjax.elements import mjed
 from liverjax.physics.base import End, Free, Step
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
-from liverjax.reduced.fluid import flowing, fluid_at_rest, porosity_at_points, storage_and_flow, volume_stress
+from liverjax.reduced.fluid import (
+    flowing,
+    fluid_at_rest,
+    porosity_at_points,
+    sponge_at_points,
+    storage_and_flow,
+    volume_stress,
+)
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
@@ -152,7 +159,7 @@ def _balance(
     sponge, rest, modes = porosity_at_points(whole, scene), fluid_at_rest(whole, scene), whole.pressures
     assert modes is not None
     dt = jnp.asarray(scene.solve.dt)
-    inverse = flowing(whole, sponge, rest, dt).inverse
+    inverse = flowing(whole, sponge_at_points(whole, scene), rest, dt).inverse
 
     def of_step(k: jax.Array) -> jax.Array:
         first, last = k == 0, jnp.maximum(k - 1, 0)
