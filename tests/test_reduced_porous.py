@@ -16,7 +16,7 @@ from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.porosity import Inlet
 from liverjax.reduced import fluid as reduced_fluid
 from liverjax.reduced import step, training
-from liverjax.reduced.fluid import flowing, fluid_at_rest, sponge_at_points, storage_and_flow
+from liverjax.reduced.fluid import flowing, fluid_at_rest, reduced_sponge, storage_and_flow
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
 from liverjax.reduced.sampling import _at
 from liverjax.reduced.tangent import in_single_precision, tangent_matrix
@@ -99,13 +99,13 @@ def test_storage_at_vertices_is_that_of_the_points(order):
     model = with_all_points(scene, modes, jnp.asarray(rng.normal(size=(3, V))))
     model = _at(model, np.arange(0, len(model.points), 2), 2 * model.weights[::2])
     F = fluid_at_rest(model, scene).F + 0.02 * rng.normal(size=(9, len(model.points)))
-    sponge = sponge_at_points(model, scene)
+    sponge = reduced_sponge(model, scene)
     own = reduced_fluid._stored_at_vertices(model, sponge, determinant(as_matrix(F)))
     stores = storage_and_flow(model, sponge.porosity, F, 0.05)[0]
     exact = np.einsum("kas,las->kl", stores, stores)
     np.testing.assert_allclose(own, exact, rtol=1e-13, atol=1e-13 * np.abs(exact).max())
     one = _at(model, np.arange(1), model.weights[:1])
-    assert sponge_at_points(one, scene).lumped is None  # fewer points than vertices
+    assert reduced_sponge(one, scene).lumped is None  # fewer points than vertices
 
 
 @pytest.mark.parametrize("scheme", ["implicit", "lagged"])
@@ -115,7 +115,7 @@ def test_the_tangent_is_the_derivative_of_the_forces(scheme):
     rng, n = np.random.default_rng(2), model.number_of_modes
     memory = fluid_at_rest(model, scene)
     memory = memory._replace(pressure=jnp.asarray(rng.normal(size=len(memory.pressure))), F=memory.F + 0.01)
-    fluid = flowing(model, sponge_at_points(model, scene), memory, 0.05)
+    fluid = flowing(model, reduced_sponge(model, scene), memory, 0.05)
     elastic = replace(scene, viscosity=None, porosity=None)
     acting = solid_at_points(model, elastic).freeze(None, None)
     rest, none = jnp.tile(jnp.eye(3).reshape(9, 1), len(model.points)), jnp.zeros(n)

@@ -47,7 +47,7 @@ class Lumped(NamedTuple):
     parts: jax.Array  # of a point's volume that each of them has (4, S) [1]
 
 
-class SpongeAtPoints(NamedTuple):
+class ReducedSponge(NamedTuple):
     """What of the sponge is the same in all steps."""
 
     porosity: Porosity  # numbers at the points
@@ -64,15 +64,15 @@ class Flowing(NamedTuple):
     J: jax.Array  # volume ratios at the beginning (S,)
 
 
-def sponge_at_points(model: ReducedModel, scene: Scene) -> SpongeAtPoints:
+def reduced_sponge(model: ReducedModel, scene: Scene) -> ReducedSponge:
     """The sponge of a run. Storage is a sum over vertices or over points, of which there are fewer."""
     porosity, mesh = porosity_at_points(model, scene), scene.mesh
     if mesh.number_of_vertices > 4 * len(model.points):
-        return SpongeAtPoints(porosity, None)
+        return ReducedSponge(porosity, None)
     E = mesh.number_of_elements
     of_point = jnp.full((4, 1), 0.25) if mesh.order == 1 else jnp.asarray(basis(mesh.order).L)
     parts = of_point[:, model.points // E].astype(model.weights.dtype)
-    return SpongeAtPoints(porosity, Lumped(mesh.tetrahedra[model.points % E].T, parts))
+    return ReducedSponge(porosity, Lumped(mesh.tetrahedra[model.points % E].T, parts))
 
 
 def porosity_at_points(model: ReducedModel, scene: Scene) -> Porosity:
@@ -96,7 +96,7 @@ def fluid_at_rest(model: ReducedModel, scene: Scene) -> ReducedFluid:
     return ReducedFluid(modes.modes @ (start * volumes), rest, J)
 
 
-def flowing(model: ReducedModel, sponge: SpongeAtPoints, memory: ReducedFluid, dt: Number) -> Flowing:
+def flowing(model: ReducedModel, sponge: ReducedSponge, memory: ReducedFluid, dt: Number) -> Flowing:
     """The fluid of a step of dt [s]."""
     assert model.pressures is not None
     porosity, lumped, J = sponge.porosity, sponge.lumped, determinant(as_matrix(memory.F))
@@ -121,7 +121,7 @@ def storage_and_flow(model: ReducedModel, porosity: Porosity, F: jax.Array, dt: 
     return jnp.sqrt(volume / porosity.limit_bulk)[None, None] * modes.parts, jnp.stack(g, axis=1)
 
 
-def _stored_at_vertices(model: ReducedModel, sponge: SpongeAtPoints, J: jax.Array) -> jax.Array:
+def _stored_at_vertices(model: ReducedModel, sponge: ReducedSponge, J: jax.Array) -> jax.Array:
     """S (m, m) [m^3/Pa] at volume ratios J (S,), as the sum over vertices."""
     modes, lumped = model.pressures, sponge.lumped
     assert modes is not None and lumped is not None

@@ -23,7 +23,7 @@ from liverjax.reduced.fluid import (
     flowing,
     fluid_at_rest,
     pressure_coordinates,
-    sponge_at_points,
+    reduced_sponge,
     volume_stress,
 )
 from liverjax.reduced.model import (
@@ -136,7 +136,7 @@ def _begin(model: ReducedModel, scene: Scene, load: jax.Array) -> tuple:
 
 def _forces_of_fluid(model: ReducedModel, scene: Scene, fluid: ReducedFluid) -> jax.Array:
     """Forces (n,) [N] of a given pressure at rest, as in `liverjax.simulation.equations.initial_state`."""
-    sponge = sponge_at_points(model, scene)
+    sponge = reduced_sponge(model, scene)
     flow = flowing(model, sponge, fluid, jnp.asarray(scene.solve.dt))
     p = pressure_coordinates(flow, flow.J)
     return jnp.tensordot(model.weights[None] * volume_stress(model, sponge.porosity, p, fluid.F), model.slopes, axes=2)
@@ -151,7 +151,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     spread = jax.lax.stop_gradient(jnp.abs(model.slopes)) if scene.displaced else None
     light = in_single_precision(model.slopes)
     steepest = jax.lax.stop_gradient(jnp.linalg.norm(model.slopes))
-    noise, sponge = reduced_noise(model, scene), None if scene.porosity is None else sponge_at_points(model, scene)
+    noise, sponge = reduced_noise(model, scene), None if scene.porosity is None else reduced_sponge(model, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:

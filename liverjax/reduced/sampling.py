@@ -22,7 +22,7 @@ from liverjax.reduced.fluid import (
     flowing,
     fluid_at_rest,
     porosity_at_points,
-    sponge_at_points,
+    reduced_sponge,
     storage_and_flow,
     volume_stress,
 )
@@ -159,7 +159,7 @@ def _balance(
     sponge, rest, modes = porosity_at_points(whole, scene), fluid_at_rest(whole, scene), whole.pressures
     assert modes is not None
     dt = jnp.asarray(scene.solve.dt)
-    inverse = flowing(whole, sponge_at_points(whole, scene), rest, dt).inverse
+    inverse = flowing(whole, reduced_sponge(whole, scene), rest, dt).inverse
 
     def of_step(k: jax.Array) -> jax.Array:
         first, last = k == 0, jnp.maximum(k - 1, 0)
