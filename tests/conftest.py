@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -106,6 +107,7 @@ def pytest_configure(config):
     """Programs compiled once are found again by the other worker and by commands that tests start."""
     config.addinivalue_line("markers", "slow: run by python -m pytest -m slow, not by default")
     config.addinivalue_line("markers", "core: each public entry once, for other versions of Python and jax: -m core")
+    config.addinivalue_line("markers", "draws: its pictures are drawn; those of other tests are files of one point")
     config.addinivalue_line("markers", "quick_to_compile: few optimisations, where compiling takes longer than running")
     if config.getoption("--verification"):
         config.option.markexpr = ""
@@ -152,6 +154,17 @@ def _compilation(request):
 @pytest.fixture(autouse=True)
 def _strict():
     assert jax.config.jax_enable_x64
+
+
+def _one_point(_figure: object, file: object, **_: object) -> None:
+    plt.imsave(file, np.zeros((1, 1)))
+
+
+@pytest.fixture(autouse=True)
+def _pictures(request, monkeypatch):
+    """Drawing takes longer than most fits: one test of each kind of picture draws it."""
+    if request.node.get_closest_marker("draws") is None:
+        monkeypatch.setattr(matplotlib.figure.Figure, "savefig", _one_point)
 
 
 @pytest.fixture

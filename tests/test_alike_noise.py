@@ -31,7 +31,9 @@ def fitted(noise: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return u, noise - J @ u
 
 
-@pytest.mark.parametrize("width", [0.004, 0.01, 0.03])
+@pytest.mark.parametrize(
+    "width", [pytest.param(0.004, marks=pytest.mark.slow), 0.01, pytest.param(0.03, marks=pytest.mark.slow)]
+)
 def test_errors_of_smoothed_noise_are_right(width):
     """Those of independent noise are several times too small. Of 120 numbers at four widths 95 to 99 % are covered."""
     X = points()
@@ -99,6 +101,7 @@ def test_unknowns_that_few_groups_show_and_points_of_two_rows():
     assert alike_noise(places[twice], group[twice], r, J[twice]) is not None
 
 
+@pytest.mark.slow
 def test_one_wrong_point_is_no_shared_noise():
     """One of 150 points with 30 times the noise: a fourth of such data counted as shared noise."""
     X, seen = points(), 0

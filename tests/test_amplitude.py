@@ -118,6 +118,7 @@ def test_a_law_and_its_loss_come_back(tmp_path, tanned):
     assert abs(other.values[1] / 1.5 - 1) > 0.1
 
 
+@pytest.mark.draws
 def test_the_command_fits_with_the_series_of_a_sweep(tmp_path, capsys):
     law = lj.laws.FungDemiray(c1=jnp.asarray(900.0), c2=jnp.asarray(1.5), bulk=None)
     series = {"shear_modulus": 2000.0, "ratios": [0.5], "relaxation_times": [0.1]}

@@ -169,6 +169,7 @@ def test_a_law_that_no_scene_can_use_gets_one_sentence(words, tmp_path, capsys):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.draws
 @pytest.mark.parametrize(
     "name", ["saint_venant_kirchhoff", *(pytest.param(n, marks=pytest.mark.slow) for n in ("neo_hookean", "costa"))]
 )
@@ -272,6 +273,7 @@ def test_files_are_refused_in_one_sentence(argument, sentence, tmp_path, capsys,
     assert sentence in error and error.count("\n") == 1
 
 
+@pytest.mark.draws
 def test_plot_draws_laws(tmp_path, capsys):
     assert main(["plot", "neo_hookean", "yeoh", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "laws.png").stat().st_size > 10_000

@@ -38,6 +38,7 @@ def _contract(content: dict, modes: int) -> None:
     assert {"jax", "numpy", "liverjax"} <= set(content["versions"])
 
 
+@pytest.mark.draws
 def test_main_job_as_a_new_user(tmp_path):
     """The README's command on the model-implied sweep: through the simulation, closed form beside it."""
     run = subprocess.run(

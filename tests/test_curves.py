@@ -472,6 +472,7 @@ def test_a_law_that_misses_the_curve_is_not_taken_for_wrong_columns(tmp_path, ca
     assert "the law misses something: try others" in said and "would follow" not in said
 
 
+@pytest.mark.draws
 @pytest.mark.core
 def test_command_writes_table_json_and_picture(tmp_path, capsys):
     out = tmp_path / "out"

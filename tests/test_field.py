@@ -334,7 +334,8 @@ def test_the_error_of_the_mesh_counts_as_noise(problem, monkeypatch):
     assert same is own and np.all(np.isnan(sizes))
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.draws
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_map_is_written_at_the_nodes_of_its_mesh(tmp_path, order):
     """The map is a field of the vertices; the nodes between them have the mean of the logarithms."""
     mesh = lj.shapes.box((0.06, 0.04, 0.04), (3, 2, 2))
@@ -518,6 +519,7 @@ def test_viscosity_from_a_time_series(tmp_path):
         assert found["standard_errors"][name] < 0.1 * true
 
 
+@pytest.mark.draws
 @pytest.mark.slow
 def test_the_command_maps(tmp_path, capsys):
     """A map from files; everything written. That it goes on from what is written, the next test sees."""

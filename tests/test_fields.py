@@ -145,6 +145,7 @@ def test_bad_fields_are_refused():
         scene_from(content(output={"fields": "cauchy_stress"}))
 
 
+@pytest.mark.draws
 def test_a_field_of_a_result_is_drawn(tmp_path, capsys):
     """Uniaxial tension has its stress for von Mises stress; what is not there is one sentence."""
     from liverjax.__main__ import main

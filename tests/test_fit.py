@@ -144,7 +144,7 @@ def test_profile_likelihood():
         assert low < TRUTH[j] < high
 
 
-@pytest.mark.parametrize("modes", [1, 2, 3])
+@pytest.mark.parametrize("modes", [pytest.param(1, marks=pytest.mark.slow), 2, 3])
 def test_lions_mane_no_worse_than_scipy_from_50_starts(modes):
     s = read_sweep(ROOT / "data" / "lions_mane_frequency_sweep.csv")
     scales = np.concatenate(s.deviations)

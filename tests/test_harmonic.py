@@ -120,6 +120,7 @@ def around_a_sphere(X: np.ndarray, G: complex, K: complex, omega: float, radius:
     return ((along - across) * cosine / r)[:, None] * X + across[:, None] * np.array([0.0, 0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_waves_about_a_sphere_that_swings(verified):
     """A box beside the sphere, driven at its surface by the closed form, moves within as that says; K is 10 G."""
     radius, side, errors = 0.003, 0.009, []
@@ -217,7 +218,7 @@ def test_a_run_in_time_comes_to_it():
     assert errors[1] < 0.02 and 1.7 < np.log2(errors[0] / errors[1]) < 2.3, errors
 
 
-@pytest.mark.parametrize(("order", "n"), [(1, 20), (2, 10)])
+@pytest.mark.parametrize(("order", "n"), [pytest.param(1, 20, marks=pytest.mark.slow), (2, 10)])
 def test_the_error_of_the_mesh(order, n):
     """It is what the closed form says, within a tenth: 18 % and 1.2 % of the motion."""
     scene = slab(n, order)

@@ -160,6 +160,7 @@ def test_about_a_stretched_state_with_pressures(volumetric, order):
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact).max()
 
 
+@pytest.mark.slow
 def test_the_mesh_s_error_of_mixed_elements():
     """From cubic elements: within a fifth of what the closed form says."""
     scene = replace(slab(10, 2), viscosity=replace(PRONY, part="isochoric"), solve=lj.Solve(volumetric="mixed"))

@@ -61,6 +61,7 @@ steps = 4
 """
 
 
+@pytest.mark.slow
 def test_a_body_rests_under_the_tension_of_its_ligaments(tmp_path):
     """Without it the body moved about a shape that is in no balance, 18 % off, and nothing said so."""
     (tmp_path / "scene.toml").write_text(LIGAMENT)

@@ -103,6 +103,7 @@ def test_adhesion_is_named(tmp_path, capsys):
     assert "this is adhesion" in capsys.readouterr().err
 
 
+@pytest.mark.draws
 def test_the_command_reads_units_and_leaves_the_unloading_out(tmp_path, capsys):
     back = DEPTH[-2::-1]
     depth = np.concatenate([DEPTH, back])

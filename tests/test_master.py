@@ -169,6 +169,7 @@ def test_a_hyphen_between_words_is_no_sign(tmp_path, name, celsius):
     assert np.allclose(data.temperatures - 273.15, [celsius, 40])
 
 
+@pytest.mark.draws
 def test_the_command_shifts_several_files_and_fits_the_curve(tmp_path, capsys):
     paths = []
     for k, s in enumerate(sweeps(0.0)[2:7]):

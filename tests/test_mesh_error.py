@@ -47,6 +47,7 @@ def test_mesh_error_of_a_small_strain_is_the_way_to_quadratic_elements():
     assert re.search("nodes are up to .* m off.*take order = 2 in", mesh_sentence(scene, result))
 
 
+@pytest.mark.slow
 def test_a_bar_of_two_compressible_materials_has_no_mesh_error():
     """Linear elements hold the exact motion, whose pressure jumps between the materials."""
     mesh = lj.shapes.box((0.01, 0.01, 0.04), (1, 1, 2))

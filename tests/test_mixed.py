@@ -72,8 +72,8 @@ def test_the_mixed_tangent_is_symmetric_and_the_derivative(order):
 
 
 def test_mixed_elements_do_not_lock_and_iterations_do_not_grow():
-    """As K/mu grows the answer settles, and so does the number of iterations; linear elements lose two thirds."""
-    scene, locked = _cook(2, 4, 1e2, volumetric="mixed"), _cook(1, 8, 1e4)
+    """As K/mu grows the answer settles, and so does the number of iterations."""
+    scene = _cook(2, 4, 1e2, volumetric="mixed")
     rises, taken = [], []
     for ratio in (1e2, 1e4, 1e5):
         result = lj.simulate(lj.with_parameters(scene, {"law.bulk": 770.0 * ratio})).check()
@@ -82,7 +82,12 @@ def test_mixed_elements_do_not_lock_and_iterations_do_not_grow():
     # What is left of compressibility goes with mu/K.
     assert abs(rises[1] / rises[0] - 1) < 0.03 and abs(rises[2] / rises[1] - 1) < 1e-3
     assert taken[2] < 1.5 * taken[0]
-    assert _rise(locked, lj.simulate(locked)) < 0.4 * rises[1]
+
+
+@pytest.mark.slow
+def test_linear_elements_without_pressures_lose_two_thirds():
+    soft, locked = _cook(2, 4, 1e4, volumetric="mixed"), _cook(1, 8, 1e4)
+    assert _rise(locked, lj.simulate(locked)) < 0.4 * _rise(soft, lj.simulate(soft).check())
 
 
 def _ended(scene: lj.Scene, ratio: float = 1e4) -> tuple[lj.Result, np.ndarray]:

@@ -30,6 +30,7 @@ def _stretched(scene: lj.Scene, by: float | jax.Array) -> jax.Array:
     return scene.mesh.points * (1 + by * jnp.array([[0.0, 0.0, 1.0]]))
 
 
+@pytest.mark.slow
 def test_newmark_keeps_its_order_from_a_stretched_start():
     """Stretched by 2 % and let go. Without the law's force in the first acceleration the differences halve: order 1."""
     scene = _let_go()
@@ -59,6 +60,7 @@ def test_a_pressed_plate_begins_with_the_acceleration_of_its_force():
     assert np.isclose(mass @ np.asarray(motion.acceleration)[:, 2], -5e-3, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_step_too_short_for_the_digits_is_told_as_roundoff():
     """4 m/dt^2 times the rounding of positions is above the tolerance; each step was cut in vain 12 times."""
     mesh = box(1)

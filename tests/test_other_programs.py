@@ -16,6 +16,7 @@ def _file(*parts: str):
     return file
 
 
+@pytest.mark.slow
 def test_a_hundred_steps_of_sofa(verified):
     """SOFA 26.12: implicit Euler, one linear solve a step, the same mass at every node."""
     points, tets = (np.loadtxt(_file("febio", name), delimiter=",") for name in ("cube3_nodes.csv", "cube3_tets.csv"))

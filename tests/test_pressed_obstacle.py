@@ -169,6 +169,7 @@ def test_obstacles_that_cannot_be_pressed_get_one_sentence(change, words):
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.slow
 def test_a_ball_between_the_contact_points_is_told():
     """Its force is right, and its place is not: of a travel of 4.7 mm, 3.6 mm were inside of the body, unsaid."""
     table = {
@@ -187,6 +188,7 @@ def test_a_ball_between_the_contact_points_is_told():
         scene_from(table | {"obstacle": [small | {"position": [0.2, 0.2, 0.2]}]})
 
 
+@pytest.mark.slow
 def test_a_light_force_is_balanced_to_the_roundoff_of_positions():
     """Its travel was not found where 16 digits of the force were asked for, and every step failed."""
     scene = cube(lambda top: sphere(PressedObstacle, top, force=jnp.array([0.0, 0.0, -1.0])))

@@ -328,8 +328,8 @@ def test_every_feature_runs_on_both_orders(feature):
         "elastic",
         pytest.param("porous", marks=pytest.mark.core),
         "pressure",
-        "isochoric",
-        "sliding",
+        pytest.param("isochoric", marks=pytest.mark.slow),
+        pytest.param("sliding", marks=pytest.mark.slow),
         "membrane",
     ],
 )

@@ -167,6 +167,7 @@ def write_samples(folder, count=5, spread=0.3, noise=0.01):
     return [str(f) for f in files], truths
 
 
+@pytest.mark.draws
 def test_the_command_fits_each_sample_and_the_population(tmp_path, capsys):
     files, truths = write_samples(tmp_path)
     out = tmp_path / "fit"

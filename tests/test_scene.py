@@ -111,6 +111,7 @@ def test_parameters_by_the_files_own_names(folder):
             lj.with_parameters(scene, {name: 1.0})
 
 
+@pytest.mark.draws
 @pytest.mark.core
 def test_command_leaves_hdf5_vtu_and_a_picture(folder, capsys):
     out, text = folder / "out", (folder / "scene.toml").read_text()

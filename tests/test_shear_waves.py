@@ -58,6 +58,7 @@ def test_waves_add_the_short_time_that_the_sweep_does_not_see(attenuation):
     assert [s.points for s in found.shares] == [30, 24 if attenuation else 12]
 
 
+@pytest.mark.draws
 def test_the_command_reads_waves_and_writes_waves(tmp_path):
     s, w = sweep(0.01), waves(0.01)
     head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"

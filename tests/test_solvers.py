@@ -193,6 +193,7 @@ def test_a_guess_takes_up_what_the_last_steps_foretold():
     assert taken[:2] == more[:2] and all(a < b for a, b in zip(taken[3:], more[3:], strict=True))
 
 
+@pytest.mark.slow
 def test_a_second_derivative_of_steps_is_right_or_nan_never_another_number():
     """Two steps in a loop, each the root of q^3 + a q = 1 + q_before / 10."""
 

@@ -105,6 +105,7 @@ def written(path, columns: str, *values) -> str:
     return str(path)
 
 
+@pytest.mark.draws
 @pytest.mark.parametrize(
     "words",
     [

@@ -198,6 +198,7 @@ def test_three_planes_of_symmetry_carry_what_pulls_at_them(order):
     )
 
 
+@pytest.mark.slow
 def test_an_oblique_plane_has_a_force_along_its_normal_alone():
     """A cube turned by 30 degrees about z, between planes: the oblique ones share edges with the base."""
     mesh, c, s = box(), np.cos(np.pi / 6), np.sin(np.pi / 6)

@@ -428,6 +428,7 @@ def test_a_table_is_not_written_over_other_files(files, capsys):
         assert len(sweep.read_table(files / "d.csv")[1]) == int(rows)
 
 
+@pytest.mark.slow
 def test_a_row_that_iterations_do_not_solve_is_factorised(files):
     """Of rows in one program none is known: a body that keeps its volume failed, with a pull 12 times too large."""
     pull = "[[displaced]]\nwhere = {z_max = 0.0}\nby = [0.0, 0.0, -0.01]\n"

@@ -132,6 +132,7 @@ def test_what_an_ode_solver_computed_is_recovered_from_the_file(kind, tmp_path):
     assert step.relative_errors.mean() > 0.01 > 1e3 * f.relative_errors.mean()
 
 
+@pytest.mark.draws
 def test_a_fluid_is_told_from_a_solid(tmp_path):
     t, rng = np.geomspace(0.02, 60, 60), np.random.default_rng(0)
     solid, fluid = (relaxation(m, t) * (1 + 0.01 * rng.standard_normal(60)) for m in (SOLID, FLUID))
@@ -342,7 +343,7 @@ def recorded(noise_of_strain=0.0, seed=0):
     return t, strain + noise_of_strain * 0.05 * rng.standard_normal(len(t)), stress
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
 def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path, noise):
     """An instrument's clock runs before the step, and its sensor has noise: neither is motion of the sample."""
     t, strain, stress = recorded(noise)
@@ -354,7 +355,7 @@ def test_rest_before_the_load_and_a_strain_that_scatters_do_not_matter(tmp_path,
     assert f.modes == 2 and np.allclose(f.uncertainty.values, [900, 0.3, 0.4, 5, 0.2], rtol=0.08 if noise else 0.03)
 
 
-@pytest.mark.parametrize("noise", [0.003, 0.01])
+@pytest.mark.parametrize("noise", [pytest.param(0.003, marks=pytest.mark.slow), 0.01])
 def test_a_ramp_that_scatters_gives_what_the_exact_ramp_gives(tmp_path, noise):
     """A ramp of 1 s: each reading counted as a step, and G0 was 15 % low, at 5 standard errors, without a word."""
     t, rng = np.r_[np.arange(0, 1, 0.02), 1 + np.geomspace(0.01, 20, 60)], np.random.default_rng(1)
@@ -476,7 +477,7 @@ def test_as_many_rows_as_allowed_are_fitted(time, ramp, first):
     assert len(rows) == fits.MOST and np.all(np.diff(rows) > 0) and rows[-1] == len(time) - 1
 
 
-@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+@pytest.mark.parametrize("kind", ["relaxation", pytest.param("creep", marks=pytest.mark.slow)])
 def test_a_test_without_relaxation_is_told_with_its_modulus(kind):
     """Six of such tests became fluids with times of 1e175 s, or did not converge with the advice of fewer modes."""
     time = np.linspace(0, 57, 120)

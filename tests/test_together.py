@@ -181,6 +181,7 @@ def test_tests_that_do_not_agree_are_named():
     assert any("the tests do not agree" in w for w in told)
 
 
+@pytest.mark.draws
 def test_the_command_reads_any_test(tmp_path, capsys):
     s, creep_time = sweep(0.01), np.geomspace(1, 100, 20)
     columns = np.column_stack([s.angular_frequency, s.storage, s.loss])

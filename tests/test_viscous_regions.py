@@ -52,13 +52,17 @@ def test_a_body_of_two_has_the_forces_of_both(order, part):
     np.testing.assert_allclose(both, 0.5 * (liver + lesion), atol=1e-12 * np.abs(liver).max())
 
 
-def test_a_later_region_wins_and_what_it_leaves_out_stays():
-    mesh = block().mesh
-    every = jnp.arange(mesh.number_of_elements)
+def test_a_later_region_wins():
+    every = jnp.arange(block().mesh.number_of_elements)
     both = (lj.Region(elements=every, viscosity=LESION), lj.Region(elements=every, viscosity=LIVER))
-    times = lj.Region(elements=every, viscosity={"relaxation_times": LESION["relaxation_times"]})
     plain = lj.simulate(block()).check().reactions
     np.testing.assert_allclose(lj.simulate(block(region=both)).check().reactions, plain, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_what_a_region_leaves_out_stays():
+    every = jnp.arange(block().mesh.number_of_elements)
+    times = lj.Region(elements=every, viscosity={"relaxation_times": LESION["relaxation_times"]})
     mixed = block(viscosity=LIVER | {"relaxation_times": LESION["relaxation_times"]})
     expected = lj.simulate(mixed).check().reactions
     np.testing.assert_allclose(lj.simulate(block(region=(times,))).check().reactions, expected, atol=1e-15)

@@ -212,6 +212,7 @@ def written(tmp_path, ending, field):
     return path
 
 
+@pytest.mark.draws
 def test_the_command_writes_regions_and_a_map_and_goes_on(tmp_path, capsys):
     labels = np.ones((7, 7, 9), int)
     labels[..., 5:] = 4
@@ -478,7 +479,7 @@ def test_errors_of_smoothed_noise_hold_the_truth(width):
     """Noise of 2 % behind a Gaussian filter of 0.7 voxels: stated errors were a third of the true ones, without a
     word; two thirds of the moduli were more than two of them off."""
     off = []
-    for seed in range(4):
+    for seed in range(3):
         U, rng = _waves_of_many_directions((11, 11, 9), seed), np.random.default_rng(seed)
         noise = rng.normal(size=U.shape) + 1j * rng.normal(size=U.shape)
         if width:
@@ -490,7 +491,7 @@ def test_errors_of_smoothed_noise_hold_the_truth(width):
         told = any("share their residuals" in s for s in waves_report._cautions(own, found, None))
         factor = found.whole.noise_factor[0, 0]
         assert told == bool(width) and (factor > 3 if width else factor < 1.2)
-    assert np.sqrt(np.mean(np.square(off))) < 1.7  # eight numbers: 1 with a deviation of a quarter
+    assert np.sqrt(np.mean(np.square(off))) < 1.8  # six numbers: 1 with a deviation of 0.29
 
 
 def test_a_hole_in_the_mask_is_in_the_mesh_bias():
