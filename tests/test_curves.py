@@ -314,7 +314,7 @@ def test_factors_of_two_tests_are_in_the_errors_or_told():
         held = np.abs(found.values - true) < 2.07 * found.standard_errors
         told = any("a factor of its own" in sentence for sentence in found.warnings)
         missed.append((not held.all(), not held.all() and not told))
-    assert np.sum(missed, axis=0)[0] <= 4 and np.sum(missed, axis=0)[1] == 0, missed
+    assert np.sum(missed, axis=0)[0] <= 6 and np.sum(missed, axis=0)[1] == 0, missed
 
 
 def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
@@ -515,6 +515,32 @@ def test_the_same_file_twice_is_refused(tmp_path, capsys):
     assert "it is the same measurement as" in capsys.readouterr().err
 
 
+def test_remarks_after_the_numbers_and_a_second_heading_are_no_matter(tmp_path):
+    rows = "".join(f"uniaxial,{k},{1 + 0.1 * k},{k},slipped\n" for k in range(6))
+    (tmp_path / "c.csv").write_text(f"test,Stretch,stretch,nominal_stress_kPa\n{rows}")
+    (found,), _ = curves.read_curves([tmp_path / "c.csv"])
+    assert np.allclose(found.stress, 1e3 * np.arange(6)) and np.isclose(found.F[-1, 0, 0], 1.5)
+
+
+def test_components_of_one_test_are_of_one_sample(tmp_path):
+    """They have no factors of their own."""
+    a, b = np.linspace(1.02, 1.4, 9), np.linspace(1.01, 1.2, 9)
+    F = np.stack([np.diag(each) for each in np.stack([a, b, 1 / (a * b)], axis=1)])
+    head = ",".join([*(f"F{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "P11_Pa", "P22_Pa"])
+    P = np.stack([np.linspace(10, 100, 9), np.linspace(5, 60, 9)], axis=1)
+    np.savetxt(tmp_path / "c.csv", np.column_stack([F.reshape(9, 9), P]), "%.12g", ",", header=head, comments="")
+    found, _ = curves.read_curves([tmp_path / "c.csv"])
+    assert len(found) == 2 and len({c.sample for c in found}) == 1
+
+
+def test_rows_without_a_stress_are_left_out_and_counted(tmp_path):
+    rows = "".join(f"uniaxial,{1 + 0.1 * k},{'' if k == 3 else k}\n" for k in range(6))
+    (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_kPa\n{rows}")
+    (found,), notes = curves.read_curves([tmp_path / "c.csv"])
+    assert np.allclose(found.stress, 1e3 * np.array([0, 1, 2, 4, 5]))
+    assert notes == ["c.csv: rows without a stress are left out: 1"]
+
+
 def test_headings_with_capitals_and_without_a_unit_are_read(tmp_path):
     rows = "".join(f"uniaxial,{1 + 0.1 * k},{k}\n" for k in range(6))
     (tmp_path / "c.csv").write_text(f"Test,Stretch [-],Nominal stress [kPa]\n{rows}")
@@ -538,7 +564,7 @@ def test_curves_of_any_encoding_are_read_below_their_title(encoding, tmp_path):
         ("a,b\n1,2\n", "has columns a, b"),
         ("test,stretch,nominal_stress_kPa\nbending,1,2\n", "'bending' is not known"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,x\nuniaxial,2,3\nuniaxial,3,3\n", "'x' is not a number"),
-        ("test,stretch,nominal_stress_kPa\nuniaxial,1,nan\nuniaxial,2,3\nuniaxial,3,3\n", "not finite"),
+        ("test,stretch,nominal_stress_kPa\nuniaxial,1,inf\nuniaxial,2,3\nuniaxial,3,3\n", "not finite"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,-1,1\nuniaxial,2,3\nuniaxial,3,3\n", "not possible"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,1,1\nuniaxial,2,3\n", "at least 3"),
         ("test,stretch,nominal_stress_kPa\nuniaxial,2,1\nuniaxial,6,3\nuniaxial,9,4\n", "do not begin near 1"),

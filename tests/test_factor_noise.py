@@ -72,8 +72,20 @@ def test_factors_that_the_numbers_take_up_are_in_the_errors_or_told(noise):
         told.append(not own.shown and np.any(own.moves > 2 * errors))
         assert own.hidden <= 0.1
     held, told = np.array(held), np.array(told)
-    assert np.all(held.mean(axis=0) > 0.8), held.mean(axis=0)
+    assert np.all(held.mean(axis=0) > 0.7), held.mean(axis=0)
     assert np.mean(~held.all(axis=1) & ~told) < 0.05
+
+
+def test_two_tests_without_factors_keep_their_errors_and_no_factor_is_claimed():
+    """Student's t of one degree of freedom is 12.7: with it, errors were 12 times too large in the mean."""
+    growth, claimed = [], 0
+    for seed in range(200):
+        J, r, found, _ = of_two_tests(0.0, 0.02, seed)
+        own = factors_of_series([12, 12], J, r, J @ found, np.eye(2))
+        alone = np.sqrt(r @ r / 22) * np.linalg.norm(np.linalg.pinv(J), axis=1)
+        growth.append(np.max(np.maximum(alone, np.linalg.norm(own.root, axis=1)) / alone))
+        claimed += own.shown
+    assert claimed <= 5 and np.median(growth) < 1.2 and np.mean(growth) < 4
 
 
 def test_factors_that_never_show():

@@ -60,17 +60,18 @@ def test_given_deviations_change_the_weights_not_the_answer():
     assert f.uncertainty.noise == 1.0
 
 
+@pytest.mark.parametrize("draws", [12, pytest.param(24, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("given", [False, True])
-def test_noise_in_percent_does_not_make_moduli_too_small(given):
+def test_noise_in_percent_does_not_make_moduli_too_small(given, draws):
     """Weighed by the measured moduli, points that are low by chance count most: G0 came out 2 % low of 10 % noise."""
     omega, found = np.geomspace(0.1, 100, 100), []
     truth = np.array([2500.0, 0.3, 0.4, 0.05, 1.2])
-    for seed in range(12):
+    for seed in range(draws):
         s = sweep(0.1, seed, truth, omega)
         s = s._replace(storage_sd=0.1 * s.storage, loss_sd=0.1 * s.loss) if given else s
         found.append(viscoelastic.closed_form(s, 2).uncertainty.values[0] / 2500 - 1)
-    # One fit is 0.85 % off: the mean of 12 has 0.25 %, and three times that is allowed.
-    assert abs(np.mean(found)) < 0.0074
+    # One fit is 0.85 % off: three times the deviation of the mean is allowed.
+    assert abs(np.mean(found)) < 3 * 0.0085 / np.sqrt(draws)
 
 
 def test_scales_follow_the_curve_and_not_the_noise():

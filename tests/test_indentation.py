@@ -38,11 +38,14 @@ def test_a_thin_layer_by_the_first_terms_of_its_series():
     assert np.isclose(found.modulus, E, rtol=0.01) and np.isclose(found.contact_point, START, atol=2e-6)
 
 
-def test_intervals_cover_with_five_percent_of_noise():
-    """60 curves of Hertz's law with noise of 5 % of the largest force: mean within 5 %, 95 % covered."""
+@pytest.mark.parametrize(
+    ("draws", "low", "high"), [(60, 0.87, 1.0), pytest.param(120, 0.9, 0.99, marks=pytest.mark.slow)]
+)
+def test_intervals_cover_with_five_percent_of_noise(draws, low, high):
+    """Curves of Hertz's law with noise of 5 % of the largest force: mean within 5 %, 95 % covered."""
     force, layer = hertz(DEPTH - START), Layer(Indenter("sphere", 1e3 * H, 0.5, R))
     rng, found = np.random.default_rng(0), []
-    for _ in range(60):
+    for _ in range(draws):
         noisy = force + 0.05 * force.max() * rng.normal(size=len(force))
         found.append(fit_contact(DEPTH, noisy, layer.force))
     moduli, points = np.array([f.modulus for f in found]), np.array([f.contact_point for f in found])
@@ -50,7 +53,7 @@ def test_intervals_cover_with_five_percent_of_noise():
     assert abs(np.median(moduli) / E - 1) < 0.05 and abs(np.median(points) - START) < 1e-5
     for values, sd, true in ((moduli, errors[:, 0], E), (points, errors[:, 1], START)):
         covered = np.mean(np.abs(values - true) < found[0].quantile * sd)
-        assert covered >= 0.87, covered  # the binomial spread of 60 draws is 0.028
+        assert low <= covered <= high, covered  # the binomial spread is 0.028 of 60 draws, 0.020 of 120
 
 
 def _shared(rng: np.random.Generator, n: int, part: float = 0.7) -> np.ndarray:

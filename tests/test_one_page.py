@@ -32,6 +32,7 @@ def test_the_page_holds_it_all(more):
         assert box.x0 >= 0 and box.x1 <= paper.x1 and box.y0 >= extent.y1
 
 
+@pytest.mark.draws
 def test_the_command_writes_it(tmp_path, capsys):
     data = str(ROOT / "data" / "lions_mane_frequency_sweep.csv")
     common = ["--method", "closed-form", "--modes", "2", "--report", "--out", str(tmp_path)]

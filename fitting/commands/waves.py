@@ -109,10 +109,13 @@ def _kept_regions(options: argparse.Namespace, organ: "Organ") -> "Keep":
     marks = kept_regions.marks_of(
         *organ.waves, organ.body.voxel, spacing=organ.field.spacing, labels=organ.field.labels, density=organ.density
     )
-    file = options.out / FILES[5]
-    if options.resume and not file.is_file():
+    progress = [options.out / name for name in FILES[4:]]
+    if not options.resume:
+        for file in progress:  # of an earlier run
+            file.unlink(missing_ok=True)
+    elif not any(file.is_file() for file in progress):
         print(f"note: {options.out} has nothing to resume: the search begins", file=sys.stderr)
-    return kept_regions.kept_in(file, options.resume, marks)
+    return kept_regions.kept_in(progress[1], options.resume, marks)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Hyperelastic laws from stress-stretch curves: least squares from many starts, kept stable over the fitted range."""
 
+import itertools
 import time
 from collections.abc import Callable
 from functools import partial
@@ -67,8 +68,9 @@ class LawFit(NamedTuple):
     limits: dict[str, str]  # parameters that ran away to 0 or infinity
 
 
-#: Factors of the tests that the residuals do not show are told if they move a number by so many standard errors.
-_HIDDEN = 2.0
+#: Factors of the tests that the residuals do not show are told if they move a number by so many standard errors, and by
+#: this part of it.
+_HIDDEN, _MOVED = 2.0, 0.05
 #: A parameter that ends by more than this factor above or below its typical size ran into a limit of its law.
 RUNAWAY = 1e6
 #: Ratio of an error of uneven noise and that of equal noise from which the correlation is that of uneven noise.
@@ -370,9 +372,12 @@ def _of_hidden_factors(
     factors: FactorNoise | None, names: np.ndarray, values: np.ndarray, errors: np.ndarray
 ) -> list[str]:
     """A sentence on factors of the tests that the residuals do not show: the parameters can take them up."""
-    if factors is None or factors.shown or not np.any(factors.moves > _HIDDEN * errors):
+    if factors is None or factors.shown:
         return []
-    worst = int(np.argmax(factors.moves / np.maximum(errors, 1e-300)))
+    much = (factors.moves > _HIDDEN * errors) & (factors.moves > _MOVED * np.abs(values))
+    if not np.any(much):
+        return []
+    worst = int(np.argmax(np.where(much, factors.moves / np.maximum(errors, 1e-300), 0.0)))
     return [
         f"a factor of its own of each test, as by the size of another sample, would hardly show in the residuals: "
         f"factors of {100 * factors.hidden:.2g} % would move {names[worst]} by some {factors.moves[worst]:.2g}, and "
@@ -405,16 +410,14 @@ def _errors_of_law(
     if of_tests:
         roots.append(growing_root(J, misfit, fitted, slope))
     alike, factors, counts = None, None, [len(c.stress) for c in curves]
+    samples = [sum(len(c.stress) for c in own) for _, own in itertools.groupby(curves, lambda c: c.sample or c.label)]
     if J.size and noise > EXACT:  # else the residuals are roundoff
         alike = along_rows(counts, misfit, J, noise, np.linalg.pinv(J))
-        factors = factors_of_series(counts, J, misfit, fitted, slope) if of_tests else None
+        factors = factors_of_series(samples, J, misfit, fitted, slope) if of_tests else None
     if alike is not None:
         roots.append(slope @ alike.root)
     if factors is not None:
         roots.append(factors.root)
-        # Errors that factors make much wider are told too, though chance may have shown these factors.
-        wide = np.any(errors_and_correlation(factors.root)[0] > _HIDDEN * errors)
-        factors = factors._replace(shown=factors.shown or bool(wide))
     for root in roots:
         uneven = errors_and_correlation(root)
         if np.any(uneven[0] > _UNEVEN * errors):

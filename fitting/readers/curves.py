@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, split_cells, text_of, to_number
+from fitting.readers.tables.text_tables import EMPTY, decimal_sign, find_delimiter, split_cells, text_of, to_number
 from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
@@ -24,6 +24,7 @@ class Curve(NamedTuple):
     component: tuple[int, int]  # of the nominal stress that was measured
     stress: np.ndarray  # (n,) [Pa]
     returns: int = 0  # how often the rows of the file turn and repeat a range
+    sample: str = ""  # the same for components of one test, which follow each other; empty: `label`
 
     @property
     def driven(self) -> np.ndarray:
@@ -55,6 +56,8 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
     curves, notes = [], []
     for file in files:
         rows = _rows_of_curves(file)
+        rows, left_out = _measured_rows(rows)
+        notes += [f"{file.name}: rows without a stress are left out: {left_out}"] if left_out else []
         found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
         curves += found
         if not named:
@@ -81,7 +84,7 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     end = next((k for k in range(first, len(cells)) if cells[k][:1] == ["[step]"]), len(cells))  # the next sheet
     if end < first + 2:
         raise InputError(f"{file} holds no rows: give a CSV file of curves")
-    names, between = [_known_heading(name) for name in cells[first]], _delimiter_of_curves(lines[first])
+    names, between = _documented(cells[first]), _delimiter_of_curves(lines[first])
     rows = [_row_under(names, own, file) for own in cells[first + 1 : end]]
     if between != ",":  # decimals may have commas then
         sign = decimal_sign(cell for row in rows for cell in row.values())
@@ -97,13 +100,20 @@ def _rows_of_curves(file: Path) -> list[dict[str, str]]:
     return rows
 
 
+def _measured_rows(rows: list[dict[str, str]]) -> tuple[list[dict[str, str]], int]:
+    """The rows whose nominal stress is measured, and how many are not; all rows if none is."""
+    name = next((key for key in rows[0] if key.startswith("nominal_stress")), None)
+    kept = rows if name is None else [row for row in rows if row[name].lower() not in EMPTY]
+    return (kept, len(rows) - len(kept)) if kept else (rows, 0)
+
+
 def _row_under(names: list[str], cells: list[str], file: Path) -> dict[str, str]:
-    if any(cells[len(names) :]):
+    if any(re.match(r"[-+]?\.?\d", cell) for cell in cells[len(names) :]):
         raise InputError(
             f"{file}: {len(cells)} cells under {len(names)} headings in {','.join(cells)[:60]!r}; write decimals with "
             "a point, and name every column"
         )
-    return dict(zip(names, cells, strict=False))  # cells at the end may be missing
+    return dict(zip(names, cells, strict=False))  # cells at the end may be missing; remarks may follow
 
 
 def _delimiter_of_curves(line: str) -> str:
@@ -111,8 +121,14 @@ def _delimiter_of_curves(line: str) -> str:
     return found if found in ";\t" else ","
 
 
-def _known_heading(name: str) -> str:
-    """A heading as it is documented: capital letters and the unit [-] do not matter."""
+def _documented(headings: list[str]) -> list[str]:
+    """Headings as they are documented, if no other heading is that already."""
+    plain = [_folded(name) for name in headings]
+    return [own if own == name or plain.count(own) == 1 else name for name, own in zip(headings, plain, strict=True)]
+
+
+def _folded(name: str) -> str:
+    """Capital letters and the unit [-] do not matter."""
     plain = re.sub(r"\s*[\[(][-1][\])]$", "", name)
     if plain.lower() in ("test", "stretch", "shear"):
         return plain.lower()
@@ -120,7 +136,7 @@ def _known_heading(name: str) -> str:
 
 
 def _names_curves(headings: list[str]) -> bool:
-    names = [_known_heading(name) for name in headings]
+    names = _documented(headings)
     return "F11" in names or ("test" in names and bool({"stretch", "shear"} & set(names)))
 
 
@@ -184,7 +200,9 @@ def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], b
     kind = _kind(F)
     several = len(measured) > 1
     return [
-        _one_curve(file, f"{file.stem}{f', P{i + 1}{j + 1}' if several else ''}", kind, F, (i, j), values)
+        _one_curve(file, f"{file.stem}{f', P{i + 1}{j + 1}' if several else ''}", kind, F, (i, j), values)._replace(
+            sample=str(file)
+        )
         for (i, j), values in measured.items()
     ], named
 

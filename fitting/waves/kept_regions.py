@@ -10,6 +10,7 @@ from fitting.waves.correlated_noise import Correlation
 from fitting.waves.regions import Regions
 from liverjax.core.errors import InputError
 from liverjax.core.files import mark_of, refuse_other, whole
+from liverjax.core.versions import versions
 
 #: `name` -> what `find` returns, or what was kept under this name.
 Keep = Callable[[str, Callable[[], Regions]], Regions]
@@ -41,7 +42,8 @@ def kept_in(file: Path, resume: bool, marks: dict[str, object]) -> Keep:
 def marks_of(omega: np.ndarray, motion: np.ndarray, sd: np.ndarray, voxel: np.ndarray, **others: object) -> dict:
     """Marks of measured waves (`MeasuredWaves`) at the voxels of a body, and of other arrays, by name."""
     arrays = {"frequencies": omega, "displacements": motion, "noise": sd, "mask": voxel, **others}
-    return {name: "none" if values is None else mark_of(values) for name, values in arrays.items()}
+    marks = {name: "none" if values is None else mark_of(values) for name, values in arrays.items()}
+    return marks | {"versions of the programs": str(versions())}
 
 
 def _write_regions(file: Path, held: dict[str, Regions], marks: dict[str, object]) -> None:

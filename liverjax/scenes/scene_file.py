@@ -65,6 +65,8 @@ _KEYS = {
     for section in dict.fromkeys(p.section for p in NAMED)
 }
 _SECTIONS = ("mesh", "law", *list(_KEYS)[1:])
+#: Keys of a place, which say nothing of what acts there.
+PLACE = {"where", "set"}
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -139,13 +141,13 @@ def _physics(mesh: TetMesh, content: dict) -> Iterator[Physics]:
     """The physics of tables in `liverjax.physics.registry`: for each table the first kind that knows all its keys."""
     for section in dict.fromkeys(p.section for p in NAMED):
         for k, table in enumerate(_tables(content, section)):
-            name, own = f"{section}.{k}", set(table) - {"where", "set"}
+            name, own = f"{section}.{k}", set(table) - PLACE
             kinds = [p for p in NAMED if p.section == section and own and own <= set(p.keys)]
             if own and not kinds:
                 raise InputError(_of_two_kinds(name, own, [set(p.keys) for p in NAMED if p.section == section]))
             if not kinds:
-                known = " or ".join(", ".join(p.keys[2:]) for p in NAMED if p.section == section)
-                raise InputError(f"{name} has only a place: give {known}")
+                known = (", ".join(key for key in p.keys if key not in PLACE) for p in NAMED if p.section == section)
+                raise InputError(f"{name} has only a place: give {' or '.join(known)}")
             yield kinds[0].read(mesh, table, name)
 
 

@@ -19,7 +19,9 @@ _ROUNDOFF = 1e-8
 class FactorNoise(NamedTuple):
     """Factors of series."""
 
-    deviation: float  # the most probable standard deviation of a factor [1]; it may be 0
+    deviation: (
+        float  # the most probable standard deviation of a factor [1]; it may be 0, and at most `HIDDEN` if not shown
+    )
     root: np.ndarray  # (P, n + K) square root of the covariance of the numbers
     shown: bool  # independent noise alone does not explain the residuals
     hidden: float  # deviation, at most `HIDDEN`, of factors that the residuals do not exclude [1]
@@ -31,9 +33,9 @@ def factors_of_series(
 ) -> FactorNoise | None:
     """Noise of variance s^2 (I + q^2 f_k f_k^T) of each series k; None for one series, or too few residuals.
 
-    The factors are few, so their deviation is not known well: it is enlarged by Student's t of K - 1 degrees of
-    freedom. If the unknowns can take up most of the factors, the residuals hardly show them: `hidden` and `moves` tell
-    what they leave open.
+    The factors are few, so a deviation that is shown is not known well: it is enlarged by Student's t of K - 1 degrees
+    of freedom. One that chance may have made is not. If the unknowns can take up most of the factors, the residuals
+    hardly show them: `hidden` and `moves` tell what they leave open.
 
     Args:
         counts: rows of each of K series.
@@ -60,14 +62,14 @@ def factors_of_series(
         square = max(rest + float(np.sum(along / stretched)), 1e-300)
         return -0.5 * (float(np.sum(np.log(stretched))) + m * np.log(square / m)), square / m
 
-    qs = np.concatenate([[0.0], np.geomspace(0.1, 1e4, 60) / S[0]]) if S[0] > 0 else np.zeros(1)
+    qs = np.concatenate([[0.0], np.geomspace(0.1, 1e8, 110) / S[0]]) if S[0] > 0 else np.zeros(1)
     values, squares = np.array([at(q) for q in qs]).T
     best, levels, inverse = int(np.argmax(values)), np.sqrt(squares), np.linalg.pinv(J)
     by_factors = slope @ inverse @ F
-    few = float(scipy.special.stdtrit(K - 1, 0.975) / scipy.special.ndtri(0.975))
-    root = np.hstack([slope @ inverse * levels[best], by_factors * (levels[best] * qs[best] * few)])
+    shown = bool(values[best] - values[0] >= _GAIN)
+    deviation = float(levels[best] * qs[best]) if shown else min(HIDDEN, float(levels[best] * qs[best]))
+    few = float(scipy.special.stdtrit(K - 1, 0.975) / scipy.special.ndtri(0.975)) if shown else 1.0
+    root = np.hstack([slope @ inverse * levels[best], by_factors * (deviation * few)])
     likely = values >= values[best] - _FALL
     hidden = HIDDEN if likely[-1] else min(HIDDEN, float((levels * qs)[likely].max()))
-    shown = bool(values[best] - values[0] >= _GAIN)
-    moves = hidden * np.linalg.norm(by_factors, axis=1)
-    return FactorNoise(float(levels[best] * qs[best]), root, shown, hidden, moves)
+    return FactorNoise(deviation, root, shown, hidden, hidden * np.linalg.norm(by_factors, axis=1))
