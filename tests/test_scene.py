@@ -192,6 +192,7 @@ REFUSED = {
         lambda c: c["displaced"][0].update(history=[["0", "0", "0", "0"]]),
         "is not a table of numbers",
     ),
+    "an empty obstacle": (lambda c: c.update(obstacle=[{}]), "obstacle.0 has only a place: give shape, position"),
     "history is missing": (lambda c: c["displaced"][0].update(history="none.csv"), "cannot be read"),
 }
 
