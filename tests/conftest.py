@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
+import io
 import json
 import shutil
 import tempfile
@@ -156,8 +157,10 @@ def _strict():
     assert jax.config.jax_enable_x64
 
 
-def _one_point(_figure: object, file: object, **_: object) -> None:
-    plt.imsave(file, np.zeros((1, 1)))
+def _one_point(_figure: object, file: Path, **_: object) -> None:
+    content = io.BytesIO()
+    plt.imsave(content, np.zeros((1, 1)), format="png")
+    Path(file).write_bytes(content.getvalue())
 
 
 @pytest.fixture(autouse=True)

@@ -77,7 +77,7 @@ def test_factors_that_the_numbers_take_up_are_in_the_errors_or_told(noise):
 
 
 def test_two_tests_without_factors_keep_their_errors_and_no_factor_is_claimed():
-    """Student's t of one degree of freedom is 12.7: with it, errors were 12 times too large in the mean."""
+    """Student's t of one degree of freedom is 12.7: with it, errors were 3 times too large in the mean."""
     growth, claimed = [], 0
     for seed in range(200):
         J, r, found, _ = of_two_tests(0.0, 0.02, seed)
@@ -85,7 +85,7 @@ def test_two_tests_without_factors_keep_their_errors_and_no_factor_is_claimed():
         alone = np.sqrt(r @ r / 22) * np.linalg.norm(np.linalg.pinv(J), axis=1)
         growth.append(np.max(np.maximum(alone, np.linalg.norm(own.root, axis=1)) / alone))
         claimed += own.shown
-    assert claimed <= 5 and np.median(growth) < 1.2 and np.mean(growth) < 4
+    assert claimed <= 5 and np.median(growth) < 1.2 and np.mean(growth) < 2
 
 
 def test_factors_that_never_show():

@@ -590,7 +590,7 @@ def test_the_moduli_are_written_as_a_sweep_that_fits_read(tmp_path):
         (["--noise", "-1"], "--noise -1 must be above 0"),
         (["--frequencies", "0"], "must be above 0 Hz"),
         (["--mask", "none.npz"], "no such file"),
-        (["--stride", "3"], "waves need at least 5"),
+        (["--stride", "3"], "waves need at least 3"),
     ],
 )
 def test_options_that_cannot_be_are_refused_in_a_sentence(tmp_path, options, words, capsys):
