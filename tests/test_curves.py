@@ -303,7 +303,7 @@ def test_factors_of_two_tests_are_in_the_errors_or_told():
     law = lj.laws.MooneyRivlin(c10=300.0, c01=200.0, bulk=None)
     (candidate,) = stress_stretch.candidates("mooney_rivlin")
     missed, shown = [], 0
-    for _ in range(12):
+    for _ in range(6):
         two = []
         for test in ("uniaxial", "equibiaxial"):
             exact = np.asarray(homogeneous.response(law, test, stretch)) * (1 + 0.1 * rng.standard_normal())
@@ -315,7 +315,7 @@ def test_factors_of_two_tests_are_in_the_errors_or_told():
         told = any("a factor of its own" in sentence for sentence in found.warnings)
         missed.append((not held.all(), not held.all() and not told))
         shown += any("each test seems to have a factor" in sentence for sentence in found.warnings)
-    assert np.sum(missed, axis=0)[0] <= 6 and np.sum(missed, axis=0)[1] == 0 and shown, missed
+    assert np.sum(missed, axis=0)[0] <= 3 and np.sum(missed, axis=0)[1] == 0 and shown, missed
 
 
 def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
