@@ -379,10 +379,10 @@ def _of_hidden_factors(
         return []
     worst = int(np.argmax(np.where(much, factors.moves / np.maximum(errors, 1e-300), 0.0)))
     return [
-        f"a factor of its own of each test, as by the size of another sample, would hardly show in the residuals: "
-        f"factors of {100 * factors.hidden:.2g} % would move {names[worst]} by some {factors.moves[worst]:.2g}, and "
-        f"{names[worst]} = {values[worst]:.4g} ± {errors[worst]:.2g} does not contain them; measure all tests on one "
-        "sample, or one of them on several samples"
+        "if each test has a factor of its own, as by another sample or a wrong size of it, the residuals hardly show "
+        f"it: factors of {100 * factors.hidden:.2g} % move {names[worst]} by some {factors.moves[worst]:.2g}, and "
+        f"{values[worst]:.4g} ± {errors[worst]:.2g} does not contain this; measure all tests on one sample, or one of "
+        "them on several samples"
     ]
 
 
