@@ -121,6 +121,7 @@ def test_auto_decides_by_size_and_stiffness():
     lj.simulate(replace(PULLED, law=Bare(mu=770.0))).check()
 
 
+@pytest.mark.slow
 def test_a_matrix_without_an_inverse_is_told():
     loose = lj.Scene(mesh=MESH, law=LAW, body=BODY, solve=lj.Solve())  # nothing holds it
     e = equations(loose, initial_state(loose), 1.0)

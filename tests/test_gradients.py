@@ -221,6 +221,7 @@ def test_a_step_keeps_no_more_than_its_state_and_root():
     assert abs(predicted / sizes[1] - 1) < 0.2
 
 
+@pytest.mark.slow
 def test_codes_of_derivatives():
     """Through a step that did not converge, and where the adjoint solve gives nothing: one program, two tolerances."""
     scene = _scene("static", cells=(1, 1, 1), steps=1)

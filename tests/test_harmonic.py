@@ -156,7 +156,7 @@ def stretched(scene: lj.Scene, stretch: float) -> jax.Array:
     return scene.mesh.points * jnp.array([[1.0, 1.0, stretch]])
 
 
-@pytest.mark.parametrize("part", ["all", "isochoric"])
+@pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_about_a_stretched_state(part):
     """The stress that has not relaxed stiffens the slab: its modulus there from derivatives of the energy alone."""
     prony = replace(PRONY, part=part)
@@ -287,6 +287,7 @@ def test_supports_and_regions_take_part():
     assert np.allclose(u, exact[:, None], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_undamped_resonance_is_told():
     scene = replace(slab(2, 1), viscosity=None)
     broken = replace(scene, law=lj.laws.NeoHookean(mu=jnp.nan, bulk=jnp.nan))

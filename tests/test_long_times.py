@@ -38,6 +38,7 @@ def interval(test: Sweep):
     return float(fit.model.equilibrium_modulus), error, found
 
 
+@pytest.mark.slow
 def test_the_interval_holds_where_a_mode_relaxes_after_the_test():
     """Two modes were chosen, and their 820 ± 12 Pa missed the true 500 by 16 to 30 errors in 20 of 20 sweeps."""
     held, errors = [], []

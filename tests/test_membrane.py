@@ -90,7 +90,8 @@ def patch_of_sphere(order: int, n: int) -> lj.TetMesh:
     return lj.quadratic(mesh) if order == 2 else mesh
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_a_balloon_through_its_limit_point(order, verified):
     """Volume control of a thin Mooney-Rivlin sphere: p = 4 t/(R l^2) (c10 (l - l^-5) + c01 (l^3 - l^-3))."""
     c10, c01, t, errors = RUBBER.c10, RUBBER.c01, 1e-3, []

@@ -102,7 +102,8 @@ def test_only_scenes_that_have_it_hold_its_equations(order):
     assert own <= set(files(traced(every).jaxpr))
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2])
 def test_what_has_no_registry_is_in_no_other_program(order):
     own = {name: module.__file__ for name, (module, _) in OTHERS.items()}
     assert not set(own.values()) & files_of_plain(order)

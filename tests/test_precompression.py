@@ -232,7 +232,9 @@ def test_no_compression_is_no_change(law):
     assert replace(rig, height=1.0).held is None
 
 
-@pytest.mark.parametrize("name", ["neo_hookean", "mooney_rivlin", "ogden", "fung_demiray"])
+@pytest.mark.parametrize(
+    "name", ["neo_hookean", "mooney_rivlin", pytest.param("ogden", marks=pytest.mark.slow), "fung_demiray"]
+)
 def test_a_sample_that_keeps_its_volume_is_the_limit_of_a_large_bulk_modulus(name):
     """The law assumed has K / G = 10: the moduli of an incompressible sample came out 1.3 % too large, unsaid."""
     law = lj.laws.typical(name)

@@ -68,6 +68,7 @@ def test_a_stiffer_sample_is_a_factor_and_waves_are_predicted_too():
     assert "outside the band" in prediction.sentence(outside)
 
 
+@pytest.mark.slow
 def test_polystyrene_relaxes_and_creeps_alike_and_softer_than_it_swings(capsys, tmp_path):
     """Of one material from one laboratory: two tests in time agree with each other, not with the sweep."""
     folder = SHARED / "data" / "rheology" / "pyrheo"

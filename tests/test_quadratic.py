@@ -107,6 +107,7 @@ def test_a_quadratic_field_is_shown_exactly():
     assert np.abs(F - exact).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_an_affine_motion_of_the_surface_moves_the_inside_alike():
     A = np.array([[1.1, 0.2, 0.0], [0.0, 0.95, 0.1], [0.05, 0.0, 1.05]])
     mesh = lj.quadratic(crooked((2, 2, 2), (0.01, 0.01, 0.01)))

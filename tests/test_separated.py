@@ -96,7 +96,7 @@ def test_a_loaded_mesh_is_refused(scene):
         ({"law.mu": 600.0}, {}, "lowest and the highest"),
         (RANGES, {"points": 1}, "2 or more"),
         (RANGES, {"points": 50}, "2000 runs at most"),
-        ({"law.mu": (1e-3, 2e-3)}, {"points": 2, "checks": 1}, "narrow the ranges"),
+        pytest.param({"law.mu": (1e-3, 2e-3)}, {"points": 2, "checks": 1}, "narrow the ranges", marks=pytest.mark.slow),
     ],
 )
 def test_what_cannot_be_separated_gets_a_sentence(scene, ranges, more, words):

@@ -341,6 +341,7 @@ def test_vmap_is_the_loop():
         assert np.allclose(lanes.reactions[k], run(mu).reactions, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_scene_carries_only_what_it_has():
     mesh = box(1)
     plain = lj.Scene(mesh=mesh, law=LAW, fixed=(bottom(mesh),))

@@ -113,6 +113,7 @@ def test_correction_removes_the_mesh_bias(law, prony):
     assert abs(corrected[0] / corrected[1] - 1) < 0.1 * STRAIN
 
 
+@pytest.mark.slow
 def test_relaxing_the_isochoric_part_alone(rig, law, prony):
     # Torsion changes no volume, so relaxing the isochoric part alone answers the same formula, once the bias of the
     # mesh is taken at each frequency (with the elastic one it would be 26 % off on this coarse mesh).
@@ -181,7 +182,8 @@ def inertial(omega, G, height):
     return G * x * np.cos(x) / np.sin(x)
 
 
-@pytest.mark.parametrize("by", ["torque", pytest.param("angle", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["torque", "angle"])
 def test_a_cycle_with_inertia_begins_without_a_transient(law, prony, by, verified):
     """One cycle is the torsional wave: a start on the cycle without inertia was 16 % off in G'' here.
 

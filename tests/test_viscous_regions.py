@@ -52,6 +52,7 @@ def test_a_body_of_two_has_the_forces_of_both(order, part):
     np.testing.assert_allclose(both, 0.5 * (liver + lesion), atol=1e-12 * np.abs(liver).max())
 
 
+@pytest.mark.slow
 def test_a_later_region_wins():
     every = jnp.arange(block().mesh.number_of_elements)
     both = (lj.Region(elements=every, viscosity=LESION), lj.Region(elements=every, viscosity=LIVER))

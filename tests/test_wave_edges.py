@@ -206,15 +206,16 @@ def test_smoothed_labels_keep_place_and_volume():
     assert np.sum(farther.argmax(axis=0) == 2) > 1.2 * volume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "centre", "spacing", "elements"),
     [
-        pytest.param(0.005, (3e-4, -4e-4), 1e-3, 0.01, marks=pytest.mark.slow),
+        (0.005, (3e-4, -4e-4), 1e-3, 0.01),
         (0.005, (1.3e-3, 1e-4), 2e-3, 0.07),
-        pytest.param(0.005, (8e-4, 1e-4), 1e-3, 0.01, marks=pytest.mark.slow),
-        pytest.param(0.003, (3e-4, -4e-4), 1e-3, 0.01, marks=pytest.mark.slow),
-        pytest.param(0.010, (3e-4, -4e-4), 2e-3, 0.01, marks=pytest.mark.slow),
-        pytest.param(0.010, (1e-3, 1e-5), 2e-3, 0.01, marks=pytest.mark.slow),
+        (0.005, (8e-4, 1e-4), 1e-3, 0.01),
+        (0.003, (3e-4, -4e-4), 1e-3, 0.01),
+        (0.010, (3e-4, -4e-4), 2e-3, 0.01),
+        (0.010, (1e-3, 1e-5), 2e-3, 0.01),
     ],
 )
 def test_the_modulus_of_a_cylinder_of_few_voxels(radius, centre, spacing, elements, verified):
