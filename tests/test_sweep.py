@@ -450,6 +450,21 @@ def test_unusable_options_are_refused(files, capsys):
         assert sentence in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("solve", "words"),
+    [
+        ('kind = "harmonic"\nfrequencies = [20.0]', "kind = 'harmonic' is not for sweeps"),
+        ('reduced = "model.h5"', "model.h5' is not for sweeps"),
+    ],
+)
+def test_scenes_that_are_not_swept_are_refused_before_a_file_is_written(files, solve, words, capsys):
+    scene = SCENE.split("[solve]")[0] + f"[solve]\n{solve}\n"
+    (files / "other.toml").write_text(scene)
+    (files / "mu.csv").write_text("law.mu\n700\n800\n")
+    ask = ["sweep", str(files / "other.toml"), str(files / "mu.csv"), "--out", str(files / "other.h5")]
+    assert main(ask) == 2 and words in capsys.readouterr().err and not list(files.glob("other.h5*"))
+
+
 def test_one_table_stands_for_a_list_of_one(files):
     one_law = SCENE.replace("[law]", "[[law]]").replace("770.0", "770")
     (files / "scene.toml").write_text(one_law + "[traction]\nwhere = {z_max = 0.0}\npressure = 4.0\n")

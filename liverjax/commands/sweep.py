@@ -49,6 +49,13 @@ def run(options: argparse.Namespace) -> int:
 
     stored, probes, numbers = tuple(options.store), tuple(options.probe), tuple(options.rows)
     table = sweep.read_sweep(options.scene, options.parameters, stored, probes, options.chunk, numbers)
+    solve = table.scene.solve
+    if solve.kind == "harmonic" or solve.reduced:
+        own = "kind = 'harmonic'" if solve.kind == "harmonic" else f"reduced = {solve.reduced!r}"
+        raise InputError(
+            f"{options.scene}: [solve] {own} is not for sweeps, which are full runs in time: take python -m liverjax "
+            "simulate for each row"
+        )
     out = options.out or options.parameters.with_suffix(".h5")
     bar = tqdm(total=len(table.rows), unit="row", disable=None, leave=False)  # on a terminal only
     try:

@@ -208,7 +208,9 @@ def _ready(scene: Scene) -> Scene:
     """`prepared`, with the points as they are given."""
     check_before_run(scene)
     if scene.solve.kind == "harmonic":
-        raise InputError("[solve] kind = 'harmonic' has no run in time: call lj.harmonic(scene)")
+        raise InputError(
+            "[solve] kind = 'harmonic' has no run in time: run python -m liverjax simulate, or call lj.harmonic(scene)"
+        )
     if scene.solve.reduced:
         file = scene.solve.reduced
         raise InputError(
