@@ -143,7 +143,7 @@ def _single(label: str, typical: Law) -> Candidate:
     fields, notes = _fitted(label, typical)
     names = tuple(f.name for f in fields)
     middle = np.array([float(getattr(typical, n)) for n in names])
-    positive = np.array([f.metadata["above"] == 0 for f in fields])
+    positive = np.array([f.metadata.get("above") == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
     size = abs(_shear_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)  # higher terms alone have G = 0
     middle = middle / np.where(modulus, size, 1.0)

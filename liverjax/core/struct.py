@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace as replace
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypedDict, TypeVar, Unpack, dataclass_transform
 
 import jax
 import numpy as np
@@ -33,48 +33,61 @@ def static(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+class Limits(TypedDict, total=False):
+    """What `liverjax.core.bounds.check_fields` asks of a number."""
+
+    lower: float  # inclusive
+    upper: float  # inclusive
+    above: float  # strict
+    nonzero: bool  # 0 is refused
+
+
 def param(
     unit: str,
     about: str = "",
     *,
-    lower: float | None = None,
-    upper: float | None = None,
-    above: float | None = None,
-    nonzero: bool = False,
     each: bool = False,
-    unnamed: bool | str = False,
     typical: Any = None,
     default: Any = dataclasses.MISSING,
+    **limits: Unpack[Limits],
 ) -> Any:
     """A numeric field, a leaf of the pytree.
 
     Args:
         unit: SI unit, ``"1"`` for a pure number. Fields in ``Pa`` scale together in `liverjax.laws.scaled`.
         about: one line for ``python -m liverjax laws``.
-        lower, upper: inclusive bounds; ``above``: strict lower bound.
-        nonzero: 0 is refused. `liverjax.core.bounds.check_fields` reads all of these.
         each: a sequence with one number per term (or the components of a direction).
-        unnamed: the field contains structs, and the dotted names of scene files leave out the field itself. A text
-            names a method that returns the places in this field for a word: `support.0` is the first of
-            ``named("support")``.
         typical: value for a soft tissue of about 1 kPa shear modulus, used if a law is given by its name alone.
         default: as in `dataclasses.field`.
+        limits: ``lower`` and ``upper``, inclusive bounds; ``above``, a strict lower bound; ``nonzero=True``, 0 is
+            refused.
     """
+    unknown = limits.keys() - Limits.__annotations__.keys()
+    if unknown:
+        raise TypeError(f"param has no {sorted(unknown)[0]!r}: use {', '.join(Limits.__annotations__)}")
     metadata = {
         "unit": unit,
         "about": about,
-        "lower": lower,
-        "upper": upper,
-        "above": above,
-        "nonzero": nonzero,
         "each": each,
-        "unnamed": unnamed,
         "typical": default if typical is None and default is not dataclasses.MISSING else typical,
+        **limits,
     }
     return dataclasses.field(default=default, metadata=metadata)
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(static, param))
+def unnamed(about: str = "", *, places: str = "", default: object = dataclasses.MISSING) -> Any:
+    """A field that contains structs, and is left out of their dotted names: `law.mu`, not `law.law.mu`.
+
+    Args:
+        about: one line on it.
+        places: name of a method that returns the places in this field for a word: `support.0` is the first of
+            ``named("support")``.
+        default: as in `dataclasses.field`.
+    """
+    return dataclasses.field(default=default, metadata={"about": about, "unnamed": places or True})
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(static, param, unnamed))
 def struct(cls: type[T]) -> type[T]:
     """Make `cls` a frozen, keyword-only dataclass registered as a pytree; `static` fields are not leaves."""
     made: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, replace, static, struct
+from liverjax.core.struct import Number, param, replace, static, struct, unnamed
 from liverjax.laws.derivatives import accumulate
 from liverjax.laws.energies import Energies, fibre_invariants
 from liverjax.laws.terms import invariant_terms
@@ -110,7 +110,7 @@ def _floating(F: Number) -> jax.Array:
 class Sum(Law):
     """Several laws acting in parallel: energies add."""
 
-    laws: tuple = param("1", "laws that add up", unnamed=True)
+    laws: tuple = unnamed("laws that add up")
 
     def summands(self):
         """The laws."""

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import param, struct
+from liverjax.core.struct import param, struct, unnamed
 from liverjax.laws.base import Law, Volumetric
 from liverjax.tensors.matrices import Matrix
 from liverjax.tensors.subsets import Subsets, in_subset, put_together
@@ -20,7 +20,7 @@ class ByRegion(Law):
     used.
     """
 
-    laws: tuple[Law, ...] = param("1", "one law for each subset", unnamed=True)
+    laws: tuple[Law, ...] = unnamed("one law for each subset")
     subsets: Subsets = param("1", "which elements each law has")  # type: ignore[assignment]
 
     def pieces(self) -> tuple[Law, ...]:

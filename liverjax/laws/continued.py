@@ -1,12 +1,10 @@
 """A law continued below a chosen J: finite energy for flat and inverted elements, for which the law itself has none."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, param, static, struct
+from liverjax.core.struct import Number, static, struct, unnamed
 from liverjax.laws.base import Law, Volumetric
 from liverjax.tensors.matrices import determinant
 
@@ -19,7 +17,7 @@ class Continued(Law):
     invariants exist. A volumetric energy is replaced by its Taylor parabola at c. The energy rises towards inversion.
     """
 
-    law: Any = param("1", "the law that is continued", unnamed=True)
+    law: Law = unnamed("the law that is continued")
     below: float = static(default=0.1, about="c, the J below which the law is continued")
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 
 from liverjax.core import names
 from liverjax.core.errors import InputError
-from liverjax.core.struct import Number, Numbers, param, replace, static, struct
+from liverjax.core.struct import Number, Numbers, param, replace, static, struct, unnamed
 from liverjax.laws import Law
 from liverjax.mesh.tetrahedra import TetMesh, with_points
 from liverjax.physics.base import Physics
@@ -82,7 +82,7 @@ class Scene:
     fixed: tuple[Fixed, ...] = param("1", "held nodes", default=())
     displaced: tuple[Displaced, ...] = param("1", "prescribed motion", default=())
     traction: tuple[Traction, ...] = param("1", "loads", default=())
-    physics: tuple[Physics, ...] = param("1", "further physics: supports, …", unnamed="named", default=())
+    physics: tuple[Physics, ...] = unnamed("further physics: supports, …", places="named", default=())
     solve: Solve = param("1", "how it is solved", default=Solve())
     points_are: str = static(default="reference", about="the mesh's points: reference; or loaded, under the loads")
 
