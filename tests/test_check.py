@@ -88,7 +88,7 @@ MISTAKES = {
         def isochoric_energy(self, I1, I2):
             return self.mu * jnp.sqrt(I1 - 3) ** 2
         """,
-        "stress at rest",
+        "tangent at rest",
     ),
     "energy at rest": (
         """
@@ -142,9 +142,35 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
     more: float = lj.param("Pa", typical=3.0)
 """
     )
-    main(["check", f"{file}:Law", "--out", str(tmp_path)])
+    assert main(["check", f"{file}:Law", "--out", str(tmp_path)]) == 1  # a misspelt energy showed in no code
     (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("numbers without effect")]
-    assert row.split()[3] == "more"
+    assert row.split()[3:5] == ["FAILED", "more"]
+
+
+@pytest.mark.parametrize(
+    "stated, agrees", [("self.mu", True), ("self.mu + 4 * self.k / 15", True), ("2 * self.mu", False)]
+)
+def test_fibres_that_go_slack_have_a_stiffness_for_each_side(stated, agrees, tmp_path, monkeypatch):
+    """W = k/2 max(I4 - 1, 0)^2: stretched fibres add 4 k along themselves; at rest JAX takes a quarter of it."""
+    monkeypatch.setattr(figures, "gradient_check", lambda *_: None)
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import jax.numpy as jnp\nimport liverjax as lj\n\n@lj.struct\nclass Fibres(lj.Law):\n"
+        '    mu: float = lj.param("Pa", typical=700.0)\n    k: float = lj.param("Pa", typical=500.0)\n'
+        '    bulk: float = lj.param("Pa", typical=5000.0)\n'
+        '    fibre: tuple = lj.param("1", each=True, typical=(1.0, 0.0, 0.0))\n'
+        '    volumetric: str = lj.static("quadratic")\n'
+        '    invariants = ("I1", "I4", "J")\n'
+        f"    def shear_modulus(self):\n        return {stated}\n"
+        "    def strain_energy(self, I):\n        slack = jnp.maximum(I.I4 - 1, 0.0)\n"
+        "        own = self.mu / 2 * (I.I1 * I.J ** (-2 / 3) - 3) + self.bulk / 2 * (I.J - 1) ** 2\n"
+        "        return own + self.k / 2 * slack**2\n"
+    )
+    rows = {row.name: row for row in gradient_check.check(gradient_check.load(f"{file}:Fibres")).rows}
+    assert rows["ground-state shear modulus"].passed is agrees
+    low, high = (float(v) for v in rows["ground-state shear modulus"].found.removesuffix(" Pa").split(" to "))
+    assert low == pytest.approx(700, rel=1e-4) and high == pytest.approx(700 + 4 * 500 / 15, rel=1e-4)
+    assert "stiffness at rest jumps" in rows
 
 
 _UNUSABLE = {
@@ -255,7 +281,7 @@ def test_stable_ranges_of_known_laws():
         ("mine.py", "names no law"),
         ("mine.py:Lew", "use Law"),
         ("mine.py:number", "is not a law"),
-        ("mine.py:Bare", "write @liverjax.core.struct"),
+        ("mine.py:Bare", "write @liverjax.struct"),
         ("mine.py:NoTypical", "parameter mu has no typical value"),
         ("broken.py:Law", "does not run"),
     ],

@@ -218,6 +218,16 @@ def test_a_curved_file_is_made_straight_and_said(tmp_path):
     assert np.allclose(found.points, MESH.points, atol=1e-15)
 
 
+def test_middles_in_another_order_are_refused(tmp_path):
+    """Gmsh numbers the last two edges the other way round than VTK: 48 "curved" middles were reported."""
+    lj.write_mesh(tmp_path / "body.vtu", MESH)
+    data = meshio.read(tmp_path / "body.vtu")
+    data.cells[0].data[:, [8, 9]] = data.cells[0].data[:, [9, 8]]
+    data.write(tmp_path / "swapped.vtu")
+    with pytest.raises(lj.InputError, match="not in the order of its format"):
+        lj.read_mesh(tmp_path / "swapped.vtu")
+
+
 def test_a_scene_file_asks_for_the_order(tmp_path):
     table = {"shape": "box", "size": [0.01, 0.01, 0.01], "cells": [1, 1, 1]}
     content = {"law": {"name": "neo_hookean", "mu": 800.0, "bulk": 4000.0}, "fixed": [{"where": {"z_max": 0.0}}]}

@@ -106,6 +106,11 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
     length = np.linalg.norm(straight[high] - straight[low], axis=1)[middles - len(used)]
     off = np.linalg.norm(points[of_file] - straight[middles], axis=2)
     curved = of_file[off > _STRAIGHT * length]
+    if len(curved) and _permuted(points[of_file], straight[middles], length):
+        raise InputError(
+            f"{name}: the middle nodes of its elements are not in the order of its format (each lies on another edge "
+            "of the same element); export the mesh anew, as VTU or Gmsh"
+        )
     if len(curved):
         warnings.warn(
             f"{name}: {len(np.unique(curved))} middles of edges lie up to {off.max():.3g} m off the straight edge: "
@@ -114,6 +119,13 @@ def _with_middles(points: np.ndarray, tets: np.ndarray, node_sets: dict, element
         )
     sets = {k: new[nodes][new[nodes] >= 0] for k, nodes in node_sets.items()}
     return replace(mesh, node_sets={k: node_numbers(np.unique(v)) for k, v in sets.items()})
+
+
+def _permuted(points: np.ndarray, middles: np.ndarray, length: np.ndarray) -> bool:
+    """Whether the points (E, 6, 3) [m] of all elements are their edges' middles (E, 6, 3) in one other order."""
+    apart = np.linalg.norm(points[:, :, None] - middles[:, None], axis=3)
+    order = apart[0].argmin(axis=1)
+    return bool(np.all(apart[:, np.arange(6), order] <= _STRAIGHT * length[:, order]))
 
 
 #: The beginning of a file that meshio cannot read -> what the file is, and the remedy.
@@ -142,9 +154,11 @@ def _read_quietly(path: Path) -> Any:
             return meshio.read(path)
     except SystemExit:  # meshio exits if no reader accepts the file, and prints their reasons
         reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
+    except KeyError as error:  # a table of the file lacks an entry, e.g. Gmsh's groups without $Entities
+        reason = f"it names {error} but does not list it"
     except Exception as error:  # meshio's readers raise whatever their parser meets
         reason = " ".join(str(error).split()) or type(error).__name__
-    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh")
+    raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh 2.2")
 
 
 #: Cells of surfaces and edges, which a file may have in addition to its tetrahedra.
