@@ -143,7 +143,7 @@ def test_what_no_law_follows_is_said(tmp_path, tanned):
     falls = 1 / (1 + (STRAIN / 0.1) ** 2)
     sweep = sweep._replace(storage=1000 * falls, loss=np.full(len(STRAIN), 100.0))
     (candidate,) = stress_stretch.candidates("fung_demiray")
-    told = " ".join(law_fit.said_of(sweep, law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")))
+    told = " ".join(law_fit.said_of(sweep, [law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")]))
     assert "c2 may be off by several per cent" in told  # the memory is not known
     assert "the loss tangent changes" in told and "misses the moduli" in told and "slips, yields or tears" in told
 
@@ -189,6 +189,45 @@ def test_strains_below_one_percent_may_be_fractions(tmp_path, tanned):
     for part, told in ((0.01, True), (1.0, False)):
         sweep = strain_sweep.read_strain_sweep(written(tmp_path / "s.csv", law, memories, 0.0, shares, part * STRAIN))
         assert any("if they are fractions, name the column strain_1" in n for n in sweep.notes) == told
+
+
+def test_two_temperatures_and_deviations(tmp_path, tanned):
+    """Sweeps at 20 and 37 °C were read as one."""
+    law, memories, shares = tanned
+    path = written(tmp_path / "sweep.csv", law, memories, 0.0, shares)
+    head, *rows = path.read_text().splitlines()
+    for other, told in ((20.5, False), (37.0, True)):
+        both = [f"{r},20,1" for r in rows] + [f"{r},{other},1" for r in rows]
+        path.write_text("\n".join([f"{head},temperature_C,storage_modulus_sd_Pa", *both]))
+        if told:
+            with pytest.raises(InputError, match="goes from 20 to 37 °C"):
+                strain_sweep.read_strain_sweep(path)
+        else:
+            notes = strain_sweep.read_strain_sweep(path).notes
+            assert any("storage_modulus_sd_Pa are not used" in note for note in notes)
+
+
+def test_a_frequency_beyond_the_series_is_told():
+    """Without the fastest of three modes c1 was 25 % too small, and nothing named the series."""
+    memory = law_fit.Memory(Maxwell(2000.0, np.array([0.3, 0.2]), np.array([1.0, 0.05])))
+    assert law_fit.outside_series(memory, 2 * np.pi * 3) is None
+    told = law_fit.outside_series(memory, 2 * np.pi * 20)
+    assert told is not None and "20 Hz lie above" in told and "(0.159 to 3.18 Hz)" in told
+    assert "lie below" in (law_fit.outside_series(memory, 2 * np.pi * 0.01) or "")
+    assert law_fit.outside_series(law_fit.Memory(), 2 * np.pi * 20) is None
+
+
+def test_laws_that_follow_a_sweep_as_well_are_named(tmp_path, tanned):
+    law, memories, shares = tanned
+    sweep = strain_sweep.read_strain_sweep(written(tmp_path / "a.csv", law, memories, 0.0, shares))
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    best = law_fit.fit_law(candidate, sweep, law_fit.Memory(), "parallel")
+    other, far = (
+        best._replace(law=best.law._replace(aicc=best.law.aicc + d, label=n)) for n, d in (("b", 3), ("c", 9))
+    )
+    told = law_fit.said_of(sweep, [best, other, far])
+    assert any(t.startswith("b follow the sweep as well as") for t in told)
+    assert not any("as well as" in t for t in law_fit.said_of(sweep, [best, far]))
 
 
 def test_a_frequency_sweep_and_few_points_are_refused(tmp_path, tanned, capsys):

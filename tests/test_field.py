@@ -470,6 +470,8 @@ def test_a_fit_that_misses_the_data_says_so():
         ("law.mu",), np.ones(1), np.ones((1, 1)), np.ones(1), np.ones((1, 1)), 90.0, 60, 1.0, 59.0, 3, True
     )
     assert field_report.misfit_sentence(found._replace(chi2=89.0)) is None
+    said = field_report.misfit_sentence(found._replace(chi2=0.6))  # a noise in millimetres
+    assert said is not None and "scatter 0.1 times as much as the stated noise" in said
     said = field_report.misfit_sentence(found._replace(chi2=240.0))
     assert said is not None and "chi2 stays at 4 per component" in said and "by 2 times their noise" in said
     assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said]

@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,6 +65,27 @@ def memory_from(path: Path) -> Memory:
     return Memory(model)
 
 
+#: Least and largest product of frequency and relaxation time for a series to know the frequency, with its own times.
+KNOWN = (0.5, 2.0)
+
+
+def outside_series(memory: Memory, omega: float) -> str | None:
+    """A sentence if the angular frequency omega [rad/s] lies beyond the relaxation times of the series; else None."""
+    if memory.series is None:
+        return None
+    times = np.asarray(memory.series.relaxation_times)
+    low, high = KNOWN
+    side, part = ("above", "faster") if omega * times.min() > high else ("below", "slower")
+    if side == "below" and omega * times.max() >= low:
+        return None
+    hertz = [f"{1 / (2 * np.pi * t):.3g}" for t in (times.max(), times.min())]
+    return (
+        f"the sweep's {omega / 2 / np.pi:.3g} Hz lie {side} the frequencies that the series of --model knows "
+        f"({hertz[0]} to {hertz[1]} Hz): what relaxes {part} is missing in it, and all moduli of the law are off; give "
+        "the fit.json of a frequency sweep that contains this frequency"
+    )
+
+
 def fit_law(candidate: Candidate, sweep: StrainSweep, memory: Memory, plates: str) -> StrainFit:
     """Least squares of the relative misfit of G* at all amplitudes, the best of many starts.
 
@@ -124,8 +146,9 @@ def _as_curves(sweep: StrainSweep) -> list[Curve]:
     return [Curve(name, "simple_shear", F, (0, 1), G) for name, G in (("G'", sweep.storage), ("G''", sweep.loss))]
 
 
-def said_of(sweep: StrainSweep, best: StrainFit) -> list[str]:
-    """Warnings about the fit for its reader."""
+def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
+    """Warnings about the fits for their reader; the best comes first."""
+    best = fits[0]
     told = list(best.law.warnings)
     tangents = sweep.loss / sweep.storage
     change = tangents[-1] / tangents[0] - 1
@@ -147,4 +170,21 @@ def said_of(sweep: StrainSweep, best: StrainFit) -> list[str]:
             "the storage modulus falls with strain: tissue that slips, yields or tears does so too, and a hyperelastic "
             "law that follows it is only a description"
         )
-    return told
+    return [*told, *_alike_laws(fits)]
+
+
+#: Difference of AICc up to which two laws describe a sweep as well as each other.
+TIE = 4.0
+
+
+def _alike_laws(fits: Sequence[StrainFit]) -> list[str]:
+    """A sentence if laws other than the best one follow the sweep as well."""
+    best = fits[0].law
+    others = [f.law.label for f in fits[1:] if f.law.aicc - best.aicc < TIE]
+    if not others:
+        return []
+    which = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
+    return [
+        f"{which} follow the sweep as well as {best.label} does (AICc within {TIE:g}): the sweep does not tell these "
+        "laws apart, and outside of its strains they differ"
+    ]

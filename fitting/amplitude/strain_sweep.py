@@ -13,6 +13,8 @@ from liverjax.core.errors import InputError
 FEWEST_POINTS, LARGEST_STRAIN, LARGEST_WITHOUT_UNIT = 4, 10.0, 2.0
 #: Largest strain of a sweep in percent below which the numbers may be fractions.
 SMALLEST_LARGEST = 0.01
+#: Change of temperature [K] above which a table has several sweeps.
+LARGEST_DRIFT = 2.0
 
 
 class StrainSweep(NamedTuple):
@@ -67,6 +69,9 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         raise InputError(
             f"{path}: the frequency goes from {low:.3g} to {high:.3g} Hz: give a sweep of the strain alone"
         )
+    _refuse_several_temperatures(path, chosen.raw.get("temperature"), kept)
+    if deviations := [c.name for c in chosen.columns if c.quantity.endswith("_sd")]:
+        notes.append(f"the columns {', '.join(deviations)} are not used: the deviation comes from the residuals")
     notes += _of_unit(path, chosen.strain_unit, float(strain[kept].max()))
     order = np.argsort(strain[kept], kind="stable")
     return StrainSweep(
@@ -76,6 +81,15 @@ def read_strain_sweep(path: Path, table: str | None = None, max_strain: float | 
         float(omega[kept].mean()),
         str(path),
         tuple(notes),
+    )
+
+
+def _refuse_several_temperatures(path: Path, temperature: np.ndarray | None, kept: np.ndarray) -> None:
+    if temperature is None or np.ptp(temperature[kept]) <= LARGEST_DRIFT:
+        return
+    low, high = temperature[kept].min() - 273.15, temperature[kept].max() - 273.15
+    raise InputError(
+        f"{path}: the temperature goes from {low:.3g} to {high:.3g} °C: give one file for each temperature"
     )
 
 

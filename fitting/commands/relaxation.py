@@ -70,22 +70,17 @@ def _in_its_rig(options: argparse.Namespace) -> "TimeTest":
     return test
 
 
-#: Last time of an answer over the first one, below which it is told what the test cannot show.
-_NARROW = 100.0
-
-
 def _said_of_rows(test: "TimeTest") -> list[str]:
-    """Notes if a long record is fitted at some of its rows, and if the answers begin late."""
+    """Notes if a long record is fitted at some of its rows, and on what lies before the answers."""
     from fitting.fits.time_tests import thinned
 
     number, every, told = len(thinned(test)), int(test.used.sum()), []
     if number < every:
         told.append(f"{number} of {every} answers are fitted, spread over the log of the time since each load")
     first, last = test.resolved
-    if last < _NARROW * first:
-        told.append(
-            f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: what relaxed before is not in G0"
-        )
+    told.append(
+        f"the answers begin {first:.3g} s after the load, and end at {last:.3g} s: what relaxed before is not in G0"
+    )
     return told
 
 

@@ -1,6 +1,7 @@
 """Files of a fit of a strain sweep: fit.json and fit.png, and a table on the terminal."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> Content:
-    """Write fit.json and fit.png into the existing folder `out`; the best fit comes first."""
+def write(out: Path, sweep: StrainSweep, fits: list[StrainFit], warnings: Sequence[str] = ()) -> Content:
+    """Write fit.json and fit.png into the existing folder `out`; the best fit comes first. More `warnings` come
+    before its own.
+    """
     content = {
         "error_is": "root mean square of the relative misfit of G' and G''",
         "data": sweep.source,
@@ -35,7 +38,7 @@ def write(out: Path, sweep: StrainSweep, fits: list[StrainFit]) -> Content:
             }
             for f in fits
         ],
-        "warnings": said_of(sweep, fits[0]),
+        "warnings": [*warnings, *said_of(sweep, fits)],
         "versions": versions(),
     }
     content = numbers(content)

@@ -24,13 +24,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: chi^2 per component above which there is a warning that the model misses something.
-TOO_FAR = 1.5
+#: chi^2 per component above which there is a warning that the model misses something, and below which the noise counts
+#: as overstated: fifty components are below it by chance once in a million times.
+TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
 
 
 def misfit_sentence(found: Estimate) -> str | None:
-    """A warning if the fit misses the displacements by more than their noise; else None."""
+    """A warning if the fit misses the displacements by more than their noise, or by far less; else None."""
     ratio = found.chi2 / found.components
+    if ratio < TOO_NEAR and found.components >= FEW:
+        return (
+            f"chi2 is {ratio:.3g} per component, so the displacements scatter {np.sqrt(ratio):.2g} times as much as "
+            "the stated noise, and the errors are too large by as much: give the noise in metres (--noise), whatever "
+            "the unit of the file"
+        )
     if not ratio > TOO_FAR:
         return None
     return (

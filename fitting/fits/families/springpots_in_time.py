@@ -17,6 +17,7 @@ from fitting.fits.families import choice, limits, models, spectrum_of_tests
 from fitting.fits.honesty import common_factor
 from fitting.fits.honesty.alike_answers import with_own_noise
 from fitting.fits.honesty.long_times import with_interval
+from fitting.fits.honesty.short_times import with_short_times
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Share, Together
 from fitting.fits.viscoelastic import Kind
@@ -171,7 +172,7 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     """
     prony = time_tests.fit(test, modes)
     if model == "prony":
-        return _with_long_times_of(with_own_noise(prony), test)
+        return _with_ends_of_record(with_own_noise(prony), test)
     tried = [prony] if model == "auto" else []
     tried += fractional_in_time(test, prony.model) if model in ("fractional", "auto") else []
     tried += [spectrum_of_tests.spectrum_in_time(test, prony.model)] if model in ("spectrum", "auto") else []
@@ -181,11 +182,11 @@ def choose_in_time(test: TimeTest, model: str, modes: int | str = "auto") -> Tim
     sentences = best.warnings if best is prony else (*best.warnings, *_cautions_in_time(best))
     seconds = {n: sum(getattr(f, n) for f in {id(f): f for f in (*tried, prony)}.values()) for n in TIMES}
     whole = with_own_noise(best._replace(warnings=sentences, details=best.details | {"tried": rows}, **seconds))
-    return _with_long_times_of(whole, test)
+    return _with_ends_of_record(whole, test)
 
 
-def _with_long_times_of(fit: TimeFit, test: TimeTest) -> TimeFit:
-    return with_interval(fit, [test], [fit.uncertainty.noise])
+def _with_ends_of_record(fit: TimeFit, test: TimeTest) -> TimeFit:
+    return with_short_times(with_interval(fit, [test], [fit.uncertainty.noise]), test)
 
 
 AFit = TypeVar("AFit", TimeFit, Together)

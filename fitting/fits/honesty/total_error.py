@@ -8,6 +8,7 @@ import numpy as np
 
 from fitting.fits.honesty import edges
 from fitting.fits.honesty.long_times import INTERVAL, NORMAL
+from fitting.fits.honesty.short_times import MISSING
 from fitting.fits.simulated_rheometer import Simulation
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import Fit
@@ -31,7 +32,7 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
 
     The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
     the square of what noise causes is subtracted from its square. The share of long times is that of the farther end
-    of `long_times.equilibrium_interval`, as a standard deviation.
+    of `long_times.equilibrium_interval`, as a standard deviation. That of short times is what `short_times` says.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}
@@ -56,6 +57,8 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
         half = max(value - interval["low"], interval["high"] - value) / NORMAL
         beyond = float(np.sqrt(max(0.0, half**2 - error**2)))
         out["long_times"] = dict.fromkeys(known, 0.0) | {"equilibrium_modulus": beyond}
+    if MISSING in fit.details and "shear_modulus" in known:
+        out["short_times"] = dict.fromkeys(known, 0.0) | {"shear_modulus": fit.details[MISSING]}
     return out
 
 

@@ -1,0 +1,57 @@
+"""What relaxes before a test in time shows it is not in G0: how much that may be, by how the stress begins to fall.
+
+If the fall of half a decade is a part r < 1 of that of the next half decade, the falls of all half decades before the
+record are r, r^2, … of its first one. One relaxation time that is far longer than the first time of the record has
+r = 0.32, and nothing is missing in G0. A stress that falls at a power of time has r >= 1: nothing bounds G0.
+"""
+
+import numpy as np
+
+from fitting.fits.time_tests import TimeFit
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.time_tests import TimeTest
+
+HALF_DECADE = float(np.sqrt(10))
+#: Key in `TimeFit.details`: part of G0 [Pa] that the record does not show.
+MISSING = "relaxed_before_the_record"
+#: Above this ratio of two falls, what is before the record is not bounded.
+LEAST_SLOWING = 0.9
+#: Standard errors of G0 by which the stress must fall, or be missing, to be told.
+SHOWN = 2.0
+
+
+def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
+    """The fit of Prony modes with what may be missing in G0, and a sentence if that is more than its standard error.
+
+    Other models, and records of less than a decade, are returned as they are.
+    """
+    first, last = test.resolved
+    if fit.parameters is not None or not fit.converged or last < HALF_DECADE**2 * first:
+        return fit
+    whole, error = float(fit.model.shear_modulus), float(fit.uncertainty.standard_errors[0])
+    G = _relaxation_modulus(fit.model, first * HALF_DECADE ** np.arange(3))
+    fall, next_fall = G[0] - G[1], G[1] - G[2]
+    if fall <= SHOWN * error:
+        return fit
+    ratio = fall / max(next_fall, 1e-300)
+    if ratio > LEAST_SLOWING:
+        told = (
+            f"the stress falls by {100 * fall / whole:.2g} % in the first half decade of the record, and by "
+            f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next: nothing tells how much relaxed before {first:.3g} "
+            "s, and G0 does not contain it; begin earlier, or compare --model auto"
+        )
+        return fit._replace(warnings=(*fit.warnings, told))
+    missing = fall * ratio / (1 - ratio) - (whole - G[0])
+    if missing <= SHOWN * error:
+        return fit
+    told = (
+        f"G0 may be {missing:.2g} Pa larger, if the stress fell before {first:.3g} s as it falls after: the chosen "
+        "modes do not contain it (it is in the total error); begin earlier, or compare --model auto"
+    )
+    return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})
+
+
+def _relaxation_modulus(model: Maxwell, time: np.ndarray) -> np.ndarray:
+    """G(t) [Pa] at times (n,) [s]."""
+    relaxed = -np.expm1(-time[:, None] / np.asarray(model.relaxation_times))
+    return np.asarray(float(model.shear_modulus) * (1 - relaxed @ np.asarray(model.ratios)))

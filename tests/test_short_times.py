@@ -1,0 +1,57 @@
+"""What a test in time leaves open of G0: what relaxed before its first answer."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fitting.__main__ import main
+from fitting.fits import time_tests
+from fitting.fits.honesty import total_error
+from fitting.fits.honesty.short_times import MISSING, with_short_times
+from fitting.readers.time_tests import Sample, read_time_test
+
+FIRST = 0.01
+
+
+def fitted(tmp_path, G, last=100.0, points=50, modes="auto"):
+    """A fit of stresses G [Pa] after a step, from `FIRST` on, with what short times may hide."""
+    time = np.geomspace(FIRST, last, points)
+    rows = "\n".join(f"{t:.8g},{g:.10g}" for t, g in zip(time, G(time), strict=True))
+    (tmp_path / "r.csv").write_text(f"time_s,relaxation_modulus_Pa\n{rows}\n")
+    test = read_time_test(tmp_path / "r.csv", "relaxation", Sample(None, None), 0.0, 0.0)
+    return with_short_times(time_tests.fit(test, modes), test)
+
+
+def noise(size):
+    return 1 + 0.005 * np.random.default_rng(0).normal(size=size)
+
+
+def test_a_slow_mode_hides_nothing(tmp_path):
+    """One time, a hundred times the first answer's: G0 is what it was made with, and nothing is said."""
+    fit = fitted(tmp_path, lambda t: (400 + 800 * np.exp(-t)) * noise(len(t)))
+    assert fit.model.shear_modulus == pytest.approx(1200, rel=0.01)
+    assert MISSING not in fit.details and not any("G0" in w for w in fit.warnings)
+
+
+def test_a_power_law_has_no_bound(tmp_path):
+    """The stress of t^-0.2 grows without end towards the load: G0 of the modes was said with an error of 3 %."""
+    fit = fitted(tmp_path, lambda t: 800 * t**-0.2 * noise(len(t)))
+    assert any("nothing tells how much relaxed before 0.01 s" in w for w in fit.warnings)
+
+
+def test_what_a_stretched_exponential_lost_before_its_record_is_in_the_total_error(tmp_path):
+    """exp(-(t/0.3)^0.5): G0 is 1200, and the modes find less."""
+    fit = fitted(tmp_path, lambda t: 200 + 1000 * np.exp(-np.sqrt(t / 0.3)), modes=5)
+    lost = 1200 - float(fit.model.shear_modulus)
+    assert 0.3 * lost < fit.details[MISSING] < 3 * lost, (lost, fit.details[MISSING])
+    assert total_error.error_shares(fit)["short_times"]["shear_modulus"] == fit.details[MISSING]
+    assert any("G0 may be" in w for w in fit.warnings)
+
+
+def test_the_command_says_where_the_answers_begin(tmp_path, capsys):
+    """A wide record had no such note."""
+    fitted(tmp_path, lambda t: (400 + 800 * np.exp(-t)) * noise(len(t)), last=1000.0)
+    assert main(["relaxation", str(tmp_path / "r.csv"), "--modes", "1", "--out", str(tmp_path)]) == 0
+    assert "begin 0.01 s after the load" in capsys.readouterr().err
+    assert "short_times" not in json.loads((tmp_path / "fit.json").read_text())["error_shares"]
