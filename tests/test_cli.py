@@ -297,6 +297,7 @@ def test_numbers_with_exponents_are_values_and_an_unknown_backend_is_no_matter(t
     ]
 
 
+@pytest.mark.slow
 def test_a_terminal_without_the_letter_and_a_full_disk(tmp_path):
     """Both ended in tracebacks after the fit, the first one before the files that --cards asks for."""
     command = [sys.executable, "-m", "fitting", str(PORCINE), "--method", "closed-form", "--out", str(tmp_path)]

@@ -318,6 +318,7 @@ def test_factors_of_two_tests_are_in_the_errors_or_told():
     assert np.sum(missed, axis=0)[0] <= 3 and np.sum(missed, axis=0)[1] == 0 and shown, missed
 
 
+@pytest.mark.slow
 def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
     """Ogden's law with alpha = 6: in simple shear alpha = -6 is the same, in tension 0.3 times the stress."""
     law = lj.laws.Ogden(mu=(333.3,), alpha=(6.0,), bulk=None)

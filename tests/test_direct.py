@@ -53,6 +53,7 @@ def test_a_factorisation_finds_the_same():
     assert int(one.statistics.linear_iterations.sum()) > 0 == int(other.statistics.linear_iterations.sum())
 
 
+@pytest.mark.slow
 def test_programs_of_several_runs_have_the_solver_that_one_of_them_needs():
     """Inside a program numbers are not known: batches failed where a single run was solved."""
     pulled = replace(PULLED, law=replace(LAW, bulk=7.7e6), solve=lj.Solve())

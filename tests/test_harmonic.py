@@ -435,6 +435,7 @@ def test_what_acts_in_one_direction_is_told_and_a_motion_without_a_drive():
 HEAVY = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]") + "frequencies = [40.0]\n"
 
 
+@pytest.mark.slow
 def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
     (tmp_path / "scene.toml").write_text(HEAVY)
     assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "out")]) == 0

@@ -17,6 +17,7 @@ from liverjax.waves.rest import under_its_weight
 pytestmark = pytest.mark.quick_to_compile
 
 
+@pytest.mark.slow
 def test_inlets_are_amplitudes_and_no_loads_at_rest():
     """Twice the inlet is twice the motion: its pressure swelled the body at rest, and the motion was 42 % off."""
     scene = column(6, 1, 1.0)

@@ -55,7 +55,7 @@ KINDS = ("mooney_rivlin", "ogden", "costa", "exponential")
 
 
 @pytest.mark.parametrize(
-    "order, kinds", [(1, KINDS[:2]), *(pytest.param(k, KINDS, marks=pytest.mark.slow) for k in (1, 2))]
+    "order, kinds", [(1, KINDS[1:2]), *(pytest.param(k, KINDS, marks=pytest.mark.slow) for k in (1, 2))]
 )
 def test_force_and_stiffness_are_derivatives_of_the_energy(order, kinds):
     mesh = block(order, (2, 2, 3))

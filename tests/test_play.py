@@ -53,6 +53,7 @@ def moving():
     return pulling.at_rest(cube(kind="dynamic", dt=0.01))
 
 
+@pytest.mark.slow
 def test_a_pulled_body_rests_where_a_ligament_holds_it(still):
     """The same spring as part of a scene that `simulate` runs."""
     to = still.positions[CORNER] + np.array([0.004, 0.002, 0.003])

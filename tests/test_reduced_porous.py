@@ -157,6 +157,7 @@ def trained() -> Trained:
     return Trained(scene, model, unseen, [jax.tree.map(lambda a, k=k: a[k], batch.result).check() for k in (8, 9)])
 
 
+@pytest.mark.slow
 def test_all_motions_pressures_and_points_are_the_full_model_in_motion(trained):
     _assert_same(trained.unseen[0], trained.full[0].positions, trained.full[0].pressure)
 

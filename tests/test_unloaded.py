@@ -173,6 +173,7 @@ def _length_of(scene: lj.Scene) -> Callable[[float], jax.Array]:
     return jax.jit(length)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_reference_shape():
     """Its length by mu, against differences."""
     length = _length_of(scene_from(content()))

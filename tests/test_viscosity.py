@@ -98,10 +98,13 @@ def test_step_relaxation_follows_alpha(part, table_2):
     history = viscosity.initial_history(prony, 1)
     dt, n = 0.002, 500
     # The first step jumps to F: to the recursion a ramp over one dt; from there the stress is constant.
-    for _ in range(n):
-        memory = viscosity.recall(prony, history, dt)
-        P = viscosity.first_piola(prony, memory, law, F)
-        history = viscosity.advance(prony, history, law, F, dt)
+
+    def step(history, _):
+        P = viscosity.first_piola(prony, viscosity.recall(prony, history, dt), law, F)
+        return viscosity.advance(prony, history, law, F, dt), P
+
+    _, stresses = jax.lax.scan(step, history, length=n)
+    P = jax.tree.map(lambda own: own[-1], stresses)
     g, tau = np.asarray(table_2.ratios), np.asarray(table_2.relaxation_times)
     ramp = tau / dt * np.expm1(dt / tau)
     alpha = 1 - np.sum(g * (1 - ramp * np.exp(-n * dt / tau)))
