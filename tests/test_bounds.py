@@ -136,6 +136,11 @@ def test_structs_of_a_users_own_are_read_alike():
             bounds.check_fields(of, "mine")
 
 
+def test_a_bound_that_is_misspelt_is_no_bound():
+    with pytest.raises(TypeError, match="param has no 'lowest': use lower, upper, above, nonzero"):
+        lj.param("Pa", lowest=0.0)
+
+
 def test_parts_of_a_scene_checked_alone_use_the_same_place():
     prony = lj.Prony(ratios=(0.5,), relaxation_times=(np.nan,))
     with pytest.raises(lj.InputError, match=r"viscosity\.relaxation_times = \[nan\] is not finite"):

@@ -396,3 +396,16 @@ def test_sets_of_triangles_in_other_files_and_names_that_collide(tmp_path):
     assert (
         sorted(np.asarray(read.node_sets["sole"]).tolist()) == below.tolist() and len(read.element_sets["half"]) == 24
     )
+
+
+def test_gmsh_groups_without_their_entities_are_named(tmp_path):
+    """The sentence ended in a bare number in brackets, and asked for Gmsh, which the file was."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    cells, groups = [("triangle", tets[:1, :3]), ("tetra", tets)], [np.array([1]), np.full(len(tets), 3)]
+    data = meshio.Mesh(points, cells, cell_data={"gmsh:physical": groups, "gmsh:geometrical": groups})
+    data.field_data = {"top": np.array([1, 2]), "body": np.array([3, 3])}
+    data.point_data["gmsh:dim_tags"] = np.tile([3, 3], (len(points), 1))
+    data.write(tmp_path / "groups.msh", file_format="gmsh", binary=False)
+    with pytest.raises(lj.InputError, match=r"names .*1.* but does not list it\); export it as VTU or Gmsh 2.2"):
+        lj.read_mesh(tmp_path / "groups.msh")

@@ -35,6 +35,7 @@ def test_plain_csv(tmp_path):
         "angular_frequency_rad_s;storage_modulus_kPa;loss_modulus_kPa",
         "Angular frequency [rad/s]\tStorage modulus [kPa]\tLoss modulus [kPa]",
         "omega (rad/s), G' (kPa), G'' (kPa)",
+        "ANGULAR_FREQUENCY_RAD_S,STORAGE_MODULUS_KPA,LOSS_MODULUS_KPA",
         '"Angular Frequency (rad/s)","Storage Modulus (kPa)","Loss Modulus (kPa)"',
     ],
 )

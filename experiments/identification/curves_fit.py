@@ -6,6 +6,7 @@ in these data: the chapter's liver curves exist in print only as pictures.
 
 from experiments.common import ROOT, either, save
 from fitting.fits import stress_stretch
+from fitting.fits.families import hyperelastic
 from fitting.readers import curves
 from fitting.reports import curves_report
 from fitting.reports.sweep_report import numbers
@@ -18,7 +19,7 @@ def main() -> None:
     """Both materials, every law."""
     for name, file in (("brain", "brain_cortex_curves.csv"), ("rubber", "rubber_curves.csv")):
         found, _ = curves.read_curves([DATA / file])
-        candidates = [candidate for law in LAWS for candidate in stress_stretch.candidates(law)]
+        candidates = [candidate for law in LAWS for candidate in hyperelastic.candidates(law)]
         fits = curves_report.best_first([stress_stretch.fit(candidate, found) for candidate in candidates])
         print(f"{name}\n{curves_report.table(fits)}")
         content = {"laws": [curves_report.summary(f) for f in fits]}

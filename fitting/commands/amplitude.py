@@ -41,10 +41,10 @@ def run(options: argparse.Namespace) -> int:
 
     from fitting.amplitude import law_fit
     from fitting.amplitude.strain_sweep import read_strain_sweep
-    from fitting.fits import stress_stretch
+    from fitting.fits.families import hyperelastic
     from fitting.reports import amplitude_report
 
-    candidates = stress_stretch.candidates(options.law, options.terms)
+    candidates = hyperelastic.candidates(options.law, options.terms)
     sweep = read_strain_sweep(options.sweep, options.table, options.max_strain)
     memory = law_fit.Memory() if options.model is None else law_fit.memory_from(options.model)
     for note in [*sweep.notes, *(n for candidate in candidates for n in candidate.notes)]:

@@ -32,17 +32,18 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from fitting.fits import stress_stretch
+    from fitting.fits.families import hyperelastic
     from fitting.fits.honesty.wrong_columns import structured_curves
     from fitting.readers import curves
     from fitting.reports import curves_report
 
     shared_options.refuse_copies(options.files)
-    candidates = stress_stretch.candidates(options.law, options.terms)
+    candidates = hyperelastic.candidates(options.law, options.terms)
     found, notes = curves.read_curves(options.files, options.unit or "Pa")
     if options.unit and not any("names no unit" in note for note in notes):
         notes.append(f"--unit {options.unit} changes nothing: the stress columns name their unit")
     if options.law == "all":
-        left = [n for n in laws.LAWS if not stress_stretch.incompressible_form(n)]
+        left = [n for n in laws.LAWS if not hyperelastic.incompressible_form(n)]
         notes.append(f"left out, because they are not an isochoric energy plus U(J): {', '.join(left)}")
     for note in [*notes, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)

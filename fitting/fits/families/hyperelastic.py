@@ -1,0 +1,186 @@
+"""Hyperelastic laws as families of models: their numbers to be fitted, and starts for these."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax import laws
+from liverjax.core.errors import InputError
+from liverjax.core.struct import replace
+from liverjax.laws import Law, gradient_check
+
+
+class Candidate(NamedTuple):
+    """A law to be fitted, and the functions from unconstrained numbers u to its parameters."""
+
+    label: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Callable[[jax.Array, Any], jax.Array]  # (u, modulus scale [Pa]) -> parameters in the order of `names`
+    law: Callable[[jax.Array], Law]  # law with these values, without volumetric energy
+    random: Callable[[np.random.Generator, int], np.ndarray]  # starts (n, len(u))
+    notes: tuple[str, ...] = ()  # sentences on parameters that are not fitted
+
+
+def candidates(name: str, terms: int | None = None) -> list[Candidate]:
+    """The law with this name or FILE.py:LAW, or for `all` the laws of this package. Without `terms`, Ogden's law comes
+    with several numbers of terms.
+
+    Raises:
+        InputError: unknown law, or a law whose energy is not an isochoric energy plus U(J).
+    """
+    if terms is not None and name not in ("ogden", "all"):
+        raise InputError(f"--terms {terms} is for ogden only, not for {name}: leave it out")
+    if name == "all":
+        singles = [c for n in laws.LAWS if n != "ogden" and incompressible_form(n) for c in candidates(n)]
+        return singles + [_ogden(k) for k in ((2, 3) if terms is None else (terms,))]  # one term is bogen
+    typical = gradient_check.load(name)
+    if laws.isochoric_part(typical) is None:
+        usable = ", ".join(n for n in laws.LAWS if incompressible_form(n))
+        raise InputError(f"law {name} is not an isochoric energy plus U(J), which the fit requires: use {usable}")
+    if isinstance(typical, laws.Ogden) and ":" not in name:
+        return [_ogden(k) for k in ((1, 2, 3) if terms is None else (terms,))]
+    return [_candidate(name.rpartition(":")[2], typical)]
+
+
+def _candidate(label: str, law: Law) -> Candidate:
+    """The candidate for one law, or for a sum of laws."""
+    parts = [s for s in laws.summands(law) if not isinstance(s, laws.Volumetric)]
+    if len(parts) > 1:
+        return _sum(label, [_candidate(f"{label}, summand {k}", s) for k, s in enumerate(parts)])
+    (law,) = parts
+    if isinstance(law, laws.Ogden):
+        return _ogden(len(law.alpha))._replace(label=label)
+    return _bogen()._replace(label=label) if isinstance(law, laws.Bogen) else _single(label, law)
+
+
+def _sum(label: str, parts: list[Candidate]) -> Candidate:
+    """The candidate for a sum of laws; parameters are named as in a scene: `1.mu` is mu of the second law."""
+    ends = np.cumsum([len(p.names) for p in parts])[:-1]  # as many unconstrained numbers as parameters
+
+    def values(u, scale):
+        return jnp.concatenate([p.values(v, scale) for p, v in zip(parts, jnp.split(u, ends), strict=True)])
+
+    def law(p):
+        return laws.Sum(laws=tuple(part.law(v) for part, v in zip(parts, jnp.split(p, ends), strict=True)))
+
+    def random(rng, n):
+        return np.concatenate([p.random(rng, n) for p in parts], axis=1)
+
+    return Candidate(
+        label,
+        tuple(f"{k}.{name}" for k, p in enumerate(parts) for name in p.names),
+        tuple(unit for p in parts for unit in p.units),
+        values,
+        law,
+        random,
+        tuple(note for p in parts for note in p.notes),
+    )
+
+
+def incompressible_form(name: str) -> bool:
+    """Whether a law is an isochoric energy plus U(J)."""
+    return laws.isochoric_part(laws.typical(name)) is not None
+
+
+def _single(label: str, typical: Law) -> Candidate:
+    fields, notes = _fitted(label, typical)
+    names = tuple(f.name for f in fields)
+    middle = np.array([float(getattr(typical, n)) for n in names])
+    positive = np.array([f.metadata.get("above") == 0 for f in fields])
+    modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
+    size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(
+        initial=0.0
+    )  # higher terms alone have G = 0
+    middle = middle / np.where(modulus, size, 1.0)
+
+    def values(u, scale):
+        unit = jnp.where(modulus, scale, 1.0)
+        return unit * jnp.where(positive, jnp.exp(jnp.where(positive, u, 0.0)), u)
+
+    def random(rng, n):
+        near = np.log(np.abs(middle)) + 1.5 * rng.standard_normal((n, len(names)))
+        u = np.where(positive, near, middle * np.exp(rng.standard_normal((n, len(names)))))
+        # An exponent alpha may have either sign; other free numbers are coefficients.
+        alpha = np.array([m == "alpha" for m in names])
+        return np.where(alpha, _exponents_of_law(rng, (n, len(names))), u)
+
+    def law(p):
+        return replace(typical, **dict(zip(names, p, strict=True)), bulk=None)
+
+    return Candidate(label, names, tuple("Pa" if m else "1" for m in modulus), values, law, random, notes)
+
+
+def _fitted(label: str, law: Law) -> tuple[list, tuple[str, ...]]:
+    """Fields to be fitted (their number is not 0), and notes on the others.
+
+    Raises:
+        InputError: a parameter is a list, or no parameter is left to be fitted.
+    """
+    fields = [f for f in laws.parameters(type(law)) if f.name != "bulk"]
+    absent = [f.name for f in fields if getattr(law, f.name) is None]
+    given = [f for f in fields if f.name not in absent]
+    for f in given:
+        if isinstance(getattr(law, f.name), Law) or np.ndim(getattr(law, f.name)) > 0:
+            raise InputError(
+                f"law {label}: {f.name} of {type(law).__name__} is not one number, which the fit of curves requires: "
+                "give a law whose parameters are numbers"
+            )
+    zero = [f.name for f in given if float(getattr(law, f.name)) == 0]
+    fitted = [f for f in given if f.name not in zero]
+    if not fitted:
+        raise InputError(f"law {label}: none of its parameters has a value other than 0: give one to be fitted")
+    notes = []
+    if zero:
+        notes.append(f"{', '.join(zero)} kept at 0 as given")
+    if absent:
+        notes.append(f"{', '.join(absent)} left out: to fit them, give them values in a law of your own (FILE.py:LAW)")
+    told = f"{label}: fitted are {', '.join(f.name for f in fitted)}; " + "; ".join(notes)
+    return fitted, (told,) if notes else ()
+
+
+def ground_state_modulus(law: Law) -> float:
+    """Shear modulus of the ground state [Pa]; if a law does not state it, dP12/dF12 there."""
+    try:
+        return float(law.shear_modulus())
+    except InputError:
+        return float(law.tangent(jnp.eye(3))[0, 1, 0, 1])
+
+
+def _exponents_of_law(rng: np.random.Generator, shape: tuple) -> np.ndarray:
+    return rng.choice([-1.0, 1.0], shape) * np.exp(rng.uniform(np.log(0.5), np.log(30.0), shape))
+
+
+def _ogden_starts(rng: np.random.Generator, n: int, terms: int) -> np.ndarray:
+    share = rng.dirichlet(np.ones(terms), n)
+    return np.concatenate(
+        [np.log(share + 1e-3) + 0.5 * rng.standard_normal((n, terms)), _exponents_of_law(rng, (n, terms))], 1
+    )
+
+
+def _ogden(terms: int) -> Candidate:
+    """Ogden's law with G_k = mu_k alpha_k / 2 > 0 in every term, so that it is stable at every stretch."""
+    names = tuple(f"{n}[{k}]" for n in ("mu", "alpha") for k in range(terms))
+
+    def values(u, scale):
+        alpha = u[terms:]
+        return jnp.concatenate([2 * scale * jnp.exp(u[:terms]) / alpha, alpha])
+
+    def law(p):
+        return laws.Ogden(mu=tuple(p[:terms]), alpha=tuple(p[terms:]), bulk=None)
+
+    label = f"ogden, {terms} term{'s' if terms > 1 else ''}"
+    return Candidate(label, names, ("Pa",) * terms + ("1",) * terms, values, law, partial(_ogden_starts, terms=terms))
+
+
+def _bogen() -> Candidate:
+    """The law `Bogen`: one term of Ogden's law."""
+
+    def law(p):
+        return laws.Bogen(mu=p[0], alpha=p[1], bulk=None)
+
+    return _ogden(1)._replace(label="bogen", names=("mu", "alpha"), law=law)
