@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import liverjax as lj
-from experiments.benchmarks.baselines import corotational, critical_step, explicit
+from experiments.benchmarks.baselines import corotational, critical_step, explicit, linear, precomputed
 from experiments.chapter import assembly_rivals
+from experiments.pages import equal_error
+from liverjax.core.struct import replace
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -29,12 +31,13 @@ def _moved(scene: lj.Scene, x: jax.Array) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_explicit_dynamics_agrees_with_newmark():
+@pytest.mark.parametrize("prony", [None, lj.Prony(ratios=jnp.array([0.5]), relaxation_times=jnp.array([0.01]))])
+def test_explicit_dynamics_agrees_with_newmark(prony):
     """Both are of second order, so on half the step they come four times as near to each other."""
     seconds, apart = 0.06, []
     for steps in (100, 200):
         dt = seconds / steps
-        scene = _bar(dt=dt, steps=steps, integrator="newmark", newton_iterations=25)
+        scene = replace(_bar(dt=dt, steps=steps, integrator="newmark", newton_iterations=25), viscosity=prony)
         ours = _moved(scene, lj.simulate(scene).check().positions[-1])
         theirs = _moved(scene, explicit(scene, dt, steps, steps)[-1])
         apart.append(np.abs(ours - theirs).max() / np.abs(ours).max())
@@ -51,15 +54,22 @@ def test_explicit_dynamics_is_stable_just_below_its_critical_step():
     assert not np.abs(above).max() < 1.0
 
 
+BODIES = {
+    "corotational": lambda scene: corotational(scene, 0.02, 5),
+    "linear": lambda scene: linear(scene, precomputed(scene, 0.02), 0.02, 5),
+}
+
+
 @pytest.mark.slow
-def test_corotational_agrees_with_implicit_euler_where_strains_are_small():
-    """Both take the same step; what differs is of second order in the strain."""
+@pytest.mark.parametrize("integrator", ["euler", "newmark"])
+@pytest.mark.parametrize("body", BODIES)
+def test_linear_bodies_agree_with_ours_where_strains_are_small(body, integrator):
+    """All take the same steps; what differs is of second order in the strain."""
     apart = []
     for gravity in (0.05, 0.1):
-        scene = _bar(gravity, dt=0.02, steps=5)
+        scene = _bar(gravity, dt=0.02, steps=5, integrator=integrator)
         ours = _moved(scene, lj.simulate(scene).check().positions[-1])
-        theirs = _moved(scene, corotational(scene, 0.02, 5)[-1])
-        apart.append(np.abs(ours - theirs).max())
+        apart.append(np.abs(ours - _moved(scene, BODIES[body](scene)[-1])).max())
     assert apart[1] < 2e-2 * np.abs(ours).max()
     assert np.log2(apart[1] / apart[0]) == pytest.approx(2, abs=0.3)
 
@@ -76,3 +86,12 @@ def test_rivals_of_the_assembly_are_right_with_and_without_their_parts_written(w
         f, K = getattr(assembly_rivals, way)(mesh, law, x, write=write)
         assert np.abs(np.stack(K) - exact).max() < 1e-12 * np.abs(exact).max()
         assert np.abs(f - force).max() < 1e-12 * np.abs(force).max()
+
+
+def test_the_run_time_at_an_error_lies_between_two_runs():
+    """Order 2, a time that grows with the steps: exact between the runs, whatever their distance."""
+    runs = [{"dt": dt, "error": 4 * dt**2, "run_s": 0.3 / dt} for dt in (0.3, 0.1, 0.01)]
+    dt, seconds = equal_error.at_error([{"dt": 0.6, "error": None, "run_s": 1.0}, *runs], 0.01)
+    assert dt == pytest.approx(0.05) and seconds == pytest.approx(6.0)
+    assert equal_error.at_error(runs, 1.0) == (0.3, 1.0)
+    assert equal_error.at_error(runs, 1e-5) is None

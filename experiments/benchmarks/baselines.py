@@ -1,17 +1,20 @@
-"""Two solvers to compare with, elastic only: total Lagrangian explicit dynamics, and corotational linear elasticity.
+"""Three solvers to compare with: total Lagrangian explicit dynamics, corotational and linear elasticity.
 
-They take a `Scene` with a body and fixed nodes, and share meshes, laws and assembly with `simulate`; nothing else is
-supported, nothing is differentiable.
+They take a `Scene` with a body and fixed nodes, and share meshes, laws and assembly with `simulate`. The explicit one
+takes a viscosity too; nothing else is supported, nothing is differentiable.
 """
+
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.elements import mjed
 from liverjax.mesh.adjacency import PAIRS
-from liverjax.physics import boundary
+from liverjax.physics import boundary, viscosity
 from liverjax.physics.base import diagonal
 from liverjax.simulation import tangent
 from liverjax.simulation.equations import Equations, equations, initial_state
@@ -50,15 +53,26 @@ def critical_step(scene: lj.Scene) -> jax.Array:
 
 
 def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
-    """Central differences with a lumped mass (Miller et al. 2007): every `keep`-th of the positions (T, V, 3)."""
-    mesh = scene.mesh
+    """Central differences with a lumped mass (Miller et al. 2007), with a Prony series if the scene has one (Taylor et
+    al. 2009): every `keep`-th of the positions (T, V, 3).
+    """
+    mesh, law, prony = scene.mesh, scene.law, scene.viscosity
     mass, weight = _mass_and_weight(scene)
     mask = boundary.free_degrees(mesh, scene.fixed, ())
 
+    def force(x, memory):
+        """Forces of the elements, and the memory after them."""
+        if prony is None:
+            return mjed.internal_force(mesh, law, x), None
+        F = matrices.deformation_gradient(mesh, x)
+        P = viscosity.first_piola(prony, viscosity.recall(prony, memory, dt), law, F)
+        return mjed.nodal_force(mesh, P), viscosity.advance(prony, memory, law, F, dt)
+
     def advance(state, _):
-        x, v = state
-        v = v + dt * mask * (weight - mjed.internal_force(mesh, scene.law, x)) / mass
-        return (x + dt * v, v), None
+        x, v, memory = state
+        f, memory = force(x, memory)
+        v = v + dt * mask * (weight - f) / mass
+        return (x + dt * v, v, memory), None
 
     def block(state, _):
         state, _ = jax.lax.scan(advance, state, length=keep)
@@ -66,7 +80,8 @@ def explicit(scene: lj.Scene, dt: float, steps: int, keep: int) -> jax.Array:
 
     # Velocities live half a step apart from positions.
     v = -0.5 * dt * mask * weight / mass
-    return jax.lax.scan(block, (mesh.points, v), length=steps // keep)[1]
+    memory = None if prony is None else viscosity.initial_history(prony, mesh.weights.shape)
+    return jax.lax.scan(block, (mesh.points, v, memory), length=steps // keep)[1]
 
 
 def _rotation(F: matrices.Matrix) -> matrices.Matrix:
@@ -78,12 +93,38 @@ def _rotation(F: matrices.Matrix) -> matrices.Matrix:
     return F
 
 
+class Inertia(NamedTuple):
+    """Implicit Euler or Newmark's average acceleration, by the scene's `integrator`: m a = now u - push."""
+
+    newmark: bool
+    dt: float  # [s]
+
+    @property
+    def now(self) -> float:
+        """Acceleration at the end of the step by the displacement in it [1/s^2]."""
+        return (4 if self.newmark else 1) / self.dt**2
+
+    def push(self, v, a):
+        """What the motion before the step adds to the force over the mass [m/s^2]."""
+        return 4 * v / self.dt + a if self.newmark else v / self.dt
+
+    def moved(self, u, v, a):
+        """Velocity and acceleration at the end of a step with displacement u."""
+        if self.newmark:
+            return 2 * u / self.dt - v, 4 / self.dt**2 * (u - self.dt * v) - a
+        return u / self.dt, a
+
+
+def _inertia(scene: lj.Scene, dt: float) -> Inertia:
+    return Inertia(scene.solve.integrator == "newmark", dt)
+
+
 def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
-    """Linear elasticity in rotated frames, implicit Euler, one linear solve a step: positions (T, V, 3).
+    """Linear elasticity in rotated frames, one linear solve a step: positions (T, V, 3).
 
     The element stiffness is that of the law at rest (Mueller and Gross 2004).
     """
-    mesh = scene.mesh
+    mesh, inertia = scene.mesh, _inertia(scene, dt)
     mass, weight = _mass_and_weight(scene)
     mask = boundary.free_degrees(mesh, scene.fixed, ())
     rest = tangent.element_blocks(at_rest(scene), None, matrices.deformation_gradient(mesh, mesh.points))
@@ -95,22 +136,22 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
         return matrices.matmul(matrices.matmul(R, K), matrices.transpose(R))
 
     def advance(state, _):
-        x, v = state
+        x, v, a = state
         R = _rotation(matrices.deformation_gradient(mesh, x))
         turned_back = [
             matrices.add(
-                matrices.matvec(matrices.transpose(R), tuple(x[mesh.tetrahedra[:, a]].T)),
-                matrices.scale(-1.0, corners[a]),
+                matrices.matvec(matrices.transpose(R), tuple(x[mesh.tetrahedra[:, i]].T)),
+                matrices.scale(-1.0, corners[i]),
             )
-            for a in range(4)
+            for i in range(4)
         ]
         force = jnp.zeros_like(x)
-        for a in range(4):
+        for i in range(4):
             f = (0.0, 0.0, 0.0)
-            for b in range(4):
-                f = matrices.add(f, matrices.matvec(full[a][b], turned_back[b]))
-            force = force.at[mesh.tetrahedra[:, a]].add(jnp.stack(matrices.matvec(R, f), axis=-1))
-        A = block_matrix.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, diagonal(mass[:, 0] / dt**2))
+            for j in range(4):
+                f = matrices.add(f, matrices.matvec(full[i][j], turned_back[j]))
+            force = force.at[mesh.tetrahedra[:, i]].add(jnp.stack(matrices.matvec(R, f), axis=-1))
+        A = block_matrix.force_matrix(mesh, {p: rotated(R, rest[p]) for p in PAIRS}, diagonal(inertia.now * mass[:, 0]))
         inverse = block_matrix.inverse_blocks(A.diagonal, mask)
 
         def precondition(r):
@@ -119,9 +160,43 @@ def corotational(scene: lj.Scene, dt: float, steps: int) -> jax.Array:
         def matvec(u):
             return mask.T.ravel() * jnp.concatenate(block_matrix.product(A, block_matrix.columns(mask.T.ravel() * u)))
 
-        b = mask * (weight - force + mass * v / dt)
+        b = mask * (weight - force + mass * inertia.push(v, a))
         dx, _ = conjugate_gradients(matvec, block_matrix.flat(b), precondition, 1e-4, 2000)
         dx = jnp.stack(block_matrix.columns(dx), axis=-1)
-        return (x + dx, dx / dt), x + dx
+        return (x + dx, *inertia.moved(dx, v, a)), x + dx
 
-    return jax.lax.scan(advance, (mesh.points, jnp.zeros_like(mesh.points)), length=steps)[1]
+    begin = (mesh.points, jnp.zeros_like(mesh.points), mask * weight / mass)
+    return jax.lax.scan(advance, begin, length=steps)[1]
+
+
+def precomputed(scene: lj.Scene, dt: float) -> Any:
+    """Inverse (n, n) [m/N] of the matrix of a step of the linear body, for `linear`; its n free degrees of freedom, and
+    their masses and weights.
+    """
+    mesh = scene.mesh
+    held = np.concatenate([np.asarray(f.nodes) for f in scene.fixed])
+    free = (3 * np.setdiff1d(np.arange(mesh.number_of_nodes), held)[:, None] + np.arange(3)).ravel()
+    K = mjed.stiffness_matrix(mesh, scene.law, mesh.points)[free][:, free].toarray()
+    mass, weight = _mass_and_weight(scene)
+    m, w = np.repeat(np.asarray(mass)[:, 0], 3)[free], np.asarray(weight).ravel()[free]
+    inverse = np.linalg.inv(K + np.diag(_inertia(scene, dt).now * m))
+    return tuple(jnp.asarray(each) for each in (inverse, free, m, w))
+
+
+def linear(scene: lj.Scene, made: Any, dt: float, steps: int) -> jax.Array:
+    """Linear elasticity: one product with a precomputed inverse a step (James and Pai 1999): positions (T, V, 3).
+
+    Args:
+        made: `precomputed(scene, dt)`.
+    """
+    inverse, free, m, w = made
+    mesh, inertia = scene.mesh, _inertia(scene, dt)
+
+    def advance(state, _):
+        u, v, a = state
+        new = inverse @ (w + m * (inertia.now * u + inertia.push(v, a)))
+        return (new, *inertia.moved(new - u, v, a)), new
+
+    begin = (jnp.zeros_like(m), jnp.zeros_like(m), w / m)
+    u = jax.lax.scan(advance, begin, length=steps)[1]
+    return mesh.points[None] + jnp.zeros((steps, mesh.points.size)).at[:, free].set(u).reshape(steps, -1, 3)

@@ -29,7 +29,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import liverjax as lj
-from experiments.benchmarks.baselines import corotational, explicit
 from experiments.common import either, save, timed
 from experiments.liver import models, with_solve
 from liverjax.core.struct import replace
@@ -355,65 +354,6 @@ def identified(scene: lj.Scene, model: lj.ReducedModel, rows: dict) -> dict[str,
     }
 
 
-def baselines(model: lj.ReducedModel, scene: lj.Scene) -> list[dict[str, Any]]:
-    """Every model that the chapter names, in the viscous phantom's place: error [1] and time a step [ms], one core.
-
-    The load is the weight alone. Linear and corotational bodies and the explicit run have no viscosity.
-    """
-    plain = replace(scene, traction=(replace(scene.traction[0], value=jnp.zeros(3)),))
-    elastic = replace(plain, viscosity=None)
-    back = one_core()
-    full, _ = timed(lj.simulate, plain, rounds=1)
-    hyper, hyper_time = timed(lj.simulate, elastic, rounds=1)
-    step = 0.001
-    keep, fine = round(DT / step), round(SECONDS / step)
-    rivals = {
-        "explicit, total Lagrangian, elastic": timed(lambda s: explicit(s, step, fine, keep), elastic, rounds=1),
-        "corotational, elastic": timed(lambda s: corotational(s, DT, s.solve.steps), elastic, rounds=1),
-        "linear, precomputed inverse": _precomputed(elastic),
-    }
-    small, small_time = timed(lambda s, model: lj.simulate_reduced(model, s), loosely(plain), model, rounds=5)
-    back()
-    rivals["hyperelastic, full"] = (hyper.positions, hyper_time)
-    rivals["viscous, reduced"] = (lj.reduced_positions(model, plain, small), small_time)
-    rest = np.asarray(plain.mesh.points)
-    moved = np.linalg.norm(np.asarray(full.positions) - rest, axis=-1).max()
-    found = []
-    for name, (x, took) in rivals.items():
-        error = np.linalg.norm(np.asarray(x) - np.asarray(full.positions), axis=-1).max() / moved
-        own = np.linalg.norm(np.asarray(x) - np.asarray(hyper.positions), axis=-1).max() / moved
-        ms = 1e3 * took.run / scene.solve.steps
-        found.append({"model": name, "error": float(error), "error_to_hyperelastic": float(own), "step_ms": ms})
-    return found
-
-
-def _precomputed(scene: lj.Scene) -> tuple[jax.Array, Any]:
-    """Implicit Euler of the linear body: one product with the inverse of (M / dt^2 + K) a step."""
-    from liverjax.elements import mjed
-    from liverjax.mesh.nodal import nodal_volumes
-
-    mesh = scene.mesh
-    free = np.setdiff1d(np.arange(mesh.number_of_nodes), np.concatenate([np.asarray(f.nodes) for f in scene.fixed]))
-    free = (3 * free[:, None] + np.arange(3)).ravel()
-    K = mjed.stiffness_matrix(mesh, scene.law, mesh.points)[free][:, free].toarray()
-    assert scene.body is not None
-    mass = np.repeat(np.asarray(scene.body.density * nodal_volumes(mesh)), 3)[free]
-    weight = jnp.asarray(mass * np.tile(np.asarray(scene.body.gravity), mesh.number_of_nodes)[free])
-    inverse, m = jnp.asarray(np.linalg.inv(K + np.diag(mass / DT**2))), jnp.asarray(mass / DT**2)
-
-    def run(inverse: jax.Array) -> jax.Array:
-        def advance(state: tuple, _: None) -> tuple:
-            u, before = state
-            new = inverse @ (weight + m * (2 * u - before))
-            return (new, u), new
-
-        return jax.lax.scan(advance, (jnp.zeros(len(free)), jnp.zeros(len(free))), length=scene.solve.steps)[1]
-
-    u, took = timed(run, inverse, rounds=3)
-    whole = jnp.zeros((len(u), mesh.points.size)).at[:, free].set(u)
-    return mesh.points + whole.reshape(len(u), -1, 3), took
-
-
 def trained(
     scene: lj.Scene, drawn_rows: int, corners: Any, modes: int, tolerance: float
 ) -> tuple[lj.ReducedModel, dict[str, Any]]:
@@ -445,9 +385,6 @@ def main() -> None:
         print({k: v for k, v in row.items() if not isinstance(v, list) or len(v) == 2}, flush=True)
         content["models"].append(row)
         save("reduced", content)
-    content["rivals"] = baselines(model, scene)
-    print(content["rivals"], flush=True)
-    save("reduced", content)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Tables of the reduced models of the liver, and of the models that the chapter weighs against its own."""
+"""Tables of the reduced models of the liver."""
 
 from experiments.pages.results import load, percent
 
@@ -15,7 +15,7 @@ def came_out() -> str:
 
 
 def table() -> str:
-    """Both tables."""
+    """The viscous phantom: training, times, errors."""
     (data,) = load("reduced")
     rows = [
         f"The viscous phantom, {data['elements']:,} linear tetrahedra, 24 steps of 0.05 s; gravity, a pull at the",
@@ -41,18 +41,6 @@ def table() -> str:
                 f"In {r['failed']} of the runs a step failed, or its error was not found: the full model would run.",
             ]
         rows += ["", correction(r), "", identified(r)]
-    rows += [
-        "",
-        "The models that the chapter names, under the weight alone; the viscous full model is the truth. The first",
-        "four have no viscosity:",
-        "",
-        "| model | error | error to the elastic model | a step of 0.05 s |",
-        "|---|---|---|---|",
-    ]
-    for r in data["rivals"]:
-        rows.append(
-            f"| {r['model']} | {percent(r['error'])} | {percent(r['error_to_hyperelastic'])} | {r['step_ms']:.3g} ms |"
-        )
     return "\n".join(rows)
 
 

@@ -8,6 +8,7 @@ from experiments.pages import (
     accelerator,
     bodies,
     elements,
+    equal_error,
     front,
     identification,
     moving,
@@ -35,6 +36,7 @@ PAGES: dict[Path, dict[str, Callable[[], str]]] = {
     | stability.PARTS
     | bodies.PARTS
     | reduced.PARTS
+    | equal_error.PARTS
     | accelerator.PARTS,
     HERE / "VERIFICATION.md": verification.PARTS,
 }

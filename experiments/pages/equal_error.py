@@ -1,0 +1,107 @@
+"""The table of all models at equal error: what a simulated second costs."""
+
+import math
+
+from experiments.pages.results import load, percent, short
+
+
+def at_error(runs: list[dict], target: float) -> tuple[float, float] | None:
+    """Time step [s] and run time [s] at an error, between the two runs whose errors enclose it; None if none meets it.
+
+    Both are on lines through the logarithms. The longest step of all is taken as it is, if it meets the error.
+    """
+    before = None
+    for run in sorted(runs, key=lambda r: -r["dt"]):
+        error = math.inf if run["error"] is None else run["error"]
+        if error <= target:
+            if before is None or not math.isfinite(before["error"] or math.inf):
+                return run["dt"], run["run_s"]
+            part = math.log(before["error"] / target) / math.log(before["error"] / error)
+            return tuple(before[k] * (run[k] / before[k]) ** part for k in ("dt", "run_s"))  # type: ignore[return-value]
+        before = run
+    return None
+
+
+def ways(own: dict) -> dict[str, list[dict]]:
+    """Runs by the name of their way."""
+    found: dict[str, list[dict]] = {}
+    for run in own["runs"]:
+        found.setdefault(run["way"], []).append(run)
+    return found
+
+
+def cell(found: tuple[float, float] | None, seconds: float) -> str:
+    """Step, steps a second, and simulated seconds a second."""
+    if found is None:
+        return "- | - | -"
+    dt, run_s = found
+    return f"{short(1e3 * dt)} ms | {seconds / dt / run_s:,.0f} | {seconds / run_s:.2g}"
+
+
+def came_out() -> str:
+    """Reduced, full and the chapter's way of each model at the middle error."""
+    (data,) = load("equal_error")
+    target, told = sorted(data["targets"])[1], []
+    for model, own in data["models"].items():
+        met = {way: at_error(runs, target) for way, runs in ways(own).items()}
+        speed = {way: data["seconds"] / found[1] for way, found in met.items() if found is not None}
+        full = max((way for way in speed if "reduced" not in way), key=lambda way: speed[way])
+        reduced_one, chapters = (next(v for w, v in met.items() if word in w) for word in ("reduced", "chapter"))
+        told.append(
+            f"{model} {data['seconds'] / reduced_one[1]:.2g} reduced, {speed[full]:.2g} in full ({full}), "
+            + (f"{data['seconds'] / chapters[1]:.2g} by the chapter's way" if chapters else "the chapter's way not met")
+            if reduced_one
+            else f"{model} {speed[full]:.2g} in full ({full})"
+        )
+    return f"simulated seconds a second at an error of {percent(target)}: {'; '.join(told)}"
+
+
+def table() -> str:
+    """All models and ways at all targets, then what linear and corotational bodies leave out."""
+    (data,) = load("equal_error")
+    targets = sorted(data["targets"], reverse=True)
+    rows = [
+        "| model | way | least error found | "
+        + " | ".join(f"at {percent(t)}: step | steps a second | simulated s a second" for t in targets)
+        + " |",
+        "|---" * (3 + 3 * len(targets)) + "|",
+    ]
+    for model, own in data["models"].items():
+        for way, runs in ways(own).items():
+            least = min(r["error"] for r in runs if r["error"] is not None)
+            cells = " | ".join(cell(at_error(runs, t), data["seconds"]) for t in targets)
+            rows.append(f"| {model} | {way} | {percent(least)} | {cells} |")
+    rows += ["", reduced(data), "", by_weight(data)]
+    return "\n".join(rows)
+
+
+def reduced(data: dict) -> str:
+    """One line: how the reduced models were made, and the error of the truths."""
+    made = ", ".join(
+        f"{model} {r['modes']} modes and {r['points']} points from {r['rows']} runs in {r['training_s']:.0f} s"
+        for model, r in ((m, own["reduced"]) for m, own in data["models"].items())
+    )
+    truths = ", ".join(f"{model} {percent(own['truth_halved'])}" for model, own in data["models"].items())
+    return f"Reduced models: {made}. The truths change with twice the step by: {truths}."
+
+
+def by_weight(data: dict) -> str:
+    """What a linear and a corotational body leave out, by the weight."""
+    names = [name for name in data["weights"][0] if name != "weight"]
+    rows = [
+        "What linear and corotational bodies leave out, with the same short steps as the hyperelastic one, by the part",
+        "of the load:",
+        "",
+        "| part of the load | " + " | ".join(names) + " |",
+        "|---" * (1 + len(names)) + "|",
+    ]
+    rows += [
+        f"| {percent(row['weight'])} | "
+        + " | ".join("-" if row[name] is None else percent(row[name]) for name in names)
+        + " |"
+        for row in data["weights"]
+    ]
+    return "\n".join(rows)
+
+
+PARTS = {"equal_error": table}
