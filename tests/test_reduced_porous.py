@@ -14,10 +14,10 @@ from liverjax.core.struct import replace
 from liverjax.jobs import reduction
 from liverjax.mesh.nodal import integrals, nodal_volumes
 from liverjax.physics.porosity import Inlet
-from liverjax.reduced import fluid as reduced_fluid
 from liverjax.reduced import step, training
-from liverjax.reduced.fluid import flowing, fluid_at_rest, reduced_sponge, storage_and_flow
 from liverjax.reduced.model import as_matrix, solid_at_points, with_all_points
+from liverjax.reduced.physics import fluid as reduced_fluid
+from liverjax.reduced.physics.fluid import flowing, fluid_at_rest, reduced_sponge, storage_and_flow
 from liverjax.reduced.sampling import _at
 from liverjax.reduced.tangent import in_single_precision, tangent_matrix
 from liverjax.tensors.matrices import determinant

@@ -11,8 +11,9 @@ energy norm of e is the dual norm of r. The estimate leaves out terms of second 
 stiffness by the deformation.
 
 In a porous scene the pressures of the full mesh are solved for along the reduced motion, so that only forces are out of
-balance. These drive the errors of motion and pressure (`liverjax.reduced.fluid_error`). The pressure's own error is the
-distance of the reduced pressure from the one that was solved for, plus the part due to the error of the motion.
+balance. These drive the errors of motion and pressure (`liverjax.reduced.physics.fluid_error`). The pressure's own
+error is the distance of the reduced pressure from the one that was solved for, plus the part due to the error of the
+motion.
 """
 
 from collections.abc import Callable
@@ -30,8 +31,9 @@ from liverjax.physics.base import End
 from liverjax.physics.inertia import FACTOR
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import coefficients, relaxing
-from liverjax.reduced.fluid_error import ErrorBefore, LinearFluid, coupled_solver, linear_fluid
 from liverjax.reduced.model import ReducedModel
+from liverjax.reduced.physics.fluid_error import ErrorBefore, LinearFluid, coupled_solver, linear_fluid
+from liverjax.reduced.physics.supports import has_springs, spring_matrix
 from liverjax.reduced.run import ReducedResult, reduced_positions, reduced_pressure
 from liverjax.scenes.scene import Scene
 from liverjax.simulation.equations import (
@@ -103,6 +105,9 @@ def _linear_body(scene: Scene, free: np.ndarray) -> _Body:
     if prony is not None and prony.part == "isochoric":
         own = volumetric_part(law)
         rest, law = None if own is None else stiffness(own), relaxing(prony, law)
+    if has_springs(scene):  # they do not relax
+        springs = spring_matrix(scene)[free][:, free].tocsc()
+        rest = springs if rest is None else rest + springs
     mass = None
     if scene.solve.kind == "dynamic" and scene.body is not None:
         nodal = np.broadcast_to(np.asarray(scene.body.density) * np.asarray(nodal_volumes(mesh)), len(mesh.points))

@@ -27,6 +27,7 @@ from liverjax.physics.loads import follows
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import Viscoelasticity
 from liverjax.reduced.correction import Correction
+from liverjax.reduced.physics.supports import identity_of_supports, refuse_other_physics
 from liverjax.scenes.by_element import law_of_elements
 from liverjax.scenes.regions import laws_of
 from liverjax.scenes.scene import Scene, numbers_at, with_parameters
@@ -36,7 +37,7 @@ from liverjax.tensors.places import taken
 #: Part of the width of a range by which a number may leave it.
 BEYOND = 0.5
 #: Parts of a scene whose numbers decide its motion.
-_PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction")
+_PARTS = ("law", "region", "viscosity", "porosity", "body", "displaced", "traction", "physics")
 #: Numbers that lead through states which the rows may have shown too.
 _FREE = ("times", "history")
 
@@ -134,7 +135,7 @@ def reduced_identity(scene: Scene) -> str:
     prony = scene.viscosity
     parts.append(None if prony is None else (prony.part, prony.scheme, len(jnp.atleast_1d(jnp.asarray(prony.ratios)))))
     parts += [(np.asarray(c.nodes).tolist(), c.axes) for held in (scene.fixed, scene.displaced) for c in held]
-    parts += [scene.solve.kind, scene.solve.dt is None]
+    parts += [scene.solve.kind, scene.solve.dt is None, *identity_of_supports(scene)]
     sponge = scene.porosity
     if sponge is not None:
         drained = None if sponge.drained is None else np.asarray(sponge.drained).tolist()
@@ -147,7 +148,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
     """Refuse a scene whose physics reduced models do not have.
 
     Raises:
-        InputError: inlets of a fluid, supports and other named physics, a loaded mesh, pressures that follow, averaged
+        InputError: inlets of a fluid, named physics other than supports, a loaded mesh, pressures that follow, averaged
             or mixed volumes.
     """
     if any(region.viscosity for region in scene.region):
@@ -158,9 +159,7 @@ def refuse_unknown_physics(scene: Scene) -> None:
         raise InputError("a reduced model has no [[porosity.inlet]]: leave it out, or run the full model")
     if scene.points_are == "loaded":
         raise InputError('[mesh] is = "loaded" is not for reduced models: take the scene of lj.unloaded(scene)')
-    if scene.physics:
-        section = scene.physics[0].section
-        raise InputError(f"a reduced model has no [[{section}]]: leave it out, or run the full model")
+    refuse_other_physics(scene)
     if follows(scene.traction):
         raise InputError("a reduced model has no pressure that follows the body: give traction.value instead")
     if scene.solve.volumetric != "element":

@@ -17,15 +17,6 @@ from liverjax.physics.loads import Loads, dead_loads
 from liverjax.physics.prescribed import prescribed
 from liverjax.physics.viscosity import initial_history
 from liverjax.reduced.correction import correction_at, size_at, stated_at
-from liverjax.reduced.fluid import (
-    ReducedFluid,
-    advanced_fluid,
-    flowing,
-    fluid_at_rest,
-    pressure_coordinates,
-    reduced_sponge,
-    volume_stress,
-)
 from liverjax.reduced.model import (
     ReducedModel,
     as_matrix,
@@ -35,6 +26,16 @@ from liverjax.reduced.model import (
     solid_at_points,
     without_rows,
 )
+from liverjax.reduced.physics.fluid import (
+    ReducedFluid,
+    advanced_fluid,
+    flowing,
+    fluid_at_rest,
+    pressure_coordinates,
+    reduced_sponge,
+    volume_stress,
+)
+from liverjax.reduced.physics.supports import forces_of_springs, has_springs, reduced_springs
 from liverjax.reduced.step import (
     ReducedEquations,
     ReducedMotion,
@@ -94,7 +95,18 @@ def _given(model: ReducedModel, scene: Scene) -> tuple[_Given, jax.Array]:
         parts = numbers[1:] / solve.steps if solve.dt is None else jnp.ones_like(numbers[1:])
         load = parts[:, None] * first[None]
 
+    if scene.displaced and has_springs(scene):
+        held = _prescribed_steps(scene)
+        load = load - jax.lax.map(lambda u: jnp.tensordot(model.modes, forces_of_springs(scene, u), axes=2), held)
     return _Given(load, prescribed_gradients(model, scene)), first
+
+
+def _prescribed_steps(scene: Scene) -> jax.Array:
+    """Prescribed displacements (T, V, 3) [m] at the end of every step."""
+    mesh, solve = scene.mesh, scene.solve
+    numbers = jnp.arange(1, solve.steps + 1, dtype=mesh.points.dtype)
+    times = jnp.zeros_like(numbers) if solve.dt is None else solve.dt * numbers
+    return jax.vmap(lambda k, t: prescribed(mesh, scene.displaced, t, k / solve.steps))(numbers, times)
 
 
 def prescribed_gradients(model: ReducedModel, scene: Scene) -> jax.Array:
@@ -152,6 +164,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
     light = in_single_precision(model.slopes)
     steepest = jax.lax.stop_gradient(jnp.linalg.norm(model.slopes))
     noise, sponge = reduced_noise(model, scene), None if scene.porosity is None else reduced_sponge(model, scene)
+    springs = reduced_springs(model.modes, scene)
     step = Step(scene.mesh, points, 1, solve.steps, solve.dt, mass is not None, None, Free(jnp.ones_like(points)))
 
     def advance(carry: tuple, given: tuple) -> tuple:
@@ -162,7 +175,7 @@ def _advance(model: ReducedModel, scene: Scene, mass: jax.Array | None) -> Calla
         flow = None if sponge is None else flowing(model, sponge, fluid, solve.dt)
         e = ReducedEquations(
             model, acting, load, gradient, mass, q, motion, solve.dt, None, spread, noise, flow, light, steepest
-        )
+        )._replace(springs=springs)
         found = step_end(newmark, solve.newton_iterations, e, solve.tolerance, inverse)
         e = e._replace(newmark=newmark)
         flat = gradients_at(e, found.q)
@@ -213,12 +226,10 @@ def simulate_reduced(model: ReducedModel, scene: Scene) -> ReducedResult:
 
 def reduced_positions(model: ReducedModel, scene: Scene, result: ReducedResult, corrected: bool = True) -> jax.Array:
     """Positions (T, V, 3) [m] of the nodes, with the correction that the model has learnt, or without it."""
-    mesh, solve = scene.mesh, scene.solve
     u = _free_motion(model if corrected else replace(model, correction=None), scene, result)
     if scene.displaced:
-        numbers = jnp.arange(1, solve.steps + 1, dtype=u.dtype)
-        u = u + jax.vmap(lambda k, t: prescribed(mesh, scene.displaced, t, k / solve.steps))(numbers, result.times)
-    return mesh.points[None] + u
+        u = u + _prescribed_steps(scene)
+    return scene.mesh.points[None] + u
 
 
 def reduced_pressure(model: ReducedModel, scene: Scene, result: ReducedResult) -> jax.Array:

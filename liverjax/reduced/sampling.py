@@ -18,7 +18,8 @@ from liverjax.elements import mjed
 from liverjax.physics.base import End, Free, Step
 from liverjax.physics.registry import law_at_rest
 from liverjax.physics.viscosity import initial_history
-from liverjax.reduced.fluid import (
+from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
+from liverjax.reduced.physics.fluid import (
     flowing,
     fluid_at_rest,
     porosity_at_points,
@@ -26,7 +27,7 @@ from liverjax.reduced.fluid import (
     storage_and_flow,
     volume_stress,
 )
-from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
+from liverjax.reduced.physics.supports import reduced_springs
 from liverjax.reduced.run import prescribed_gradients
 from liverjax.scenes.scene import Scene, with_parameters
 from liverjax.tensors.matrices import determinant
@@ -111,7 +112,8 @@ def _reduced_compliance(whole: ReducedModel, scene: Scene) -> np.ndarray:
     """Inverse of the reduced stiffness of the reference shape (n, n) [m/N]."""
     modes = np.asarray(whole.modes).reshape(whole.number_of_modes, -1)
     K = mjed.stiffness_matrix(scene.mesh, law_at_rest(scene), scene.mesh.points)
-    return np.linalg.inv(modes @ (K @ modes.T))
+    springs = reduced_springs(whole.modes, scene)
+    return np.linalg.inv(modes @ (K @ modes.T) + (0.0 if springs is None else np.asarray(springs)))
 
 
 @jax.jit

@@ -17,8 +17,14 @@ from liverjax.core.struct import Number, replace
 from liverjax.physics.base import Solid
 from liverjax.physics.elasticity import Elastic, Elasticity
 from liverjax.physics.inertia import FACTOR
-from liverjax.reduced.fluid import Flowing, pressure_coordinates, stiffness_of_pressures, volume_blocks, volume_stress
 from liverjax.reduced.model import ReducedModel, as_matrix, solid_at_points
+from liverjax.reduced.physics.fluid import (
+    Flowing,
+    pressure_coordinates,
+    stiffness_of_pressures,
+    volume_blocks,
+    volume_stress,
+)
 from liverjax.reduced.tangent import ReducedTangent, SinglePrecision, near_inverse, solved_by_tangent
 from liverjax.scenes.scene import Scene
 from liverjax.tensors.matrices import IDENTITY, add_matrices, determinant
@@ -52,6 +58,7 @@ class ReducedEquations(NamedTuple):
     fluid: Flowing | None  # of a porous scene
     light: SinglePrecision
     steepest: jax.Array  # root of the sum of squares of all slopes [1/m]
+    springs: jax.Array | None = None  # stiffness of elastic supports (n, n) [N/m]
 
 
 def reduced_kinematics(e: ReducedEquations, q: jax.Array) -> ReducedMotion:
@@ -113,6 +120,9 @@ def _unbalanced(e: ReducedEquations, q: jax.Array, P: jax.Array, internal: jax.A
     if e.spread is not None:
         # Without loads the forces of the points cancel at the solution: their sizes are the forces at work.
         size = size + jnp.linalg.norm(jnp.tensordot(jnp.abs(P), e.spread, axes=2))
+    if e.springs is not None:
+        pull = e.springs @ q
+        r, size = r + pull, size + jnp.linalg.norm(pull)
     if e.mass is not None:
         inertia = e.mass @ reduced_kinematics(e, q).acceleration
         r, size = r + inertia, size + jnp.linalg.norm(inertia)
@@ -135,6 +145,8 @@ def _reduced_tangent(e: ReducedEquations, q: jax.Array) -> ReducedTangent:
     rest = jnp.zeros((len(q), len(q)), q.dtype)
     if e.fluid is not None:
         rest = rest + stiffness_of_pressures(e.model, e.fluid, as_matrix(F))
+    if e.springs is not None:
+        rest = rest + e.springs
     if e.mass is not None:
         rest = rest + FACTOR["newmark" if e.newmark else "euler"] / e.dt**2 * e.mass
     return ReducedTangent(e.model.slopes, moduli, rest)

@@ -4,7 +4,8 @@ To first order the errors e of the motion and p of the pressure follow the linea
 
     (K + K_sponge) e - B^T p = load,    A p + B (e - e_before) = S p_before,
 
-with the matrices of `liverjax.reduced.fluid` on the whole mesh (lagged: the change of volume of the step before).
+with the matrices of `liverjax.reduced.physics.fluid` on the whole mesh (lagged: the change of volume of the step
+before).
 """
 
 from collections.abc import Callable

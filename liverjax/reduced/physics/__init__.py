@@ -1,0 +1,1 @@
+"""What acts in reduced models besides the solid: fluid and supports."""

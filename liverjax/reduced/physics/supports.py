@@ -1,0 +1,93 @@
+"""Supports in reduced models: springs between the body and a wall, and nodes that slide along an axis.
+
+Springs are linear in the motion, so their forces on the modes are a matrix (n, n) times the coordinates, exactly. Modes
+come from motions in which nodes slide, so they keep these nodes in their planes.
+"""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from liverjax.core.errors import InputError
+from liverjax.physics.base import Free, NodalForce, Step
+from liverjax.physics.elastic_support import ElasticSupport, Foundation, Springs
+from liverjax.physics.sliding_support import SlidingSupport
+from liverjax.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    import scipy.sparse
+
+
+def refuse_other_physics(scene: Scene) -> None:
+    """Refuse named physics other than these supports.
+
+    Raises:
+        InputError: membranes, ligaments, vessels, obstacles, springs with a history, nodes that slide along no axis.
+    """
+    for own in scene.physics:
+        if isinstance(own, SlidingSupport):
+            if not own.axis:
+                raise InputError(
+                    "in a reduced model nodes slide in planes across x, y or z alone: turn the mesh so that the plane "
+                    "of [[support]] is one, or run the full model"
+                )
+        elif not isinstance(own, ElasticSupport):
+            raise InputError(f"a reduced model has no [[{own.section}]]: leave it out, or run the full model")
+        elif own.history is not None:
+            raise InputError("a reduced model has no history of [[support]]: leave it out, or run the full model")
+
+
+def identity_of_supports(scene: Scene) -> list[object]:
+    """Kinds and places of the supports, without their numbers."""
+    found: list[object] = []
+    for own in scene.physics:
+        place = own.nodes if isinstance(own, SlidingSupport) or own.triangles is None else own.triangles
+        found.append((type(own).__name__, np.asarray(place).tolist(), getattr(own, "axis", "")))
+    return found
+
+
+def _springs(scene: Scene) -> list[NodalForce]:
+    """The springs of all elastic supports."""
+    points = scene.mesh.points
+    step = Step(scene.mesh, points, 1, 1, None, False, None, Free(jnp.ones_like(points)))
+    return [own.freeze(None, step) for own in scene.physics if isinstance(own, ElasticSupport)]
+
+
+def has_springs(scene: Scene) -> bool:
+    """Whether the scene has an elastic support."""
+    return any(isinstance(own, ElasticSupport) for own in scene.physics)
+
+
+def forces_of_springs(scene: Scene, u: jax.Array) -> jax.Array:
+    """Forces (V, 3) [N] of all springs at displacements u (V, 3) [m]."""
+    mesh = scene.mesh
+    return sum((own.force(mesh, mesh.points + u, 1.0) for own in _springs(scene)), jnp.zeros_like(u))
+
+
+def reduced_springs(modes: jax.Array, scene: Scene) -> jax.Array | None:
+    """Stiffness (n, n) [N/m] of all springs on modes (n, V, 3); None without springs."""
+    if not has_springs(scene):
+        return None
+    return jnp.tensordot(jax.lax.map(lambda mode: forces_of_springs(scene, mode), modes), modes, axes=((1, 2), (1, 2)))
+
+
+def spring_matrix(scene: Scene) -> "scipy.sparse.csr_array":
+    """Stiffness (3 V, 3 V) [N/m] of all springs; host side."""
+    import scipy.sparse
+
+    V = scene.mesh.number_of_nodes
+    K = scipy.sparse.csr_array((3 * V, 3 * V))
+    for own in _springs(scene):
+        if isinstance(own, Foundation):
+            attached = own.attached(scene.mesh, scene.mesh.points, 1.0)
+            nodes, blocks = np.asarray(attached.nodes), np.asarray(attached.blocks)
+        else:
+            assert isinstance(own, Springs)
+            nodes = np.arange(V)[None]
+            blocks = np.stack([np.stack([np.asarray(entry) for entry in row]) for row in own.blocks])[None, :, None]
+        places = 3 * nodes[:, None] + np.arange(3)[None, :, None]
+        rows, columns = np.broadcast_arrays(places[:, :, None, None], places[None, None])
+        K = K + scipy.sparse.coo_array((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=K.shape).tocsr()
+    return K
