@@ -93,9 +93,8 @@ def _single(label: str, typical: Law) -> Candidate:
     middle = np.array([float(getattr(typical, n)) for n in names])
     positive = np.array([f.metadata.get("above") == 0 for f in fields])
     modulus = np.array([f.metadata["unit"] == "Pa" for f in fields])
-    size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(
-        initial=0.0
-    )  # higher terms alone have G = 0
+    # Higher terms alone have G = 0.
+    size = abs(ground_state_modulus(typical)) or np.abs(middle[modulus]).max(initial=0.0)
     middle = middle / np.where(modulus, size, 1.0)
 
     def values(u, scale):
