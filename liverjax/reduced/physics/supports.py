@@ -43,8 +43,11 @@ def identity_of_supports(scene: Scene) -> list[object]:
     """Kinds and places of the supports, without their numbers."""
     found: list[object] = []
     for own in scene.physics:
-        place = own.nodes if isinstance(own, SlidingSupport) or own.triangles is None else own.triangles
-        found.append((type(own).__name__, np.asarray(place).tolist(), getattr(own, "axis", "")))
+        if isinstance(own, SlidingSupport):
+            found.append(("slide", np.asarray(own.nodes).tolist(), own.axis))
+        elif isinstance(own, ElasticSupport):
+            places = (own.nodes, own.triangles)
+            found.append(("springs", *(None if place is None else np.asarray(place).tolist() for place in places)))
     return found
 
 
