@@ -21,6 +21,9 @@ import pytest
 
 import liverjax as lj
 from liverjax.core.versions import versions
+from liverjax.mesh.nodal import nodal_volumes
+from liverjax.reduced.model import with_all_points
+from liverjax.simulation.equations import free_directions
 
 matplotlib.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -200,3 +203,21 @@ def distorted_box():
 def table_2() -> lj.Prony:
     """Viscosity of the chapter's Table 2."""
     return lj.Prony(ratios=jax.numpy.array([0.235, 0.333]), relaxation_times=jax.numpy.array([0.27, 0.03]))
+
+
+def every_motion(scene):
+    """One mode (V, 3) for each free degree of freedom of a scene, orthonormal with the lumped volumes of the nodes."""
+    free = np.asarray(free_directions(scene).mask)
+    modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
+    return jax.numpy.asarray(modes / np.sqrt(np.asarray(nodal_volumes(scene.mesh)))[:, None])
+
+
+def moves_as_full(scene):
+    """Positions (T, V, 3) [m] of a run; the reduced model of all motions and points has the same ones."""
+    full, model = lj.simulate(scene).check(), with_all_points(scene, every_motion(scene))
+    found = lj.simulate_reduced(model, scene)
+    assert not np.any(found.status)
+    moved = np.abs(full.positions - scene.mesh.points[None]).max()
+    # The solver's tolerance of 1e-8 of the forces, through a condition number of some thousands.
+    assert np.abs(lj.reduced_positions(model, scene, found) - full.positions).max() < 1e-5 * moved
+    return full.positions

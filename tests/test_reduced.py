@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import every_motion, moves_as_full
 
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.commands import reduce
 from liverjax.core.struct import replace
-from liverjax.mesh.nodal import nodal_volumes
 from liverjax.reduced import training
 from liverjax.reduced.correction import Learnt, _least_squares, correction_at, learnt_correction, stated_at
 from liverjax.reduced.model import as_matrix, refuse_unseen_numbers, solid_at_points, with_all_points
@@ -37,26 +37,12 @@ def _bar(cells: tuple, order: int = 1, **changes) -> lj.Scene:
     return lj.Scene(mesh=mesh, law=law, fixed=(lj.Fixed(nodes=held),), body=body, **changes)
 
 
-def _every_motion(scene: lj.Scene) -> jax.Array:
-    """One mode a free degree of freedom."""
-    held = [*scene.fixed, *scene.displaced]
-    free = lj.boundary.free_degrees(scene.mesh, tuple(held), ())
-    modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
-    return jnp.asarray(modes / np.sqrt(np.asarray(nodal_volumes(scene.mesh)))[:, None])  # orthonormal with them
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_all_motions_and_all_points_are_the_full_model(order):
     # Another path to the same numbers: Newton's method on dense matrices, memory and inertia of coordinates.
     scene = _bar((1, 1, 1), order, viscosity=PRONY, solve=MOVING)
-    full = lj.simulate(scene).check()
-    model = with_all_points(scene, _every_motion(scene))
-    found = lj.simulate_reduced(model, scene)
-    assert not np.any(found.status)
-    moved = np.abs(full.positions - scene.mesh.points[None]).max()
-    # The solver's tolerance of 1e-8 of the forces, through a condition number of some thousands.
-    assert np.abs(lj.reduced_positions(model, scene, found) - full.positions).max() < 1e-5 * moved
+    moves_as_full(scene)
 
 
 @pytest.mark.slow
@@ -65,7 +51,7 @@ def test_prescribed_motion_and_histories_are_those_of_the_full_model():
     end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
     body = replace(scene.body, times=jnp.array([0.0, 0.2]), history=jnp.array([1.0, 0.5]))
     scene = replace(scene, displaced=(lj.Displaced(nodes=end[:2], by=jnp.array([0.004, 0.0, 0.002])),), body=body)
-    model = with_all_points(scene, _every_motion(scene))
+    model = with_all_points(scene, every_motion(scene))
     x = lj.reduced_positions(model, scene, lj.simulate_reduced(model, scene))
     assert np.abs(x - lj.simulate(scene).check().positions).max() < 1e-5 * 0.004
 
@@ -76,7 +62,7 @@ def test_a_body_that_is_only_moved_converges():
     scene = replace(_bar((2, 1, 1)), body=None)
     end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03}, None, "displaced"))
     scene = replace(scene, displaced=(lj.Displaced(nodes=end, by=jnp.array([0.003, 0.0, 0.002])),))
-    model = with_all_points(scene, _every_motion(scene))
+    model = with_all_points(scene, every_motion(scene))
     found = lj.simulate_reduced(model, scene)
     assert not np.any(found.status) and np.all(found.iterations < 25)
     x = lj.reduced_positions(model, scene, found)

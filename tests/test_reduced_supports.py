@@ -4,17 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import every_motion, moves_as_full
 
 import liverjax as lj
 from liverjax.core.struct import replace
-from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.selection import surface_of
 from liverjax.physics.contact.obstacle import Obstacle
 from liverjax.physics.elastic_support import ElasticSupport
 from liverjax.physics.sliding_support import SlidingSupport
 from liverjax.reduced.model import other_numbers, refuse_unseen_numbers, with_all_points
 from liverjax.reduced.physics.supports import forces_of_springs, spring_matrix
-from liverjax.simulation.equations import free_directions
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -40,12 +39,6 @@ def _on_springs(order: int = 1, cells: tuple = (1, 1, 1), **changes) -> lj.Scene
     return lj.Scene(mesh=mesh, law=law, body=body, physics=supports, **changes)
 
 
-def _every_motion(scene: lj.Scene) -> jax.Array:
-    free = np.asarray(free_directions(scene).mask)
-    modes = np.eye(free.size)[np.flatnonzero(free.ravel())].reshape(-1, *free.shape)
-    return jnp.asarray(modes / np.sqrt(np.asarray(nodal_volumes(scene.mesh)))[:, None])
-
-
 MOVING = lj.Solve(kind="dynamic", integrator="newmark", dt=0.05, steps=3)
 
 
@@ -62,14 +55,10 @@ def test_all_motions_and_points_on_springs_are_the_full_model(order, changes):
     scene = _on_springs(order, **changes)
     end = jnp.asarray(lj.boundary.select(scene.mesh, {"x_min": 0.03, "z_max": 0.0}, None, "displaced"))
     scene = replace(scene, displaced=(lj.Displaced(nodes=end, by=jnp.array([0.001, 0.0, 0.002])),))
-    full = lj.simulate(scene).check()
-    model = with_all_points(scene, _every_motion(scene))
-    found = lj.simulate_reduced(model, scene)
-    assert not np.any(found.status)
-    moved = np.abs(full.positions - scene.mesh.points[None]).max()
-    assert np.abs(lj.reduced_positions(model, scene, found) - full.positions).max() < 1e-5 * moved
+    near = moves_as_full(scene)
+    moved = np.abs(near - scene.mesh.points[None]).max()
     far = lj.simulate(replace(scene, physics=scene.physics[1:])).positions
-    assert np.abs(far - full.positions).max() > 0.05 * moved
+    assert np.abs(far - near).max() > 0.05 * moved
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -111,7 +100,7 @@ def test_stiffness_of_springs_stays_free_and_the_error_is_stated():
 
 def test_other_supports_are_refused():
     scene = _on_springs()
-    model = with_all_points(scene, _every_motion(scene))
+    model = with_all_points(scene, every_motion(scene))
     springs, ends, slide = scene.physics
     for other, sentence in (
         ((springs, ends), "was made for scene"),
@@ -124,5 +113,5 @@ def test_other_supports_are_refused():
             lj.simulate_reduced(model, replace(scene, physics=other))
     stiffer = replace(scene, physics=(springs, replace(ends, stiffness=0.4), slide))
     model = replace(model, others=other_numbers(scene, {}))
-    with pytest.raises(lj.InputError, match=r"physics\.1\.stiffness is not that of the model's rows"):
+    with pytest.raises(lj.InputError, match=r"support\.1\.stiffness is not that of the model's rows"):
         refuse_unseen_numbers(model, stiffer)

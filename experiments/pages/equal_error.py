@@ -17,7 +17,8 @@ def at_error(runs: list[dict], target: float) -> tuple[float, float] | None:
             if before is None or not math.isfinite(before["error"] or math.inf):
                 return run["dt"], run["run_s"]
             part = math.log(before["error"] / target) / math.log(before["error"] / error)
-            return tuple(before[k] * (run[k] / before[k]) ** part for k in ("dt", "run_s"))  # type: ignore[return-value]
+            dt, run_s = (before[k] * (run[k] / before[k]) ** part for k in ("dt", "run_s"))
+            return dt, run_s
         before = run
     return None
 
@@ -46,14 +47,9 @@ def came_out() -> str:
         met = {way: at_error(runs, target) for way, runs in ways(own).items()}
         speed = {way: data["seconds"] / found[1] for way, found in met.items() if found is not None}
         full = max((way for way in speed if "reduced" not in way), key=lambda way: speed[way])
-        reduced_one, chapters = (next(v for w, v in met.items() if word in w) for word in ("reduced", "chapter"))
-        told.append(
-            f"{model} {data['seconds'] / reduced_one[1]:.2g} reduced, {speed[full]:.2g} in full ({full}), "
-            + (f"{data['seconds'] / chapters[1]:.2g} by the chapter's way" if chapters else "the chapter's way not met")
-            if reduced_one
-            else f"{model} {speed[full]:.2g} in full ({full})"
-        )
-    return f"simulated seconds a second at an error of {percent(target)}: {'; '.join(told)}"
+        small, chapters = (next((f"{v:.2g}" for w, v in speed.items() if k in w), "-") for k in ("reduced", "chapter"))
+        told.append(f"{model} {small} reduced, {speed[full]:.2g} in full ({full}), {chapters} by the chapter's way")
+    return f"simulated seconds a second at an error of {percent(target)} (-: not met): {'; '.join(told)}"
 
 
 def table() -> str:

@@ -154,8 +154,8 @@ def _read_quietly(path: Path) -> Any:
             return meshio.read(path)
     except SystemExit:  # meshio exits if no reader accepts the file, and prints their reasons
         reason = " ".join(said.getvalue().split()) or f"its content is not what {path.suffix} files hold"
-    except KeyError as error:  # a table of the file lacks an entry, e.g. Gmsh's groups without $Entities
-        reason = f"it names {error} but does not list it"
+    except KeyError as error:  # an attribute, or an entity that Gmsh's groups name
+        reason = f"the entry {error.args[0]} is missing"
     except Exception as error:  # meshio's readers raise whatever their parser meets
         reason = " ".join(str(error).split()) or type(error).__name__
     raise InputError(f"mesh file {path}: meshio cannot read it ({reason[:120]}); export it as VTU or Gmsh 2.2")

@@ -202,7 +202,14 @@ def other_numbers(scene: Scene, varied: Mapping[str, np.ndarray | jax.Array]) ->
     found = {}
     for part in _PARTS:
         for path, leaf in jax.tree_util.tree_flatten_with_path(getattr(scene, part))[0]:
-            name = ".".join([part, *(str(getattr(key, "name", getattr(key, "idx", key))) for key in path)])
+            words = [str(getattr(key, "name", getattr(key, "idx", key))) for key in path]
+            if part == "physics":  # by the names of a scene file: support.0
+                part_of = scene.physics[: int(words[0]) + 1]
+                section = part_of[-1].section
+                words = [str(sum(own.section == section for own in part_of) - 1), *words[1:]]
+                name = ".".join([section, *words])
+            else:
+                name = ".".join([part, *words])
             if name.rsplit(".", 1)[-1] not in _FREE:
                 # Equal numbers may differ in their last digits, and in the sign of 0.
                 rounded = np.asarray(leaf, np.float32) + np.float32(0)
