@@ -22,8 +22,8 @@ from fitting.readers.frequency_sweep import Sweep, some
 from fitting.rigs import compression
 from liverjax import laws
 
-#: Most rounds of fit and correction.
-ROUNDS = 4
+#: Most rounds of fit and correction, and most halvings of a correction that would leave a modulus of 0 or less.
+ROUNDS, HALVINGS = 20, 30
 
 
 class Nuisance(NamedTuple):
@@ -55,11 +55,12 @@ class InstrumentErrors(NamedTuple):
     covariance: np.ndarray  # (k, k)
     part: np.ndarray | None  # the values without the last half decade; None if too few points are left
     part_errors: np.ndarray | None
+    found: bool  # False: the rounds of fit and correction did not end
 
     @property
     def steady(self) -> np.ndarray:
-        """Which errors (k,) change by at most two standard errors if the last half decade is left out."""
-        if self.part is None or self.part_errors is None:
+        """Which errors (k,) were found, and change by at most two standard errors without the last half decade."""
+        if self.part is None or self.part_errors is None or not self.found:
             return np.zeros(len(self.values), bool)
         return np.abs(self.values - self.part) <= 2 * self.part_errors
 
@@ -83,18 +84,19 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     known = nuisances_of(sweep)
     if not known or fit.kind.values is not None or not isinstance(fit.solution.u, np.ndarray):
         return fit, sweep
-    values, covariance, refitted = _errors_of_instrument(fit, sweep)
+    weighed = _with_noise_as_measured(sweep)
+    values, covariance, refitted, ended = _errors_of_instrument(_fitted_again(fit, weighed), weighed)
     kept = sweep.angular_frequency < sweep.angular_frequency[-1] / HALF_DECADE * (1 - 1e-9)
     part: tuple[Any, Any] = (None, None)
     if len(np.unique(sweep.angular_frequency[kept])) > len(fit.solution.u) // 2 + 1:
-        shorter = some(sweep, kept)
-        found, of_part, _ = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
-        part = found, np.sqrt(np.diag(of_part))
-    errors = InstrumentErrors(values, covariance, *part)
+        shorter = some(weighed, kept)
+        found, of_part, _, also = _errors_of_instrument(viscoelastic.closed_form(shorter, fit.modes), shorter)
+        part = (found, np.sqrt(np.diag(of_part))) if also else part
+    errors = InstrumentErrors(values, covariance, *part, ended)
     details = fit.details | {"instrument": instrument_numbers(errors, known)}
     if not errors.steady.all():
         return fit._replace(details=details, warnings=(*fit.warnings, *_not_corrected(errors, known))), sweep
-    corrected = _shifted(sweep, known, values)
+    corrected = _shifted(weighed, known, values)
     notes = [
         f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}), and the "
         "moduli are corrected for it"
@@ -115,8 +117,15 @@ def used_errors(fit: Fit, sweep: Sweep) -> tuple[list[Nuisance], np.ndarray]:
 
 
 def _not_corrected(errors: InstrumentErrors, known: list[Nuisance]) -> list[str]:
-    """A sentence on each error that changes with the band."""
+    """A sentence on each error that changes with the band, or that was not found."""
     out, e = [], np.sqrt(np.diag(errors.covariance))
+    if not errors.found:
+        each = " and ".join(n.name for n in known)
+        return [
+            f"the error of the instrument's {each} was not found together with the modes, so nothing is corrected and "
+            "the errors of the parameters are without it: leave out the frequencies at which the instrument carries "
+            "most of the torque (--max-frequency), or give another number of --modes"
+        ]
     for k in np.flatnonzero(~errors.steady):
         n = known[k]
         there = "too few points are left to check it"
@@ -160,10 +169,23 @@ def _shifted(sweep: Sweep, known: list[Nuisance], values: np.ndarray) -> Sweep:
     return sweep._replace(storage=sweep.storage + moved.real, loss=sweep.loss + moved.imag)
 
 
-def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit]:
-    """The errors (k,) and their covariance, in standard deviations of the priors; the fit to the corrected moduli."""
+def _with_noise_as_measured(sweep: Sweep) -> Sweep:
+    """The sweep with the noise of what was measured as weights: a correction takes a part of the moduli away, but not
+    its noise.
+    """
+    if sweep.storage_sd is not None:
+        return sweep
+    noise = sweep.point_scatter
+    storage_sd, loss_sd = (d * (noise if 0 < noise < 1 else 1.0) for d in sweep.deviations)
+    return sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd, sd_estimated=True)
+
+
+def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit, bool]:
+    """The errors (k,) and their covariance, in standard deviations of the priors; the fit to the corrected moduli; and
+    whether the rounds of fit and correction ended.
+    """
     known = nuisances_of(sweep)
-    values = np.zeros(len(known))
+    values, covariance = np.zeros(len(known)), np.eye(len(known))
     for _ in range(ROUNDS):
         here = _shifted(sweep, known, values)
         J, r = np.asarray(fit.solution.jacobian), np.asarray(fit.solution.residuals)
@@ -173,14 +195,31 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         precision = own.T @ own / noise**2 + np.eye(len(known))
         # The prior is on the whole error; the residuals show the part that is not corrected yet.
         step = np.linalg.solve(precision, own.T @ r / noise**2 - values)
-        values, covariance = values + step, np.linalg.inv(precision)
-        corrected = _shifted(sweep, known, values)
-        if np.any(corrected.storage <= 0) or np.any(corrected.loss <= 0):  # nothing but the instrument in the sweep
-            return values - step, covariance, fit
-        fit = viscoelastic.modes_from(corrected, fit.solution.u[None], fit.kind)._replace(details=fit.details)
+        covariance = np.linalg.inv(precision)
+        step = _shortened(sweep, known, values, step)
+        values = values + step
+        fit = _fitted_again(fit, _shifted(sweep, known, values))
         if np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))):
-            break
-    return values, covariance, fit
+            return values, covariance, fit, bool(np.any(step))
+    return values, covariance, fit, False
+
+
+def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
+    """The modes fitted to other moduli, from where they are."""
+    return viscoelastic.modes_from(sweep, fit.solution.u[None], fit.kind)._replace(details=fit.details)
+
+
+def _shortened(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """The step, halved until all corrected moduli are positive; 0 if no part of it is possible.
+
+    The modes explain a part of a large error, so the first step may be far too long.
+    """
+    for _ in range(HALVINGS):
+        moved = _shifted(sweep, known, values + step)
+        if np.all(moved.storage > 0) and np.all(moved.loss > 0):
+            return step
+        step = step / 2
+    return np.zeros_like(step)
 
 
 def _with_directions(fit: Fit, sweep: Sweep, known: list[Nuisance], covariance: np.ndarray) -> Estimate:
