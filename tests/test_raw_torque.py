@@ -49,6 +49,23 @@ def test_the_inertia_is_found_and_the_points_below_it_left_out(sample, phase, tm
     assert f"{lost.sum()} of 20 points" in kept.notes[1]
 
 
+@pytest.mark.parametrize("lines", [(4,), (6, 9, 17)])
+def test_an_empty_cell_takes_one_point_away_and_not_the_column(lines, tmp_path):
+    path = tmp_path / "gap.txt"
+    export(path, sample=False)
+    rows = path.read_text().splitlines()
+    for place, line in enumerate(lines):  # the phase, the torque, the displacement
+        cells = rows[line].split("\t")
+        cells[2 + place] = ""
+        rows[line] = "\t".join(cells)
+    path.write_text("\n".join(rows) + "\n")
+    whole, kept = (
+        without_inertia(s, RADIUS, HEIGHT) for s in (export(tmp_path / "e.txt", sample=False), read_sweep(path))
+    )
+    assert f"{len(lines)} of 20 points have an empty cell in the raw columns" in kept.notes[0]
+    assert np.allclose(kept.inertia, whole.inertia, rtol=1e-6) and len(kept.grey) == len(whole.grey)
+
+
 def test_the_phase_alone_tells_the_share_of_the_instrument(tmp_path):
     """Neither torque nor size: I omega^2 / K = G' - G'' / tan(phase)."""
     s = export(tmp_path / "p.txt", sample=False)

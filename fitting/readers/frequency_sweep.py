@@ -278,7 +278,7 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     the raw phase.
     """
     raw = sweep.raw
-    if not raw:
+    if not raw or not set(raw_torque.COLUMNS) & set(raw):
         return sweep
     geometry = np.pi * radius**4 / (2 * height) if radius and height else None
     G = sweep.storage + 1j * sweep.loss
@@ -302,6 +302,9 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     if np.isfinite(found.inertia):
         shows = f"torque shows an instrument inertia of {1e6 * found.inertia:.4g} uN m s^2"
     times = found.modulus[k] / np.abs(G[k])
+    empty = int(np.sum(~raw_torque.with_raw_columns(raw)))
+    if empty:
+        shows += f" ({empty} of {len(G)} points have an empty cell in the raw columns: theirs is that of the others)"
     note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it needs {times:.3g} times the torque of the sample"
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))

@@ -105,22 +105,33 @@ def share(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray], geometry
         raw: columns (n,) in SI: torque and angle, perhaps phase and sample_torque.
         geometry: K [m^3], torque per Pa and rad; needed if there is no sample_torque.
     """
-    if not {"torque", "angle"} <= set(raw) or np.any(~(np.abs(raw["angle"]) > 0)):
+    kept = with_raw_columns(raw)
+    if not {"torque", "angle"} <= set(raw) or not kept.any() or np.any(raw["angle"][kept] == 0):
         return None
-    stiffness = np.abs(raw["torque"] / raw["angle"])
+    w, g, own = omega[kept], G[kept], {q: v[kept] for q, v in raw.items()}
+    stiffness = np.abs(own["torque"] / own["angle"])
     K = geometry
-    if "sample_torque" in raw:
-        K = float(np.median(np.abs(raw["sample_torque"] / raw["angle"]) / np.abs(G)))
+    if "sample_torque" in own:
+        K = float(np.median(np.abs(own["sample_torque"] / own["angle"]) / np.abs(g)))
     if K is None or not K > 0:
         return None
-    if "phase" in raw:
-        inertias = (K * G.real - stiffness * np.cos(raw["phase"])) / omega**2
+    if "phase" in own:
+        inertias = (K * g.real - stiffness * np.cos(own["phase"])) / w**2
     else:  # past the resonance, where the raw torque leads: the other root belongs to lower frequencies
-        inertias = (K * G.real + np.sqrt(np.maximum(stiffness**2 - (K * G.imag) ** 2, 0))) / omega**2
-    inertia = _agreed(omega, inertias)
+        inertias = (K * g.real + np.sqrt(np.maximum(stiffness**2 - (K * g.imag) ** 2, 0))) / w**2
+    inertia = _agreed(w, inertias)
     if not inertia * omega[-1] ** 2 > K * np.abs(G[-1]):
         return None
     return SampleShare(inertia, inertia * omega**2 / K)
+
+
+#: Raw columns of the instrument.
+COLUMNS = ("torque", "angle", "phase", "sample_torque")
+
+
+def with_raw_columns(raw: dict[str, np.ndarray]) -> np.ndarray:
+    """Which points (n,) have a number in all raw columns of the instrument; the others have an empty cell."""
+    return np.all([np.isfinite(raw[q]) for q in COLUMNS if q in raw], axis=0)
 
 
 def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray]) -> SampleShare | None:
@@ -131,8 +142,9 @@ def share_by_phase(omega: np.ndarray, G: np.ndarray, raw: dict[str, np.ndarray])
     """
     if "phase" not in raw:
         return None
+    kept = np.isfinite(raw["phase"])
     with np.errstate(divide="ignore", invalid="ignore"):
-        per_square = _agreed(omega, (G.real - G.imag / np.tan(raw["phase"])) / omega**2)
+        per_square = _agreed(omega[kept], (G.real - G.imag / np.tan(raw["phase"]))[kept] / omega[kept] ** 2)
     if not per_square * omega[-1] ** 2 > np.abs(G[-1]):
         return None
     return SampleShare(np.nan, per_square * omega**2)
@@ -143,6 +155,8 @@ def _agreed(omega: np.ndarray, values: np.ndarray) -> float:
 
     It is known best where inertia is the largest part; elsewhere it is a small difference of large numbers.
     """
+    if not len(omega):
+        return np.nan
     led = np.argsort(omega)[-max(3, len(omega) // 6) :]
     value, apart = float(np.median(values[led])), np.ptp(values[led])
     return value if value > 0 and apart < 0.1 * value else np.nan

@@ -163,18 +163,19 @@ def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str |
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, strain and temperature in SI for the rows of a table; a column with a gap is left out,
-    except for the strain.
+    """Raw torque, angle, phase, strain and temperature in SI for the rows of a table; NaN for an empty cell. A column of
+    temperatures with a gap is left out.
 
     `sign` is the table's decimal sign.
     """
     found, units = {}, unit_rows[-1] if unit_rows else []
     measured = {q: (place, factor, 0.0) for q, (place, factor) in raw_torque.known_columns(cells, units).items()}
     for quantity, (place, factor, offset) in (measured | condition_columns(cells, units)).items():
-        values = [to_number(row[place], delimiter, sign) if place < len(row) else None for row in rows]
-        # A reader that needs the strain leaves out points without it; other columns must have all values.
-        if all(v is not None and (np.isfinite(v) or quantity == "strain") for v in values):
-            found[quantity] = factor * np.array(values, float) + offset
+        values = _cells_of(place, rows, delimiter, sign)
+        known = np.isfinite(values)
+        # Readers of the other columns leave out points without them.
+        if known.all() if quantity == "temperature" else known.any():
+            found[quantity] = factor * values + offset
     return found
 
 
