@@ -149,6 +149,18 @@ def test_a_small_factor_between_the_tests_is_named_too():
     assert not any("the tests agree if" in w for w in same.warnings)
 
 
+@pytest.mark.parametrize("scale", [10.0, 50.0, 1e-3])
+def test_a_wrong_unit_of_one_test_is_named(scale):
+    """The common fit of such tests may have too few modes for either, and lies far from both."""
+    fit = springpots_in_time.choose_together(wide_and_long(scale, 0), "prony")
+    alone = [s.misfit_alone for s in fit.shares]
+    assert alone == [pytest.approx(0.02, rel=0.4), pytest.approx(0.01, rel=0.4)]
+    (told,) = [w for w in fit.warnings if "the tests agree if" in w]
+    found, error = map(float, re.search(r"relaxation.csv are ([\de.-]+) ± ([\de.-]+) times", told).groups())
+    assert abs(found - scale) < 4 * error + 0.005 * scale and error < 0.02 * scale
+    assert not any("try another --model" in w for w in fit.warnings)
+
+
 def test_tests_that_differ_by_more_than_a_factor_are_only_told_apart():
     fit = springpots_in_time.choose_together(of_the_same_times(np.append(1.0, (TIME / 10) ** 0.1)), "prony", 2)
     assert any("do not agree" in w for w in fit.warnings)

@@ -196,7 +196,7 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         # The prior is on the whole error; the residuals show the part that is not corrected yet.
         step = np.linalg.solve(precision, own.T @ r / noise**2 - values)
         covariance = np.linalg.inv(precision)
-        step = _shortened(sweep, known, values, step)
+        step = _halved_until_positive(sweep, known, values, step)
         values = values + step
         fit = _fitted_again(fit, _shifted(sweep, known, values))
         if np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))):
@@ -209,7 +209,7 @@ def _fitted_again(fit: Fit, sweep: Sweep) -> Fit:
     return viscoelastic.modes_from(sweep, fit.solution.u[None], fit.kind)._replace(details=fit.details)
 
 
-def _shortened(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
+def _halved_until_positive(sweep: Sweep, known: list[Nuisance], values: np.ndarray, step: np.ndarray) -> np.ndarray:
     """The step, halved until all corrected moduli are positive; 0 if no part of it is possible.
 
     The modes explain a part of a large error, so the first step may be far too long.

@@ -31,6 +31,8 @@ ROUNDS, QUIETEST, STARTS = 3, 1e-5, 6
 APART = 1.5
 #: Misfit above which there is a warning.
 MISSED = 0.05
+#: Further modes that a fit to one test may have, and the least fall of the criterion by each (Kass and Raftery 1995).
+MORE, CLEARLY = 2, 10.0
 
 Measured = Sweep | TimeTest | Dispersion
 
@@ -193,7 +195,7 @@ def _one_test(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind)
     """Fit one number of modes to all tests; the fit and the weights are found in turn."""
     parts = [reported_numbers(t) for t in tests]
     begin, evaluate = time.perf_counter(), partial(tests_evaluated, list(map(name_of, tests)), kind)
-    starts, noise = _starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
+    starts, noise = starts_of_all(tests, band, modes, kind), np.full(len(tests), 0.03)
     for _ in range(ROUNDS):
         used = noise
         data = [(at, y, scales * s) for (at, y, scales), s in zip(parts, noise, strict=True)]
@@ -259,8 +261,8 @@ def noises(tests: list[Measured], parts: list, residuals: np.ndarray, used: np.n
     return np.array(out)
 
 
-def _starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
-    """Starts: times over the decades of all tests, strengths by non-negative least squares of apparent moduli."""
+def starts_of_all(tests: list[Measured], band: ResolvedBand, modes: int, kind: Kind) -> np.ndarray:
+    """Starts (S, P): times over the decades of the tests, strengths by non-negative least squares of their moduli."""
     out = []
     for times in generalised_maxwell.times_over(band.resolved, modes, STARTS):
         A, b = (np.concatenate(rows) for rows in zip(*(_apparent(t, times) for t in tests), strict=True))
@@ -359,22 +361,40 @@ def structured(fit: Together) -> list[str]:
 
 
 def _shares(fit: Together) -> list[Share]:
-    """The contribution of each test: errors without it, and the misfit of a fit to this test alone with as many modes.
+    """The contribution of each test: errors without it, and the misfit of a fit to this test alone."""
+    u = np.asarray(fit.solution.u)
+    vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
+    rows = np.asarray(fit.solution.jacobian)
+    return shares_by_rows(fit, rows, vector, fit.uncertainty.values, partial(_residuals_alone, fit))
 
-    Infinite deviations exclude a test.
+
+def _residuals_alone(fit: Together, k: int) -> np.ndarray:
+    """Residuals of all tests, divided by their scales, of a fit to test k alone; 0 for the others.
+
+    It has as many modes as the common fit, or more if they follow the test better: a common fit of tests that
+    contradict each other may have too few.
     """
     parts = [reported_numbers(t) for t in fit.tests]
+    # Infinite deviations exclude a test.
+    data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
     evaluate = partial(tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
-    u = np.asarray(fit.solution.u)
-    band = ResolvedBand(resolved_by(fit.tests))
-    starts = np.concatenate([u[None], _starts_of_all(fit.tests, band, fit.modes, fit.kind)[1:]])
-    vector = host.with_jacobian(partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u)[1]
-
-    def alone(k: int) -> np.ndarray:
-        data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
-        return np.asarray(from_starts(evaluate, starts, data).residuals)
-
-    return shares_by_rows(fit, np.asarray(fit.solution.jacobian), vector, fit.uncertainty.values, alone)
+    count = len(parts[k][1])
+    every, own = (ResolvedBand(resolved_by(tests)) for tests in (fit.tests, [fit.tests[k]]))
+    best, lowest = np.empty(0), np.inf
+    for modes in range(fit.modes, fit.modes + MORE + 1):
+        # Moduli far from the others' are far from the starts of all tests.
+        starts = [starts_of_all(fit.tests, every, modes, fit.kind), starts_of_all([fit.tests[k]], own, modes, fit.kind)]
+        if modes == fit.modes:
+            starts.append(np.asarray(fit.solution.u)[None])
+        r, free = np.asarray(from_starts(evaluate, np.concatenate(starts), data).residuals), starts[0].shape[1]
+        if len(best) and free > count / 2:
+            break
+        noise = max(_size_of_noise(r, count), QUIETEST)
+        criterion = 2 * count * np.log(noise) + free * np.log(count)
+        if not criterion < lowest - CLEARLY * (len(best) > 0):
+            break
+        best, lowest = r, criterion
+    return best
 
 
 def shares_by_rows(

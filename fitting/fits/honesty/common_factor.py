@@ -13,7 +13,7 @@ from fitting.fits.together import Together
 from fitting.fits.viscoelastic import Kind
 from fitting.methods.estimate import spread
 from fitting.methods.generalised_maxwell import Maxwell
-from fitting.methods.least_squares import from_starts
+from fitting.methods.least_squares import Solution, from_starts
 
 #: A factor is named if it differs from 1 by so many standard errors, and by more than this.
 CERTAIN, LEAST = 4.0, 0.005
@@ -57,8 +57,19 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         r, J = zip(*rows, strict=True)
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
-    found = from_starts(evaluate, np.append(np.asarray(fit.solution.u), 0.0)[None])
-    counts = [len(y) for _, y, _ in data]
+    for modes in range(fit.modes, fit.modes + 1 + together.MORE):  # a common fit of such tests may have too few
+        starts = _starts_at_the_others(fit, k, modes)
+        if modes == fit.modes:
+            starts = np.concatenate([np.append(np.asarray(fit.solution.u), 0.0)[None], starts])
+        found = from_starts(evaluate, starts)
+        answer = _certain(found, [len(y) for _, y, _ in data])
+        if answer is not None:
+            break
+    return answer
+
+
+def _certain(found: Solution, counts: list[int]) -> tuple[float, float, float] | None:
+    """The result of `factor_of` from the solution for tests with so many numbers."""
     left = np.split(np.asarray(found.residuals), np.cumsum(counts)[:-1])
     worst = max(float(np.sqrt(np.mean(r**2))) for r in left)
     last = np.eye(len(found.u))[-1:]
@@ -67,6 +78,22 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         return None
     factor = float(np.exp(found.u[-1]))
     return factor, factor * error, worst
+
+
+def _starts_at_the_others(fit: Together, k: int, modes: int) -> np.ndarray:
+    """Starts that follow the other tests, with the factor that moves their prediction to test k; a large factor is far
+    from the common fit.
+    """
+    others = [t for j, t in enumerate(fit.tests) if j != k]
+    band = together.ResolvedBand(together.resolved_by(others))
+    found = together.starts_of_all(others, band, modes, fit.kind)
+    own = _, measured, scales = together.reported_numbers(fit.tests[k])
+    residuals, _ = together.tests_evaluated([together.name_of(fit.tests[k])], fit.kind, found, [own])
+    with np.errstate(all="ignore"):
+        apart = np.abs(np.log(np.abs(measured / (residuals * scales + measured))))
+    size = np.nan_to_num(np.median(apart, axis=-1), nan=0.0, posinf=0.0)
+    # A compliance falls where moduli grow: one of both signs is right.
+    return np.concatenate([np.column_stack([found, sign * size]) for sign in (1, -1)])
 
 
 def _as_the_others(maxwell: Callable[[np.ndarray], Maxwell]) -> Callable[[np.ndarray], Maxwell]:

@@ -163,8 +163,9 @@ def _perhaps_thousands(rows: list[list[str]], columns: list[Column], sign: str |
 
 
 def _raw(cells, unit_rows, rows, delimiter, sign) -> dict[str, np.ndarray]:
-    """Raw torque, angle, phase, strain and temperature in SI for the rows of a table; NaN for an empty cell. A column of
-    temperatures with a gap is left out.
+    """Raw torque, angle, phase, strain and temperature in SI for the rows of a table; NaN for an empty cell.
+
+    A column of temperatures with a gap is left out.
 
     `sign` is the table's decimal sign.
     """
