@@ -182,6 +182,13 @@ def test_a_box_spectrum_is_found_inside_the_box():
     assert 3 < found.decades <= 6 and found.effective < len(s.storage) / 2
 
 
+@pytest.mark.parametrize(("longest", "told"), [(1e4, True), (1.0, False)])
+def test_a_spectrum_says_that_more_may_relax_after_the_test(longest, told):
+    """Relaxation goes on for four decades below the band, or ends two decades inside it."""
+    fit = models.spectrum_fit(box_spectrum(np.geomspace(1e-2, 1e2, 31), 1e-3, longest, 0.01))
+    assert any("nothing tells how much of it relaxes later" in w for w in fit.warnings) == told
+
+
 def test_no_start_of_scipy_is_below_the_spectrum():
     s = read_sweep(ROOT / "data" / GIVEN["lion's mane"])
     found = relaxation_spectrum.fit(s)

@@ -133,6 +133,20 @@ def test_a_sample_that_is_not_of_the_others_is_named():
         assert len(said) == told and all(s.startswith("s4.csv: its shear_modulus is 4.9 times") for s in said)
 
 
+def test_a_sample_of_other_times_is_named_by_them():
+    """The unit of the frequency, or the temperature, moves the times alone."""
+    rows = [{"shear_modulus": (900.0 + 50 * k, 5.0), "relaxation_times[0]": (1.0 + 0.01 * k, 0.01)} for k in range(5)]
+    rows[3]["relaxation_times[0]"] = (6.4, 0.05)
+    found = SimpleNamespace(
+        sweeps=[SimpleNamespace(source=f"s{k}.csv") for k in range(5)],
+        fits=rows,
+        populations=dict.fromkeys(rows[0]),
+        values=lambda k: rows[k],
+    )
+    (said,) = outliers(found)
+    assert said.startswith("s3.csv: its relaxation_times[0] is 6.3 times") and "the unit of its frequency" in said
+
+
 def test_few_samples_of_another_unit_are_named():
     """One of three in kPa gave a new sample 2e-5 to 5e12 Pa, without a word."""
     for moduli, names in (((800.0, 950.0, 1.1e6), "s2.csv: the shear_modulus is"), ((800.0, 950.0, 2000.0), None)):

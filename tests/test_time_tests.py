@@ -396,6 +396,23 @@ def test_a_modulus_that_rises_and_a_compliance_that_falls_are_refused_with_the_c
         read_time_test(write(file, "time_s,creep_compliance_1/Pa", t, back), "creep")
 
 
+def test_a_strain_that_rings_is_told(tmp_path):
+    """A solid of one mode on a plate with inertia: the natural frequency is 30 rad/s. Creep alone does not fall."""
+    t, stress = np.geomspace(0.01, 30, 120), 10.0
+
+    def moves(_, y):
+        inner = 500 * (y[0] - y[2])
+        return [y[1], 900 * (stress - 500 * y[0] - inner) / 1000, inner / 500 / 2]
+
+    ringing = scipy.integrate.solve_ivp(moves, (0, 30), [0, 0, 0], t_eval=t, rtol=1e-9, atol=1e-12).y[0]
+    plain = stress * (1 / 500 - np.exp(-t / 4) / 1000)
+    for strain, start, told in ((ringing, 0.0, True), (ringing, 12.0, False), (plain, 0.0, False)):
+        noisy = strain * (1 + 0.002 * np.random.default_rng(1).standard_normal(len(t)))
+        path = write(tmp_path / "c.csv", "time_s,strain_1,stress_Pa", t, noisy, np.full(len(t), stress))
+        notes = read_time_test(path, "creep", start=start).notes
+        assert any("the inertia of the instrument rings" in n for n in notes) == told
+
+
 @pytest.mark.parametrize("kind", ["relaxation", "creep"])
 def test_noise_and_single_wrong_rows_are_no_other_course(tmp_path, kind):
     t, rng = np.geomspace(0.01, 60, 60), np.random.default_rng(0)

@@ -150,23 +150,59 @@ _OTHER_UNIT = 100.0
 
 
 def outliers(found: Samples) -> list[str]:
-    """A sentence on each sample whose modulus does not belong to the others' (t-test on logarithms, Bonferroni)."""
+    """A sentence on each sample with a number that does not belong to the others' (t-tests on logarithms, Bonferroni).
+
+    Strengths of a spectrum are not compared: neighbours on the grid exchange parts.
+    """
+    names = [n for n in found.populations if not n.startswith("strengths[")]
+    told: dict[int, list[tuple[float, str, float, float]]] = {}
+    for name in names:
+        for sample, chance, ratio, mean in _strangers(found, name):
+            if chance * len(names) < _STRANGE:
+                told.setdefault(sample, []).append((chance * len(names), name, ratio, mean))
+    out = []
+    for sample, own in told.items():
+        which = ", and ".join(
+            f"its {name} is {ratio:.2g} times the mean of the others, {mean:.4g} (by chance: {chance:.1g})"
+            for chance, name, ratio, mean in own
+        )
+        what = "its units and sizes"
+        if not any(name.split("[")[0] in _MODULI for _, name, _, _ in own):
+            what = "its temperature, the unit of its frequency, and the sample"
+        source = Path(found.sweeps[sample].source).name
+        out.append(f"{source}: {which}: check {what}; it widens the population's intervals")
+    if out:
+        return out
     name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
+    known, logs, _ = _known_logarithms(found, name)
+    return _of_another_unit(logs, [Path(found.sweeps[k].source).name for k in known], name)
+
+
+#: Numbers that are moduli.
+_MODULI = ("shear_modulus", "equilibrium_modulus", "relaxing_modulus", "modulus", "viscosity")
+
+
+def _known_logarithms(found: Samples, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The samples that determine a number, its logarithms, and their errors."""
     pairs = np.array([found.values(k)[name] for k in range(len(found.fits))])
     known = np.flatnonzero((pairs[:, 0] > 0) & (pairs[:, 1] < _UNSURE * pairs[:, 0]))
-    logs, errors, out = np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0], []
+    return known, np.log(pairs[known, 0]), pairs[known, 1] / pairs[known, 0]
+
+
+def _strangers(found: Samples, name: str) -> list[tuple[int, float, float, float]]:
+    """Samples with a number far from the others', the chance of one so far among all samples, its ratio to the mean of
+    the others, and this mean.
+    """
+    known, logs, errors = _known_logarithms(found, name)
+    out = []
     for k, sample in enumerate(known if len(known) >= _FEWEST else ()):
-        sweep, others = found.sweeps[sample], np.delete(logs, k)
+        others = np.delete(logs, k)
         deviation = np.sqrt(others.var(ddof=1) * (1 + 1 / len(others)) + errors[k] ** 2)
         apart = float((logs[k] - others.mean()) / max(deviation, 1e-12))
-        chance = min(1.0, 2 * len(logs) * float(scipy.stats.t.sf(abs(apart), len(others) - 1)))
+        chance = 2 * len(logs) * float(scipy.stats.t.sf(abs(apart), len(others) - 1))
         if chance < _STRANGE and abs(logs[k] - others.mean()) > np.log(_APART):
-            out.append(
-                f"{Path(sweep.source).name}: its {name} is {np.exp(logs[k] - others.mean()):.2g} times the mean of the "
-                f"others, {np.exp(others.mean()):.4g} (by chance: {chance:.1g}): check its units and sizes; it "
-                "widens the population's intervals"
-            )
-    return out or _of_another_unit(logs, [Path(found.sweeps[k].source).name for k in known], name)
+            out.append((int(sample), chance, float(np.exp(logs[k] - others.mean())), float(np.exp(others.mean()))))
+    return out
 
 
 def _of_another_unit(logs: np.ndarray, sources: list[str], name: str) -> list[str]:

@@ -140,6 +140,7 @@ def of_columns(
         InputError: the driven quantity is zero, there are too few answers, or their sign is opposite.
     """
     driven, told = without_scatter(time, driven, "strain" if kind == "relaxation" else "stress")
+    told += _ringing(time, driven, answer, start) if kind == "creep" else []
     return _checked(TimeTest(kind, time, driven, answer, time > 0, source[0], (*source[1], *told)), start)
 
 
@@ -274,6 +275,36 @@ def _another_course(path: str, kind: str, time: np.ndarray, values: np.ndarray, 
             f"has {100 * t[0] / ramp:.2g} % of its strain then: is --ramp right?"
         ]
     return []
+
+
+def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: float) -> list[str]:
+    """A note if the strain falls and rises again under a constant stress: the instrument's inertia rings."""
+    from scipy.ndimage import median_filter
+
+    largest = float(np.max(np.abs(stress)))
+    held = (np.abs(stress) > (1 - HELD) * largest) & (time >= start)
+    first = int(np.argmax(held))
+    length = int(np.argmin(np.append(held[first:], False)))
+    t, v = time[first : first + length], np.abs(strain[first : first + length])
+    if len(t) < 8:
+        return []
+    noise, v = noise_of_series(v), median_filter(v, size=3, mode="nearest")
+    falls = np.maximum.accumulate(v) - v
+    allowed = max(_RINGS * float(v.max()), _IN_NOISE * noise)
+    if not falls.max() > allowed:
+        return []
+    worst = int(np.argmax(falls))
+    rises = float(v[worst:].max() - v[worst])
+    if not rises > allowed:
+        return []
+    return [
+        f"the strain falls by {100 * falls[worst] / v.max():.2g} % until {t[worst]:.3g} s under a constant stress, and "
+        "rises again: the inertia of the instrument rings, and no creep does; leave these rows out (--min-time)"
+    ]
+
+
+#: Part of the largest strain by which it falls and rises again if it rings.
+_RINGS = 0.02
 
 
 def _as_shear(path, form, columns, sample):

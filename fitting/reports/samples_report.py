@@ -124,7 +124,10 @@ def warnings(found: Samples) -> list[str]:
                 out.append(f"{name}: the errors of the samples explain their spread; no spread between samples is seen")
             without = [Path(s.source).name for s, x in zip(found.sweeps, p.pooled, strict=True) if np.isnan(x)]
             if without:
-                out.append(f"{name}: {', '.join(without)} has none (a fluid?), so the population is that of the others")
+                out.append(
+                    f"{name}: {', '.join(without)} does not determine it (a fluid, or another band?), so the "
+                    "population is that of the others"
+                )
     out += _limits_of_typical(found)
     out += outliers(found)
     heat = np.array([np.mean(s.raw["temperature"]) for s in found.sweeps if s.raw and "temperature" in s.raw])

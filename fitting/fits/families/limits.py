@@ -12,6 +12,9 @@ from fitting.methods.uncertainty import NO_REST, equilibrium_error
 
 #: Differences above this many standard errors get a sentence.
 TOLD = 2.0
+#: Falls of G' in the first half decade of the band, over that in the next, above which much may relax after the test:
+#: one relaxation time well inside the band has 0.1, a modulus that falls by the same amount in each half decade has 1.
+SLOWING = 0.5
 NAMES = {"shear_modulus": "instantaneous modulus", "equilibrium_modulus": "equilibrium modulus"}
 
 
@@ -55,3 +58,22 @@ def limit_sentences(name: str, modes: Estimate, model: Maxwell, own: Estimate | 
                 f"{name} {there:.4g} Pa: the modes follow the model over the measured band only"
             )
     return out
+
+
+def still_relaxing(storage: np.ndarray, noise: float, longest: float) -> list[str]:
+    """A sentence if G' still falls where the band begins, so that more may relax after the test.
+
+    Args:
+        storage: G' (3,) of the model at the lowest frequency and half a decade and a decade above it [Pa].
+        noise: relative noise of the data.
+        longest: longest relaxation time [s] of the model.
+    """
+    fall, next_fall = np.diff(storage)
+    if fall <= max(TOLD * noise * storage[0], SLOWING * next_fall):
+        return []
+    return [
+        f"G' falls by {100 * fall / storage[1]:.2g} % in the lowest half decade and by "
+        f"{100 * next_fall / storage[2]:.2g} % in the next: the equilibrium modulus is what is left after "
+        f"{longest:.3g} s, the longest time of the model; nothing tells how much of it relaxes later, and its error "
+        "does not contain that; measure at lower frequencies"
+    ]

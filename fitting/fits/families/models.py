@@ -107,7 +107,13 @@ def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = 
         "effective_parameters": found.effective,
         "decades_carried": found.decades,
     }
-    return _finished(viscoelastic.fitted(sweep, solution, kind, 0.0, 0.0, {"spectrum": details}), made)
+    fit = viscoelastic.fitted(sweep, solution, kind, 0.0, 0.0, {"spectrum": details})
+    if solid:
+        lowest = sweep.angular_frequency[0] * np.sqrt(10.0) ** np.arange(3)
+        noise = sweep.relative_deviation if sweep.noise_given else fit.uncertainty.noise
+        told = limits.still_relaxing(moduli(u, lowest)[0], noise, float(np.max(found.times)))
+        fit = fit._replace(warnings=(*fit.warnings, *told))
+    return _finished(fit, made)
 
 
 def _conversion(sweep: Sweep, moduli: Any, solid: bool) -> as_prony_modes.Conversion:
