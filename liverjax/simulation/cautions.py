@@ -99,7 +99,8 @@ def mesh_sentence(scene: Scene, result: Result) -> str:
         if size > nothing
         else "and do not move"
     )
-    said = f"mesh error (estimate, last step): nodes are up to {error:.2g} m off, {part}"
+    without = "" if result.pressure is None else ", without the error of the fluid's pressures"
+    said = f"mesh error (estimate, last step{without}): nodes are up to {error:.2g} m off, {part}"
     if not np.all(np.asarray(result.mesh_error.found)):
         return (
             f"{said}; at some steps it is not found, or turns elements inside out: the mesh is too coarse to say more"
@@ -273,7 +274,7 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
         return []
     P = np.asarray(result.pressure)
     if scene.porosity.scheme != "lagged":
-        return _of_overshoot(scene, P[:, : scene.mesh.number_of_vertices])
+        return _of_overshoot(scene, P[:, : scene.mesh.number_of_vertices]) + _of_drained_layer(scene, len(P))
     if len(P) < 4:
         return []
     once, twice = np.abs(np.diff(P, axis=0)).sum(), np.abs(P[2:] - P[:-2]).sum()
@@ -282,6 +283,49 @@ def _of_pressures(scene: Scene, result: Result) -> list[str]:
     return [
         "the pressure goes up and down from step to step, as scheme = 'lagged' does if it is unstable: write scheme = "
         "'implicit' in [porosity]"
+    ]
+
+
+def _height_beside(scene: Scene, at: np.ndarray, faces: np.ndarray) -> float:
+    """Median height [m] of the elements `at` over their face; `faces` (n, 4) says which corners of all elements are on
+    one.
+    """
+    corners = np.asarray(scene.mesh.points)[np.asarray(scene.mesh.tetrahedra)[at]]
+    base = corners[faces[at]].reshape(-1, 3, 3)
+    area = 0.5 * np.linalg.norm(np.cross(base[:, 1] - base[:, 0], base[:, 2] - base[:, 0]), axis=1)
+    return float(np.median(3 * np.abs(np.asarray(scene.mesh.volumes)[at]) / area))
+
+
+def _of_drained_layer(scene: Scene, steps: int) -> list[str]:
+    """A sentence if the layer that drains in the whole run is thinner than the elements there.
+
+    After a time t the fluid has left a layer of about sqrt(c t), with the diffusivity c = kappa / (1/K_lim + 1/M) (Biot
+    1941). The pressure is linear in an element, so a thinner layer is drained too much.
+    """
+    sponge = scene.porosity
+    assert sponge is not None
+    if sponge.drained is None or scene.solve.dt is None:
+        return []
+    given = np.isin(np.asarray(scene.mesh.tetrahedra), np.asarray(sponge.drained))
+    at = np.flatnonzero(given.sum(axis=1) == 3)
+    if not len(at):
+        return []
+    try:
+        shear = float(np.median(np.asarray(scene.law.shear_modulus())))
+    except InputError:  # a law need not state its moduli
+        return []
+    K0, limit, kappa = (
+        float(np.median(np.asarray(own))) for own in (sponge.bulk, sponge.limit_bulk, sponge.permeability)
+    )
+    height = _height_beside(scene, at, given)
+    layer = float(np.sqrt(kappa / (1 / limit + 1 / (K0 + 4 / 3 * shear)) * float(scene.solve.dt) * steps))
+    if layer >= height:
+        return []
+    return [
+        f"in {float(scene.solve.dt) * steps:.3g} s the fluid leaves a layer of about {layer:.2g} m at the drained "
+        f"places, and the elements there are {height:.2g} m high: they drain too much, so that pressures and "
+        "displacements are wrong there, and the mesh error does not contain it: take thinner elements there, or hold "
+        "the fluid (no drained places) if nothing should flow"
     ]
 
 
@@ -323,10 +367,7 @@ def _of_overshoot(scene: Scene, P: np.ndarray) -> list[str]:
     worst = int(np.argmax(np.where(largest > 0.1 * largest.max(), over, 0.0)))
     if not over[worst] > OVERSHOOT:
         return []
-    corners = np.asarray(scene.mesh.points)[tets[at]]
-    base = corners[faces[at]].reshape(-1, 3, 3)
-    area = 0.5 * np.linalg.norm(np.cross(base[:, 1] - base[:, 0], base[:, 2] - base[:, 0]), axis=1)
-    height = float(np.median(3 * np.abs(np.asarray(scene.mesh.volumes)[at]) / area))
+    height = _height_beside(scene, at, faces)
     said = (
         f"the pressure overshoots beside the drained places, by {100 * over[worst]:.2g} % at "
         f"{float(scene.solve.dt) * (worst + 1):.3g} s, because the first steps are too short for the elements there"
