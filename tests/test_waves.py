@@ -307,6 +307,28 @@ def test_columns_of_the_table_stay_apart_where_nothing_fits():
     ]
 
 
+def test_a_frequency_of_noise_alone_is_named_and_a_number_at_its_bound():
+    field = plane_waves((9, 9, 9))
+    size = float(np.sqrt(np.mean(np.abs(field.displacement[0]) ** 2) / 2))
+    assert not waves_report._of_no_motion(field._replace(noise=np.array([0.05 * size])), 0)
+    (said,) = waves_report._of_no_motion(field._replace(noise=np.array([0.98 * size])), 0)
+    assert "are hardly larger than their noise" in said and said.endswith("leave this frequency out")
+    own = {"numbers": {"exponent": 1.0, "springpot": 2.0}, "standard_errors": {"exponent": None, "springpot": 0.1}}
+    blank = {"regions": None, "map": None, "frequencies_Hz": [], "whole": {}, "direct_inversion": {"whole": {}}}
+    spring = {"whole": own | {"model": "springpot", "frequencies": 3, "mean_relative_error": 0.043}}
+    last = waves_report.table(blank | {"springpots": spring}).splitlines()[-1]
+    assert "4.3 % off on average: exponent = 1 (at its bound), springpot = 2 ± 0.1" in last
+
+
+def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
+    """Solids of three materials at three frequencies: no springpot rises and falls so."""
+    rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
+    rows += ["50,3200,600,17,17", "75,2500,1900,17,17", "100,3800,300,17,17"]
+    (tmp_path / "s.csv").write_text("\n".join(rows) + "\n")
+    _, told = waves_report._springpots({"whole": tmp_path / "s.csv"})
+    assert any("misses the moduli over the frequencies by" in w for w in told)
+
+
 def test_a_map_that_was_stopped_goes_on_to_the_same_end(tmp_path, monkeypatch):
     """Stopped in the second deviation, the first one is judged again: the same numbers as without the stop."""
     own, file = organ(noise=5e-7), tmp_path / "progress.h5"

@@ -16,6 +16,7 @@ from fitting.waves.files import components
 from fitting.waves.regions import Regions
 from fitting.waves.shear_waves import velocity_and_attenuation
 from fitting.waves.stiffness_map import FAR, WaveMap, sd_of_modulus
+from fitting.waves.wave_field import WaveField
 from liverjax.core.errors import InputError
 from liverjax.core.plotting import pyplot, save
 from liverjax.core.struct import Content
@@ -123,13 +124,18 @@ def _springpots(sweeps: dict[str, Path]) -> tuple[Content | None, list[str]]:
             continue
         told += [f"{name}: the springpot is fitted without some frequencies: {note}" for note in sweep.notes]
         fit, _ = models.best_of_models(models.fractional(sweep), sweep)
-        u = fit.parameters
+        u, off = fit.parameters, float(np.mean(fit.relative_errors(sweep)))
         assert u is not None
+        if off > MISSED:
+            told.append(
+                f"{name}: the {fit.kind.name} misses the moduli over the frequencies by {100 * off:.2g} % on average: "
+                "use the moduli of each frequency"
+            )
         found[name] = {
             "model": fit.kind.name,
             "numbers": {k: float(v) for k, v in zip(u.names, u.values, strict=True)},
             "standard_errors": numbers({k: float(v) for k, v in zip(u.names, u.standard_errors, strict=True)}),
-            "mean_relative_error": float(np.mean(fit.relative_errors(sweep))),
+            "mean_relative_error": off,
             "frequencies": len(sweep.angular_frequency),
         }
     return found, told
@@ -204,6 +210,10 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     for f, hertz in enumerate(organ.field.frequencies):
         if not np.isfinite(organ.field.noise[f]):
             continue
+        still = _of_no_motion(organ.field, f)
+        if still:
+            told += still
+            continue
         coarse = _of_voxel_size(hertz, found, f)
         told += coarse + _of_residuals(hertz, each, f, "regions" if found.parts else "moduli", bool(coarse))
         any_coarse |= bool(coarse)
@@ -232,6 +242,25 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
             "viscous solid; its deviations are too small then, so compare it with regions and with one frequency alone"
         )
     return told
+
+
+#: Mean relative distance of the springpot from the moduli of the frequencies that is told.
+MISSED = 0.03
+#: Root mean square of the motion over the noise, below which nothing but noise is seen: the two add up as squares, so
+#: that the motion itself is smaller than two thirds of the noise.
+NO_MOTION = 1.2
+
+
+def _of_no_motion(field: WaveField, f: int) -> list[str]:
+    """A sentence if the displacements at this frequency are hardly larger than their noise."""
+    u = field.displacement[f][field.mask]
+    size = float(np.sqrt(np.nanmean(np.abs(u) ** 2) / 2))
+    if not size < NO_MOTION * field.noise[f]:
+        return []
+    return [
+        f"{field.frequencies[f]:g} Hz: the displacements ({size:.2g} m) are hardly larger than their noise "
+        f"({field.noise[f]:.2g} m): nothing is known of the waves there; leave this frequency out"
+    ]
 
 
 #: Relative standard error of a modulus above which its interval is not symmetric.
@@ -383,9 +412,11 @@ def table(content: Content) -> str:
             )
     for name, own in (content["springpots"] or {}).items():
         said = ", ".join(
-            f"{k} = {v:.4g} ± {own['standard_errors'][k] or np.nan:.2g}" for k, v in own["numbers"].items()
+            f"{k} = {v:.4g} {f'± {error:.2g}' if (error := own['standard_errors'][k]) else '(at its bound)'}"
+            for k, v in own["numbers"].items()
         )
-        rows.append(f"{name:12s}{own['model']} over {own['frequencies']} frequencies: {said}")
+        off = f"{100 * own['mean_relative_error']:.2g} % off on average"
+        rows.append(f"{name:12s}{own['model']} over {own['frequencies']} frequencies, {off}: {said}")
     if content["map"]:
         m = content["map"]
         rows.append(
