@@ -636,3 +636,26 @@ def test_measured_data_of_other_folders(tmp_path):
     assert [c.test for c in found] == ["uniaxial", "simple_shear", "equibiaxial"]
     assert len(notes) == 3 and "names no unit, read as kPa" in notes[0]
     assert np.isclose(found[1].F[0, 0, 0], 0.75)
+
+
+def test_components_without_a_column_of_shear(tmp_path):
+    F = np.asarray(homogeneous.deformation_gradient("uniaxial", np.linspace(0.8, 1.4, 13)))
+    P = np.asarray(homogeneous.response(KNOWN["neo_hookean"], "uniaxial", np.linspace(0.8, 1.4, 13)))
+    rows = np.column_stack([F[:, 0, 0], F[:, 1, 1], F[:, 2, 2], P])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="F11,F22,F33,P11_Pa", comments="")
+    ((curve,), _) = curves.read_curves([tmp_path / "a.csv"])
+    assert curve.test == "uniaxial" and np.allclose(curve.F, F)
+    np.savetxt(tmp_path / "b.csv", rows[:, [0, 1, 3]], delimiter=",", header="F11,F22,P11_Pa", comments="")
+    with pytest.raises(InputError, match="has no column F33: give F11, F22 and F33"):
+        curves.read_curves([tmp_path / "b.csv"])
+
+
+def test_laws_that_tie_are_named_with_their_moduli():
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    best = stress_stretch.fit(candidate, synthetic(KNOWN["neo_hookean"], 0.01))
+    other, far = (
+        best._replace(aicc=best.aicc + d, label=n, shear_modulus=m) for d, n, m in ((2, "b", 900.0), (9, "c", 5.0))
+    )
+    (told,) = stress_stretch.tied_laws([best, other, far], "curves")
+    assert told.startswith("b follow the curves as well as neo_hookean does") and "with G0 from 7" in told
+    assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")

@@ -382,3 +382,17 @@ def test_equal_noise_of_storage_and_loss_is_left_alone():
         alone = uncertainty.estimate(fit.solution, False).standard_errors
         changed += not np.allclose(fit.uncertainty.standard_errors, alone, rtol=1e-9)
     assert changed <= 1
+
+
+def test_a_number_that_the_other_points_do_not_determine_is_unknown_by_its_own_size():
+    """Without the last half decade the fast mode runs away, and G0 with it: its total error was 1e8 Pa."""
+    omega = 2 * np.pi * np.geomspace(0.1, 1, 12)
+    G = 200 + sum(g * 1j * omega * tau / (1 + 1j * omega * tau) for g, tau in ((2000.0, 10.0), (300.0, 0.08)))
+    noise = 1 + 0.03 * np.random.default_rng(2).standard_normal((2, 12))
+    s = Sweep(omega, G.real * noise[0], G.imag * noise[1])
+    fit = edges.honest(viscoelastic.closed_form(s, 2), s, generalised_maxwell.spectrum(s))
+    changes = {"shear_modulus": 1e3 * fit.model.shear_modulus}
+    fit = fit._replace(details=fit.details | {"band_sensitivity": {edges.PARTS[0]: changes, edges.PARTS[1]: None}})
+    share = total_error.error_shares(fit)["band"]["shear_modulus"]
+    assert share == pytest.approx(max(fit.model.shear_modulus, edges.values(fit)["shear_modulus"][1]), rel=1e-9)
+    assert "shear_modulus by more than tenfold" in edges._moved_most(fit)[0]

@@ -433,3 +433,33 @@ def test_an_exponent_at_its_bound_is_told():
     s = Sweep(OMEGA, 1e-3 * OMEGA, 10.0 * OMEGA)
     (fit,) = (f for f in models.fractional(s) if f.kind.name == "springpot")
     assert any("exponent is at its bound 1: the springpot is a dashpot" in w for w in fit.warnings)
+
+
+def test_a_small_exponent_that_is_known_is_at_no_bound_and_has_modes():
+    """An elastic solid with a loss of a thousandth: the exponent is 2/pi atan(1e-3), and the modes need a rest."""
+    noise = 1 + 0.01 * np.random.default_rng(0).standard_normal((2, 16))
+    fits = models.fractional(Sweep(OMEGA, 1000 * noise[0], 1.0 * noise[1]))
+    (fit,) = (f for f in fits if f.kind.name == "springpot")
+    assert fit.parameters.values[1] == pytest.approx(2 / np.pi * np.arctan(1e-3), rel=0.01)
+    assert fit.details["conversion"]["largest_relative_error"] < as_prony_modes.ALLOWED
+    assert not any("at its bound" in w or "narrower band" in w for w in fit.warnings)
+    (spring,) = (f for f in fits if f.kind.name == "fractional_maxwell")
+    unknown = spring.parameters._replace(standard_errors=np.full(4, 1e-3), values=np.array([900, 1e-4, 400, 0.2]))
+    assert len(models.at_bounds(unknown)) == 1
+
+
+def test_the_total_error_stands_beside_a_model_s_own_numbers(tmp_path):
+    main(
+        [
+            str(ROOT / "data" / "porcine_liver_frequency_sweep.csv"),
+            "--method",
+            "closed-form",
+            "--model",
+            "spectrum",
+            "--out",
+            str(tmp_path),
+        ]
+    )
+    content = json.loads((tmp_path / "fit.json").read_text())
+    own = content["parameters"]["equilibrium_modulus"]
+    assert own["total_error"] == content["total_errors"]["equilibrium_modulus"] >= own["standard_error"]

@@ -297,3 +297,13 @@ def test_chains_that_do_not_agree_are_named():
     found = posterior.of_sweep(viscoelastic.closed_form(one_mode(0.02, 1), 1), one_mode(0.02, 1), 200)
     assert not found.warnings()
     assert "R-hat 1.3" in found._replace(r_hat=np.array([1.0, 1.3, 1.0, 1.0])).warnings()[0]
+
+
+def test_a_posterior_that_the_prior_cuts_is_told():
+    """A mode of 8 s, which frequencies from 0.3 Hz on do not tell from longer ones; the prior ends at 5 s."""
+    omega = 2 * np.pi * np.geomspace(0.316, 31.6, 25)
+    G = sum(1000 * 1j * omega * tau / (1 + 1j * omega * tau) for tau in (8.0, 0.05))
+    noise = 1 + 0.01 * np.random.default_rng(0).standard_normal((2, 25))
+    s = Sweep(omega, G.real * noise[0], G.imag * noise[1])
+    told = posterior.of_sweep(viscoelastic.closed_form(s, 2), s, 100).warnings()
+    assert any("the prior cuts the posterior of relaxation_times[0]" in w and "its end of 5.04 s" in w for w in told)

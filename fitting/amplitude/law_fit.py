@@ -13,7 +13,7 @@ import numpy as np
 from fitting.amplitude import cycle
 from fitting.amplitude.strain_sweep import StrainSweep
 from fitting.fits.families.hyperelastic import Candidate
-from fitting.fits.stress_stretch import STARTS, LawFit, assessed
+from fitting.fits.stress_stretch import STARTS, LawFit, assessed, tied_laws
 from fitting.methods.generalised_maxwell import Maxwell, moduli
 from fitting.methods.least_squares import levenberg_marquardt
 from fitting.readers.curves import Curve
@@ -171,21 +171,4 @@ def said_of(sweep: StrainSweep, fits: Sequence[StrainFit]) -> list[str]:
             "the storage modulus falls with strain: tissue that slips, yields or tears does so too, and a hyperelastic "
             "law that follows it is only a description"
         )
-    return [*told, *_alike_laws(fits)]
-
-
-#: Difference of AICc up to which two laws describe a sweep as well as each other.
-TIE = 4.0
-
-
-def _alike_laws(fits: Sequence[StrainFit]) -> list[str]:
-    """A sentence if laws other than the best one follow the sweep as well."""
-    best = fits[0].law
-    others = [f.law.label for f in fits[1:] if f.law.aicc - best.aicc < TIE]
-    if not others:
-        return []
-    which = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
-    return [
-        f"{which} follow the sweep as well as {best.label} does (AICc within {TIE:g}): the sweep does not tell these "
-        "laws apart, and outside of its strains they differ"
-    ]
+    return [*told, *tied_laws([f.law for f in fits], "sweep")]

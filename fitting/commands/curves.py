@@ -57,7 +57,9 @@ def run(options: argparse.Namespace) -> int:
     for fit in curves_report.best_first(fits):
         for sentence in fit.warnings:
             print(f"warning: {fit.label}: {sentence}", file=sys.stderr)
-    for sentence in (*stress_stretch.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found), *structured):
+    tied = stress_stretch.tied_laws(curves_report.best_first(fits), "curves")
+    told = (*stress_stretch.unfollowed(found, fits), *stress_stretch.loaded_at_rest(found), *structured, *tied)
+    for sentence in told:
         print(f"warning: {sentence}", file=sys.stderr)
     print(f"written: {options.out}/curves.json, curves.png")
     return 0 if curves_report.best_first(fits)[0].converged else 1

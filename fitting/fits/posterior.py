@@ -58,11 +58,14 @@ class Posterior(NamedTuple):
     prior: str  # in words
     seconds: float
     simulated: dict[str, float] | None = None  # number of simulated draws, and their largest difference
+    times: tuple[float, float] | None = None  # ends [s] of the prior of relaxation times
 
     def warnings(self) -> list[str]:
-        """Warnings if there are too few draws, or if the linear rig is not accurate enough."""
+        """Warnings if there are too few draws, if the prior cuts the posterior, or if the linear rig is not accurate
+        enough.
+        """
         worst = int(np.argmax(self.r_hat))
-        out = []
+        out = self._cut_by_the_prior()
         if self.simulated and not self.simulated["largest_difference"] < DIFFERENT:
             out.append(
                 f"the posterior is that of the linear rig; in {SIMULATED} simulated draws its log density is off by up "
@@ -76,7 +79,28 @@ class Posterior(NamedTuple):
             "more --samples, fewer modes or another --model",
         ]
 
+    def _cut_by_the_prior(self) -> list[str]:
+        """A sentence on each relaxation time with many draws near an end of its prior."""
+        out = []
+        for k, name in enumerate(self.names):
+            if self.times is None or not name.startswith("relaxation_times"):
+                continue
+            draws = self.draws[..., k]
+            for end, near in (
+                (self.times[0], draws < NEAR * self.times[0]),
+                (self.times[1], draws * NEAR > self.times[1]),
+            ):
+                if near.mean() > CUT:
+                    out.append(
+                        f"the prior cuts the posterior of {name}: {100 * near.mean():.0f} % of the draws are near its "
+                        f"end of {end:.3g} s, so its interval and those of the moduli are those of the prior: the data "
+                        "do not bound them; measure a wider band"
+                    )
+        return out
 
+
+#: Ratio to an end of the prior that is near it, and the part of the draws near it that is told.
+NEAR, CUT = 1.25, 0.025
 #: R-hat below which the chains agree, and the smallest relative error of data: with none a posterior is a point.
 AGREED, QUIETEST = 1.01, 1e-6
 
@@ -259,7 +283,10 @@ def sample(at: Target, parameters: int, count: int, seed: int = 0) -> Posterior:
     chains = tempering.run(density, count, seed)
     draws = prior.numbers(chains.draws.reshape(-1, parameters)).reshape(*chains.draws.shape[:2], -1)
     known = np.array([r_hat(draws[..., k]) for k in range(draws.shape[-1])])
-    return Posterior(prior.names(parameters), draws, known, chains, prior.words, time.perf_counter() - begin)
+    modes = prior.modes if isinstance(prior, WithInstrument) else prior
+    ends = (float(np.exp(modes.times[0])), float(np.exp(modes.times[1]))) if isinstance(modes, Modes) else None
+    seconds = time.perf_counter() - begin
+    return Posterior(prior.names(parameters), draws, known, chains, prior.words, seconds, times=ends)
 
 
 def _with_gap(found: Posterior, fit: Fit, seed: int) -> Posterior:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import sample_inertia
+from fitting.fits.honesty.alike_points import OF_INDEPENDENT, SHARED, with_alike_points
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, SHORT, BestPoint, Fit, Kind, by_importance, fit_at, timed
 from fitting.methods import uncertainty
@@ -160,6 +161,7 @@ OF_THE_DATA = (
     "Kramers-Kronig",
     "half decade",
     "structured misfit",
+    SHARED,
     "poses as",
     SHORT,
     "a solid follows the data as well",
@@ -170,6 +172,7 @@ KEPT = (
     "models_compared",
     "band_sensitivity",
     "band_scatter",
+    OF_INDEPENDENT,
     "consistency",
     "instrument",
     "gap_error",
@@ -234,7 +237,9 @@ def through_torsion(
         fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
-    fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
+    fit = with_alike_points(fit._replace(details=fit.details | of_the_model), sweep)
+    fit = _with_shared_errors(fit, start)
+    fit = fit._replace(warnings=tuple(w for w in fit.warnings if not w.startswith(SHARED)))  # as the closed form says
     own = tuple(w for w in fit.warnings if not (w.startswith(MISSES) and any(m.startswith(MISSES) for m in more)))
     return fit._replace(warnings=by_importance((*own, *more, *_bias(start, fit))))
 

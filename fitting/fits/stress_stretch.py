@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -331,3 +332,22 @@ def unfollowed(curves: list[Curve], fits: list[LawFit]) -> list[str]:
                 f"{100 * error:.0f} % of its stress; check its unit, signs and axes, or fit it on its own"
             )
     return told
+
+
+#: Difference of AICc up to which two laws describe data as well as each other.
+TIE = 4.0
+
+
+def tied_laws(fits: Sequence[LawFit], data: str) -> list[str]:
+    """A sentence if laws other than the best one follow the `data` ("sweep", "curves") as well; the best is first."""
+    best = fits[0]
+    others = [f for f in fits[1:] if f.aicc - best.aicc < TIE]
+    if not others:
+        return []
+    which = ", ".join(f.label for f in others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
+    moduli = [f.shear_modulus for f in (best, *others)]
+    return [
+        f"{which} follow the {data} as well as {best.label} does (AICc within {TIE:g}), with G0 from {min(moduli):.4g} "
+        f"to {max(moduli):.4g} Pa: the {data} cannot decide between these laws, and beyond the strains measured they "
+        "differ"
+    ]

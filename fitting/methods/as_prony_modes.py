@@ -44,7 +44,7 @@ def convert(
     Args:
         moduli: G' and G'' (n,) [Pa] at angular frequencies (n,).
         low, high: ends of the band [rad/s].
-        solid: whether the model has an equilibrium modulus.
+        solid: whether the model has an equilibrium modulus. The modes have one in any case if they need it.
     """
     decades = np.log10(high / low)
     omega = np.geomspace(low, high, max(12, int(decades * PER_DECADE) + 1))
@@ -65,6 +65,10 @@ def convert(
         if best[0] < ALLOWED:
             break
     assert best is not None
+    if not solid and best[0] > ALLOWED:  # a small exponent: within the band it is a spring, and hardly relaxes
+        with_rest = convert(moduli, low, high, solid=True)
+        if with_rest.error < best[0]:
+            return with_rest
     error, times, strengths, A = best
     kept = strengths[solid:] > 1e-9 * strengths.sum()
     columns = np.concatenate([[True], kept]) if solid else kept

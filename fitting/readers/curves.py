@@ -178,7 +178,14 @@ ROUNDOFF = 1e-5
 
 
 def _components(file: Path, rows: list[dict], unit: str) -> tuple[list[Curve], bool]:
-    F = np.stack([_column(file, rows, f"F{ij}") for ij in _INDICES], axis=1).reshape(-1, 3, 3)
+    missing = [f"F{k}{k}" for k in (1, 2, 3) if f"F{k}{k}" not in rows[0]]
+    if missing:
+        raise InputError(
+            f"{file} has no column {', '.join(missing)}: give F11, F22 and F33, and the shears that are not 0"
+        )
+    # A shear without a column is 0.
+    given = {ij: None if f"F{ij}" in rows[0] else 0.0 for ij in _INDICES}
+    F = np.stack([_column(file, rows, f"F{ij}", zero) for ij, zero in given.items()], axis=1).reshape(-1, 3, 3)
     measured, stated = {}, {}
     for ij in _INDICES:
         column = _stress_column(file, rows[0], f"P{ij}", unit)

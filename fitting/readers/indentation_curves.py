@@ -49,7 +49,7 @@ def read_indentation(path: str | Path) -> IndentationCurve:
 
     Args:
         path: text with a header that names depth (or displacement, indentation) and force (or load), with units m, mm,
-            um, nm and N, mN, uN, nN: `depth_um,force_mN`; or a workbook.
+            um, nm and N, mN, uN, nN, pN: `depth_um,force_mN`; or a workbook.
 
     Raises:
         InputError: one sentence naming file, column or line, value and remedy.

@@ -50,7 +50,7 @@ TIME_TEST_UNITS = {
 #: Units of indentation curves.
 INDENTATION_UNITS = {
     "depth": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
-    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "nN": 1e-9},
+    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "µN": 1e-6, "μN": 1e-6, "nN": 1e-9, "pN": 1e-12},
 }
 #: Units of shear waves; the first is the default. 1 Np is a factor of e.
 WAVE_UNITS = {

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fitting.fits.families import limits, models
-from fitting.fits.honesty import edges, moduli_errors, total_error
+from fitting.fits.honesty import alike_points, edges, moduli_errors, total_error
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.posterior import Posterior
 from fitting.fits.simulated_rheometer import largest_shift
@@ -184,7 +184,11 @@ def write(
     content = summary(main, sweep) | {"data": sweep.source, "notes": list(sweep.notes), "versions": versions()}
     content["moduli"] = moduli_rows(fits[0], sweep)
     content["band_sensitivity"] = band_sensitivity(fits[0])
-    content["total_errors"] = by_stem(total_error.total_errors(main))
+    whole = total_error.total_errors(main)
+    content["total_errors"] = by_stem(whole)
+    for name, own in content.get("parameters", {}).items():
+        if name in whole:
+            own["total_error"] = whole[name]
     content["error_shares"] = {source: by_stem(part) for source, part in total_error.error_shares(main).items()}
     if len(fits) > 1:
         content["closed_form"] = summary(fits[0], sweep)
@@ -194,6 +198,11 @@ def write(
     if posterior is not None:
         content["posterior"] = posterior_report.summary(posterior)
         content["warnings"] += posterior.warnings()
+        if alike_points.INDEPENDENT in main.details:
+            content["warnings"].append(
+                "the posterior takes the noise of all moduli as independent, and neighbours share it: its intervals "
+                "are too narrow; use the standard errors"
+            )
         posterior_report.write_draws(out / "posterior.csv", posterior)
     content = numbers(content)
     (out / "fit.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")

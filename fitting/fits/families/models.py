@@ -28,6 +28,8 @@ STRONG = 10.0
 
 #: Distance from 0 and 1 below which an exponent is at its bound.
 BOUND = 1e-3
+#: Distance below which it is at its bound, however well it is known.
+SHARP = 1e-4
 
 
 def fractional(sweep: Sweep) -> list[Fit]:
@@ -155,8 +157,8 @@ def undetermined(fit: Any) -> list[str]:
 def at_bounds(own: Estimate) -> list[str]:
     """A sentence for each exponent at its bound, where a standard error says nothing."""
     out = []
-    for name, value in zip(own.names, own.values, strict=True):
-        if "exponent" in name and not BOUND < value < 1 - BOUND:
+    for name, value, bound in zip(own.names, own.values, _bounded(own), strict=True):
+        if bound:
             what = "dashpot" if value > 0.5 else "spring"
             out.append(
                 f"{name} is at its bound {round(float(value))}: the springpot is a {what}, and the standard error of "
@@ -167,9 +169,14 @@ def at_bounds(own: Estimate) -> list[str]:
 
 def determined(own: Estimate) -> np.ndarray:
     """Which numbers of a model have an error below half their value; exponents may also be 0 or 1 (spring, dashpot)."""
-    values, errors = own.values, own.standard_errors
-    bound = np.array(["exponent" in name for name in own.names]) & ((values < BOUND) | (values > 1 - BOUND))
-    return (errors < 0.5 * np.abs(values)) | bound
+    return (own.standard_errors < 0.5 * np.abs(own.values)) | _bounded(own)
+
+
+def _bounded(own: Estimate) -> np.ndarray:
+    """Which numbers are exponents at 0 or 1: nearly an elastic solid has a small exponent that is known well."""
+    off = np.minimum(own.values, 1 - own.values)
+    known = (own.standard_errors < 0.1 * np.abs(off)) & (off > SHARP)
+    return np.array(["exponent" in name for name in own.names]) & (off < BOUND) & ~known
 
 
 def identifiable(fit: Fit, sweep: Sweep) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.honesty import chance_of_ends
+from fitting.fits.honesty.alike_points import OF_INDEPENDENT, SHARED, with_alike_points
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
@@ -22,6 +23,10 @@ PARTS = ("without_first_half_decade", "without_last_half_decade")
 
 def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
     """Add to the fit: the influence of the ends, the structure of its residuals, and the checks of the data alone."""
+    wider = with_alike_points(fit, sweep)
+    if wider is not fit:
+        own = {name: error for name, (_, error) in values(fit).items()}
+        fit = wider._replace(details=wider.details | {OF_INDEPENDENT: own})
     details, warnings = dict(fit.details), list(fit.warnings)
     found = kramers_kronig.of_data(sweep, dense)
     told = kramers_kronig.sentences(found, sweep)
@@ -37,6 +42,8 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         )
         details["residuals"] = runs
         told += structured
+        if structured:  # one sentence on one thing
+            warnings = [w for w in warnings if not w.startswith(SHARED)]
     if found.far and any(w.startswith(MISSES) for w in warnings):
         told = [w for w in told if KRAMERS_KRONIG not in w]
         warnings = [w for w in warnings if not w.startswith(MISSES)] + [_nearest(fit, sweep, found.misfit)]
@@ -113,6 +120,8 @@ def decided_by(fit: Fit | TimeFit, part: str) -> dict[str, float]:
     """
     changes, known = (fit.details.get("band_sensitivity") or {}).get(part) or {}, values(fit)
     by_noise = (fit.details.get("band_scatter") or {}).get(part) or {}
+    # Smooth residuals of a model that misses the data are no noise that explains a change.
+    known |= {name: (known[name][0], e) for name, e in fit.details.get(OF_INDEPENDENT, {}).items() if name in known}
     far, out = chance_of_ends.farthest_by_chance(fit, len(changes)), {}
     for name, change in changes.items():
         value, error = known[name]
@@ -167,7 +176,7 @@ def _moved_most(fit: Fit) -> list[str]:
         names = sorted(beyond, key=lambda name: -beyond[name])
         rows = [(name, fit.details["band_sensitivity"][part][name], known[name][0]) for name in names]
         if rows:
-            listed = ", ".join(f"{n} by {100 * d / v:+.2g} %" if v else f"{n} by {d:+.2g}" for n, d, v in rows[:3])
+            listed = ", ".join(f"{n} by {_relative_change(d, v)}" for n, d, v in rows[:3])
             rest = f" and {len(rows) - 3} more" if len(rows) > 3 else ""
             told.append(f"leaving out the {end} half decade moves {listed}{rest}")
     if not told:
@@ -176,3 +185,13 @@ def _moved_most(fit: Fit) -> list[str]:
         f"{'; '.join(told)}: more than their standard errors and more than noise explains, so the ends of the band "
         "decide them: take the total errors, or measure a wider band"
     ]
+
+
+#: Relative change above which a number is not determined by the other points, so that its new value means nothing.
+_RUNS_AWAY = 10.0
+
+
+def _relative_change(change: float, value: float) -> str:
+    if not value:
+        return f"{change:+.2g}"
+    return f"{100 * change / value:+.2g} %" if abs(change) < _RUNS_AWAY * abs(value) else "more than tenfold"

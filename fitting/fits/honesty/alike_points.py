@@ -1,0 +1,64 @@
+"""Noise that neighbouring frequencies of a sweep share, as in a drift: the errors of its numbers, which independent
+noise underestimates. A model that misses a part of the spectrum leaves such residuals too.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from fitting.fits.viscoelastic import EXACT, Fit
+from fitting.methods import host, uncertainty
+from fitting.methods.estimate import Estimate, errors_and_correlation, wider
+from fitting.methods.noise.alike_noise import along_rows
+from fitting.readers.frequency_sweep import Sweep
+
+#: Key in `Fit.details`: numbers of independent noise that would measure as much as the moduli.
+INDEPENDENT = "independent_moduli"
+#: Key in `Fit.details`: the standard errors of independent noise, by name.
+OF_INDEPENDENT = "errors_of_independent_noise"
+#: Start of the sentence on such noise.
+SHARED = "neighbouring frequencies share their noise"
+
+
+def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
+    """The fit with the errors of noise that neighbouring frequencies share, if its residuals show any.
+
+    Spectra, whose errors are those of a prior, and sweeps that repeat their frequencies are returned as they are.
+    """
+    r, J, n = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian), len(sweep.angular_frequency)
+    numbers = fit.parameters or fit.uncertainty
+    known = np.all(np.isfinite(numbers.standard_errors)) and fit.kind.effective is None and len(r) == 2 * n
+    if not known or len(np.unique(sweep.angular_frequency)) < n or np.max(fit.relative_errors(sweep)) < EXACT:
+        return fit
+    alike = along_rows([n, n], r, J, fit.uncertainty.noise, np.linalg.pinv(J))
+    if alike is None:
+        return fit
+    u, own = np.asarray(fit.solution.u), fit.parameters
+    modes = _not_below(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, alike.root)
+    if own is not None and fit.kind.values is not None:
+        own = _not_below(own, fit.kind.values, u, alike.root)
+    told = (
+        f"{SHARED}, or the model misses something: {2 * n} moduli measure as much as {alike.independent:.0f} of "
+        "independent noise; the standard errors are those of such noise"
+    )
+    details = fit.details | {INDEPENDENT: float(alike.independent)}
+    return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, told), details=details)
+
+
+def _not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
+    """The estimate with errors by noise at least as large as those of a square root (p, k) of the covariance of u. What
+    all points share is added as before.
+    """
+    shared = np.zeros((len(estimate.values), 0)) if estimate.shared is None else estimate.shared
+    noise = np.asarray(estimate.root)[:, : np.shape(estimate.root)[1] - shared.shape[1]]
+    before = np.linalg.norm(noise, axis=1)
+    size = np.linalg.norm(host.with_jacobian(natural_of, u)[1] @ root, axis=1)
+    factor = np.maximum(1.0, size / np.where(before > 0, before, np.inf))
+    noise = factor[:, None] * noise
+    errors, correlation = errors_and_correlation(noise)
+    errors = np.where(np.isfinite(estimate.standard_errors), errors, np.inf)  # chosen, or not determined
+    found = estimate._replace(root=noise, standard_errors=errors, correlation=correlation, shared=None)
+    for direction in shared.T:
+        found = wider(found, direction)
+    return found

@@ -1,0 +1,72 @@
+"""Noise that neighbouring frequencies of a sweep share: errors hold the truth; independent noise changes nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fitting.__main__ import main
+from fitting.fits import viscoelastic
+from fitting.fits.honesty import alike_points
+from fitting.fits.instrument import with_gap_error
+from fitting.methods import generalised_maxwell
+from fitting.methods.generalised_maxwell import Maxwell
+from fitting.readers.frequency_sweep import Sweep
+
+pytestmark = pytest.mark.quick_to_compile
+
+OMEGA = 2 * np.pi * np.geomspace(0.01, 30, 30)
+TRUTH = Maxwell(np.float64(1500.0), np.array([0.2, 0.45]), np.array([0.5, 0.03]))
+NUMBERS = np.array([1500, 0.2, 0.45, 0.5, 0.03])
+
+
+def drifting(seed: int, length: float) -> Sweep:
+    """3 % of noise whose correlation falls as exp(-rows / length), other draws for G' and G''."""
+    rows = np.arange(len(OMEGA))
+    C = np.exp(-np.abs(rows[:, None] - rows) / length) if length else np.eye(len(OMEGA))
+    noise = 0.03 * np.linalg.cholesky(C) @ np.random.default_rng(seed).standard_normal((len(OMEGA), 2))
+    storage, loss = generalised_maxwell.moduli(TRUTH, OMEGA)
+    return Sweep(OMEGA, storage * (1 + noise[:, 0]), loss * (1 + noise[:, 1]))
+
+
+def test_errors_of_a_drift_hold_the_truth():
+    """Of 40 sweeps; errors of independent noise hold the numbers in half of them."""
+    before, after = [], []
+    for seed in range(40):
+        s = drifting(seed, 5.0)
+        plain = viscoelastic.closed_form(s, 2)
+        for hits, fit in ((before, plain), (after, alike_points.with_alike_points(plain, s))):
+            u = fit.uncertainty
+            hits.append(np.abs(u.values - NUMBERS) < u.quantile * u.standard_errors)
+    assert np.mean(before) < 0.7 and np.mean(after) > 0.82
+    assert fit.warnings[-1].startswith(alike_points.SHARED) and fit.details[alike_points.INDEPENDENT] < 30
+
+
+def test_independent_noise_and_exact_data_change_nothing():
+    for seed in range(20):
+        s = drifting(seed, 0.0)
+        fit = viscoelastic.closed_form(s, 2)
+        assert alike_points.with_alike_points(fit, s) is fit
+    storage, loss = generalised_maxwell.moduli(TRUTH, OMEGA)
+    fit = viscoelastic.closed_form(Sweep(OMEGA, storage, loss), 2)
+    assert alike_points.with_alike_points(fit, Sweep(OMEGA, storage, loss)) is fit
+
+
+def test_the_error_of_the_gap_is_added_as_before():
+    s = drifting(1, 5.0)
+    plain = alike_points.with_alike_points(viscoelastic.closed_form(s, 2), s).uncertainty
+    wide = alike_points.with_alike_points(with_gap_error(viscoelastic.closed_form(s, 2), 0.1), s).uncertainty
+    G0 = plain.values[0]
+    assert wide.standard_errors[0] == pytest.approx(np.hypot(plain.standard_errors[0], 0.1 * G0), rel=1e-9)
+    np.testing.assert_allclose(wide.standard_errors[1:], plain.standard_errors[1:], rtol=1e-9)
+
+
+def test_a_posterior_says_that_it_takes_noise_as_independent(tmp_path):
+    s = drifting(3, 5.0)
+    head = "angular_frequency_rad_s,storage_modulus_Pa,loss_modulus_Pa"
+    np.savetxt(tmp_path / "s.csv", np.column_stack(s[:3]), delimiter=",", header=head, comments="")
+    words = [str(tmp_path / "s.csv"), "--method", "closed-form", "--modes", "2", "--samples", "100"]
+    main([*words, "--out", str(tmp_path)])
+    content = json.loads((tmp_path / "fit.json").read_text())
+    assert content["details"][alike_points.INDEPENDENT] < 40
+    assert any("takes the noise of all moduli as independent" in w for w in content["warnings"])
