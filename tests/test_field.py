@@ -474,7 +474,20 @@ def test_a_fit_that_misses_the_data_says_so():
     assert said is not None and "scatter 0.1 times as much as the stated noise" in said
     said = field_report.misfit_sentence(found._replace(chi2=240.0))
     assert said is not None and "chi2 stays at 4 per component" in said and "by 2 times their noise" in said
-    assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said]
+    assert field_report.of_numbers(found._replace(chi2=240.0))["warnings"] == [said] and "the mesh's error" not in said
+    said = field_report.misfit_sentence(found._replace(chi2=240.0, mesh_over_noise=3.0))
+    assert said is not None and "the mesh's error in the data is 3 times the noise: refine the mesh" in said
+    said = field_report.misfit_sentence(found._replace(chi2=240.0, standard_errors=np.array([np.inf])))
+    assert said is not None and said.startswith("no values of law.mu explain the displacements")
+
+
+def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
+    scene = _scene(tmp_path, mu=1000.0)
+    points = np.asarray(scene.mesh.points)
+    rows = np.column_stack([points, 1e3 * 1e-3 * points])  # the displacements alone in mm
+    np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
+    with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm is for x, y, z and ux"):
+        displacements.read_displacements(tmp_path / "u.csv", scene, 1e-5, "mm")
 
 
 @pytest.mark.slow

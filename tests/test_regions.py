@@ -140,6 +140,11 @@ def test_regions_of_a_scene_file(tmp_path):
     assert float(law.mu[1].min()) == 10.0 and float(law.mu[1].max()) == 300.0
 
 
+def test_a_border_that_goes_through_elements_is_told(tmp_path):
+    with pytest.warns(UserWarning, match=r"region.0: x_min = 0.013 goes through elements.* the region begins at 0.0"):
+        _load(tmp_path, "[[region]]\nwhere = {x_min = 0.013}\nlaw = {bulk = 6000.0}")
+
+
 @pytest.mark.slow
 def test_a_scene_file_with_a_region_runs(tmp_path):
     scene = _load(tmp_path, "[[region]]\nwhere = {x_min = 0.02}\nlaw = {mu = [1500.0, 900.0], bulk = 6000.0}")

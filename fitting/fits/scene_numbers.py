@@ -97,9 +97,11 @@ def fit(
     seconds = time.perf_counter() - begin
     estimate = estimated(names, natural_of, found, problem.components)
     estimate = _of_alike_noise(problem, natural_of, found, estimate)
-    left_out = missing_or_none(problem, values_of(found.u)) if mesh_error else None
+    known = np.all(np.isfinite(estimate.standard_errors))  # else the numbers ran away
+    left_out = missing_or_none(problem, values_of(found.u)) if mesh_error and known else None
     if left_out is not None:
-        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out))
+        size = float(np.sqrt(np.sum(left_out**2) / problem.components))
+        estimate = estimate._replace(mesh_bias=mesh_bias(found, natural_of, left_out), mesh_over_noise=size)
         for sentence in bias_sentences(estimate):
             warnings.warn(sentence, stacklevel=2)
     return estimate._replace(converged=converged, codes=ended, seconds=seconds), found

@@ -235,12 +235,16 @@ def through_torsion(
     fit = fit_at(sweep, at, kind, (running, compiling), details)
     if simulation.is_linear and kind.prior is None:
         fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
+    return _as_told_before(with_alike_points(fit, sweep), start)
+
+
+def _as_told_before(fit: Fit, start: Fit) -> Fit:
+    """The fit through the simulation with what the closed form `start` says of the data, and with its shared errors."""
     more = tuple(w for w in start.warnings if any(words in w for words in OF_THE_DATA))
     of_the_model = {k: v for k, v in start.details.items() if k in KEPT}
-    fit = with_alike_points(fit._replace(details=fit.details | of_the_model), sweep)
-    fit = _with_shared_errors(fit, start)
-    fit = fit._replace(warnings=tuple(w for w in fit.warnings if not w.startswith(SHARED)))  # as the closed form says
-    own = tuple(w for w in fit.warnings if not (w.startswith(MISSES) and any(m.startswith(MISSES) for m in more)))
+    fit = _with_shared_errors(fit._replace(details=fit.details | of_the_model), start)
+    known = any(w.startswith(MISSES) for w in more)
+    own = (w for w in fit.warnings if not w.startswith((SHARED, MISSES) if known else SHARED))
     return fit._replace(warnings=by_importance((*own, *more, *_bias(start, fit))))
 
 

@@ -87,6 +87,7 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         nodes, weights = _at_nodes(path, mesh, table["node"])
     else:
         places = scale * np.stack([table[c] for c in "xyz"], axis=1)
+        _refuse_other_places(path, places, size, unit)
         nodes, weights = _measured_at_points(path, mesh, places)
     _no_copies(path, table)
     return Displacements(
@@ -96,6 +97,19 @@ def read_displacements(path: str | Path, scene: Scene, noise: float | None = Non
         measured=np.where(seen, measured, 0.0),
         sd=np.where(seen, sd[:, None], np.inf),
     )
+
+
+#: So many points, within this part of the body's size, have places of another unit than the body.
+_SOME, _TOGETHER = 8, 0.01
+
+
+def _refuse_other_places(path: Path, places: np.ndarray, size: float, unit: str) -> None:
+    across = float(np.ptp(places, axis=0).max()) if np.all(np.isfinite(places)) else size
+    if len(np.unique(places, axis=0)) >= _SOME and across < _TOGETHER * size:
+        raise InputError(
+            f"{path}: all points lie within {across:.2g} m of each other, in a body of {size:.3g} m: --unit {unit} is "
+            "for x, y, z and ux, uy, uz alike; write both in one unit"
+        )
 
 
 def _no_copies(path: Path, table: dict[str, np.ndarray]) -> None:

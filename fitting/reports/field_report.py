@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 #: chi^2 per component above which there is a warning that the model misses something, and below which the noise counts
 #: as overstated: fifty components are below it by chance once in a million times.
 TOO_FAR, TOO_NEAR, FEW = 1.5, 0.4, 50
+#: Error of the mesh in the data, over their noise, that is named beside such a chi^2.
+MESH = 1.0
 
 
 def misfit_sentence(found: Estimate) -> str | None:
@@ -40,10 +42,24 @@ def misfit_sentence(found: Estimate) -> str | None:
         )
     if not ratio > TOO_FAR:
         return None
-    return (
+    if not np.any(np.isfinite(found.standard_errors)):
+        return (
+            f"no values of {', '.join(found.names)} explain the displacements (chi2 is {ratio:.3g} per component): the "
+            "fit ran away, and the values that are printed mean nothing; look at the unit (--unit), the sign and the "
+            "origin of the coordinates, node numbers (from 0), loads and supports"
+        )
+    said = (
         f"chi2 stays at {ratio:.3g} per component, so the fit misses the displacements by {np.sqrt(ratio):.2g} times "
-        "their noise: the numbers may be wrong by much more than their errors; look at the unit (--unit), the origin "
-        "of the coordinates, node numbers (from 0), rows of zeros, loads and supports, or give a larger --noise"
+        "their noise: the numbers may be wrong by much more than their errors"
+    )
+    if found.mesh_over_noise is not None and found.mesh_over_noise > MESH:
+        said += (
+            f"; the mesh's error in the data is {found.mesh_over_noise:.2g} times the noise: refine the mesh, or take "
+            "order = 2 (the bias of a region's border that goes through elements is not in the mesh bias)"
+        )
+    return (
+        f"{said}; look at the unit (--unit), the origin of the coordinates, node numbers (from 0), rows of zeros, "
+        "loads and supports, or give a larger --noise"
     )
 
 

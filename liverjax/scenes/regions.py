@@ -1,5 +1,6 @@
 """Parts of a body with other numbers in its law, viscosity or porosity, or with a law of another kind."""
 
+import warnings
 from collections.abc import Mapping
 
 import jax
@@ -50,7 +51,28 @@ def select_elements(mesh: TetMesh, where: dict[str, float] | None, set: str | No
     inside = np.flatnonzero(np.isin(np.asarray(mesh.tetrahedra), nodes).all(axis=1))
     if not len(inside):
         raise InputError(f"{name} = {where} holds nodes but no whole element: widen it")
+    _warn_of_cut_elements(mesh, inside, where or {}, name)
     return inside
+
+
+#: Distance of a bound from the elements of its region, over the region's width, that is told.
+_APART = 0.02
+
+
+def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
+    """Warn of each bound that goes through elements: they are left out whole, so the region is smaller than stated."""
+    every, own = np.asarray(mesh.points), np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)[elements]]
+    for key, bound in where.items():
+        axis, first = "xyz".index(key[0]), key.endswith("min")
+        x, whole = own[..., axis], every[:, axis]
+        ends = (max(bound, whole.min()), x.min()) if first else (x.max(), min(bound, whole.max()))
+        if ends[1] - ends[0] > _APART * np.ptp(x):
+            warnings.warn(
+                f"{name}: {key} = {bound:g} goes through elements, which are left out: the region "
+                f"{'begins' if first else 'ends'} at {ends[1] if first else ends[0]:.4g} m; put a layer of nodes there "
+                "(cells of the mesh), or use an element set",
+                stacklevel=3,
+            )
 
 
 def laws_of(law: Law, regions: tuple[Region, ...]) -> tuple[Law, ...]:
