@@ -24,7 +24,7 @@ def parser(prog: str) -> argparse.ArgumentParser:
     )
     command.add_argument("--terms", type=int, choices=(1, 2, 3, 4), help="terms of Ogden's law (default 1, 2 and 3)")
     command.add_argument("--model", type=Path, metavar="fit.json", help="Prony series of a frequency sweep")
-    command.add_argument("--plates", choices=("parallel", "cone"), default="parallel", help="plates (default parallel)")
+    command.add_argument("--plates", choices=("parallel", "cone"), help="plates (default parallel)")
     command.add_argument("--max-strain", type=float, metavar="X", help="leave out larger strains; 0.1 is 10 %%")
     command.add_argument("--table", metavar="NAME", help="which of several tables: a part of its name")
     command.add_argument(
@@ -47,11 +47,12 @@ def run(options: argparse.Namespace) -> int:
     candidates = hyperelastic.candidates(options.law, options.terms)
     sweep = read_strain_sweep(options.sweep, options.table, options.max_strain)
     memory = law_fit.Memory() if options.model is None else law_fit.memory_from(options.model)
-    for note in [*sweep.notes, *(n for candidate in candidates for n in candidate.notes)]:
+    plates = [] if options.plates else ["parallel plates are assumed: for a cone and a plate give --plates cone"]
+    for note in [*sweep.notes, *plates, *(n for candidate in candidates for n in candidate.notes)]:
         print(f"note: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
     bar = tqdm(candidates, unit=" laws", disable=None, leave=False)
-    fits = [law_fit.fit_law(candidate, sweep, memory, options.plates) for candidate in bar]
+    fits = [law_fit.fit_law(candidate, sweep, memory, options.plates or "parallel") for candidate in bar]
     fits.sort(key=lambda f: f.law.aicc)
     outside = law_fit.outside_series(memory, sweep.angular_frequency)
     content = amplitude_report.write(options.out, sweep, fits, [outside] if outside else [])

@@ -102,7 +102,8 @@ def indentation_warnings(
     if chance < 1e-3:
         told.append(
             f"structured misfit: residuals in contact change sign {runs - 1} times over {len(touching)} points (by "
-            f"chance: {chance:.1g}): another shape, layer or material, or noise that neighbours share"
+            f"chance: {chance:.1g}): another shape, layer or material, a material that relaxes meanwhile, or noise "
+            "that neighbours share"
         )
     if fit.independent is not None:
         told.append(
