@@ -208,6 +208,27 @@ def test_files_of_matlab_have_the_axes_that_matlab_shows(tmp_path, version):
     np.testing.assert_allclose(found.spacing, H)
 
 
+def test_units_in_the_headings_of_a_table_are_read(tmp_path):
+    field = plane_waves((5, 5, 5))
+    path = written(tmp_path, ".csv", field)
+    exact = wave_field.read_waves(path)
+    head, *rows = path.read_text().splitlines()
+    names = head.split(",")
+    values = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    for k, name in enumerate(names):
+        if name in "xyz":
+            names[k], values[:, k] = f"{name} [mm]", 1e3 * values[:, k]
+        elif name.startswith("u_"):
+            names[k], values[:, k] = f"{name}_um", 1e6 * values[:, k]
+    np.savetxt(path, values, delimiter=",", header=",".join(names), comments="", fmt="%.17g")
+    found = wave_field.read_waves(path)
+    np.testing.assert_allclose(found.displacement, exact.displacement, rtol=1e-12)
+    np.testing.assert_allclose(found.spacing, exact.spacing, rtol=1e-12)
+    path.write_text(path.read_text().replace("y [mm]", "y_m", 1))
+    with pytest.raises(InputError, match="the heading y_m has another unit than mm"):
+        wave_field.read_waves(path)
+
+
 def test_a_table_with_semicolons_and_decimal_commas_is_read(tmp_path):
     field = plane_waves((5, 5, 5))
     path = written(tmp_path, ".csv", field)

@@ -4,6 +4,7 @@ Names are displacement (complex; or real and imag, or phases: instants of a peri
 origin [m], mask, labels and unit.
 """
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,13 +154,38 @@ ALSO = {"frequency_hz": "frequency", "hertz": "frequency", "labels": "label", "r
 _KNOWN = (*COLUMNS, "frequency", "label", "mask")
 
 
+#: Units that the headings of places and displacements may end in.
+_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
+
+
+def _without_units(path: Path, head: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Headings without their units, and the unit of the places ("x") and of the displacements ("u") if they have one.
+
+    `x_mm`, `x [mm]` and `u_re_x (um)` are read.
+    """
+    plain: list[str] = []
+    units: dict[str, str] = {}
+    for name in head:
+        match = re.fullmatch(r"([xyz]|u_(?:re|im)_[xyz])[ _]*[\[(]?([a-zµμ]+)[\])]?", name)
+        if match is None or match[2] not in _LENGTHS:
+            plain.append(name)
+            continue
+        plain.append(match[1])
+        kind = match[1][0] if match[1][0] == "u" else "x"
+        if units.setdefault(kind, match[2]) != match[2]:
+            raise InputError(
+                f"{path}: the heading {name} has another unit than {units[kind]}: give all of them one unit"
+            )
+    return plain, units
+
+
 def _voxel_table(path: Path) -> Content:
     """x, y, z [m], real and imaginary parts, with or without frequency [Hz], label and mask, on a regular grid."""
     numbered = enumerate(text_of(path, "waves").splitlines(), 1)
     lines = [(k, line) for k, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     between = find_delimiter(lines[0][1]) if lines else ","
     head = [cell.lower() for cell in split_cells(lines[0][1], between)] if lines else []
-    head = [ALSO.get(name, name) for name in head]
+    head, units = _without_units(path, [ALSO.get(name, name) for name in head])
     twice = next((name for k, name in enumerate(head) if name in head[:k] and name in _KNOWN), None)
     if twice is not None:
         raise InputError(f"{path}: two columns mean {twice}: leave one of them")
@@ -173,7 +199,8 @@ def _voxel_table(path: Path) -> Content:
             raise InputError(f"{path}: row {number}: {line[:40]!r} has a cell that is no number: correct it")
         rows[k, : len(cells)] = cells
     column = dict(zip(head, rows.T, strict=True))
-    at, spacing, origin, shape = _grid(path, np.stack([column[a] for a in "xyz"], axis=1))
+    places = _LENGTHS[units.get("x", "m")] * np.stack([column[a] for a in "xyz"], axis=1)
+    at, spacing, origin, shape = _grid(path, places)
     hertz, of = (None, np.zeros(len(rows), int))
     if "frequency" in column:
         empty = np.flatnonzero(~np.isfinite(column["frequency"]))
@@ -187,7 +214,9 @@ def _voxel_table(path: Path) -> Content:
     U = np.full((1 if hertz is None else len(hertz), *shape, 3), np.nan + 0j)
     for c, axis in enumerate("xyz"):
         U[(of, *at.T, np.full(len(at), c))] = column[f"u_re_{axis}"] + 1j * column[f"u_im_{axis}"]
-    found = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
+    found: Content = {"displacement": U, "frequencies": hertz, "spacing": spacing, "origin": origin}
+    if "u" in units:
+        found["unit"] = units["u"].replace("µ", "u").replace("μ", "u")
     for name, key in (("label", "labels"), ("mask", "mask")):
         if name in column:
             values, own = np.zeros(shape), np.nan_to_num(column[name])
