@@ -131,6 +131,8 @@ def test_errors_of_the_instrument_that_are_not_found_are_not_called_zero(monkeyp
     s = sweep(5e-4, 0)._replace(friction=FRICTION, friction_error=2e-7)
     fit, same = corrected(s)
     assert same is s and "inertia and friction was not found together with the modes" in fit.warnings[-1]
+    known = instrument.InstrumentErrors(np.ones(1), np.eye(1), np.ones(1), np.ones(1), True)
+    assert known.steady.all() and not known._replace(found=False).steady.any()
 
 
 def test_the_command_fits_friction_and_refuses_it_without_a_size(tmp_path, capsys):

@@ -182,7 +182,7 @@ def test_a_box_spectrum_is_found_inside_the_box():
     assert 3 < found.decades <= 6 and found.effective < len(s.storage) / 2
 
 
-@pytest.mark.parametrize(("longest", "told"), [(1e4, True), (1.0, False)])
+@pytest.mark.parametrize(("longest", "told"), [(1e4, True), (30.0, False), (1.0, False)])
 def test_a_spectrum_says_that_more_may_relax_after_the_test(longest, told):
     """Relaxation goes on for four decades below the band, or ends two decades inside it."""
     fit = models.spectrum_fit(box_spectrum(np.geomspace(1e-2, 1e2, 31), 1e-3, longest, 0.01))

@@ -161,6 +161,24 @@ def test_a_wrong_unit_of_one_test_is_named(scale):
     assert not any("try another --model" in w for w in fit.warnings)
 
 
+def test_a_common_fit_with_too_few_modes_does_not_hide_the_factor():
+    """The sweep shows the fast mode, the relaxation ten times as stiff the slow one: one mode is all that both allow."""
+    both = Maxwell(np.float64(1000.0), np.array([0.3, 0.3]), np.array([20.0, 0.05]))
+    omega, time = 2 * np.pi * np.geomspace(0.1, 31.6, 20), np.append(0.0, np.geomspace(0.1, 316, 50))
+    draws = np.random.default_rng(50).standard_normal((2, 20))
+    storage, loss = (G * (1 + 0.01 * d) for G, d in zip(generalised_maxwell.moduli(both, omega), draws, strict=True))
+    G = 1000 * (1 - (both.ratios * (1 - np.exp(-time[:, None] / both.relaxation_times))).sum(axis=1))
+    noisy = 10 * G * (1 + 0.005 * np.random.default_rng(51).standard_normal(51))
+    slow = TimeTest("relaxation", time, np.ones(51), noisy, time > 0, source="relaxation.csv")
+    fit = springpots_in_time.choose_together([Sweep(omega, storage, loss, source="sweep.csv"), slow], "prony")
+    assert fit.modes == 1 and [s.misfit_alone for s in fit.shares] == [
+        pytest.approx(0.01, rel=0.4),
+        pytest.approx(0.005, rel=0.4),
+    ]
+    (told,) = [w for w in fit.warnings if "the tests agree if" in w]
+    assert "relaxation.csv are 10 ± " in told or "relaxation.csv are 9.9" in told
+
+
 def test_tests_that_differ_by_more_than_a_factor_are_only_told_apart():
     fit = springpots_in_time.choose_together(of_the_same_times(np.append(1.0, (TIME / 10) ** 0.1)), "prony", 2)
     assert any("do not agree" in w for w in fit.warnings)
