@@ -63,6 +63,7 @@ def test_an_empty_cell_takes_one_point_away_and_not_the_column(lines, tmp_path):
         without_inertia(s, RADIUS, HEIGHT) for s in (export(tmp_path / "e.txt", sample=False), read_sweep(path))
     )
     assert f"{len(lines)} of 20 points have an empty cell in the raw columns" in kept.notes[0]
+    assert "the raw torque shows" in kept.notes[0]  # not the phase alone
     assert np.allclose(kept.inertia, whole.inertia, rtol=1e-6) and len(kept.grey) == len(whole.grey)
 
 

@@ -162,7 +162,7 @@ def test_a_wrong_unit_of_one_test_is_named(scale):
 
 
 def test_a_common_fit_with_too_few_modes_does_not_hide_the_factor():
-    """The sweep shows the fast mode, the relaxation ten times as stiff the slow one: one mode is all that both allow."""
+    """The sweep shows the fast mode, the relaxation, ten times as stiff, the slow one: both together allow one mode."""
     both = Maxwell(np.float64(1000.0), np.array([0.3, 0.3]), np.array([20.0, 0.05]))
     omega, time = 2 * np.pi * np.geomspace(0.1, 31.6, 20), np.append(0.0, np.geomspace(0.1, 316, 50))
     draws = np.random.default_rng(50).standard_normal((2, 20))
