@@ -659,3 +659,25 @@ def test_laws_that_tie_are_named_with_their_moduli():
     (told,) = stress_stretch.tied_laws([best, other, far], "curves")
     assert told.startswith("b follow the curves as well as neo_hookean does") and "with G0 from 7" in told
     assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
+
+
+NOT_FINITE = """
+import liverjax as lj
+
+@lj.struct
+class Root(lj.Law):
+    mu: float = lj.param("Pa", typical=770.0)
+    bulk: float = lj.param("Pa", typical=7700.0)
+    volumetric: str = lj.static("quadratic")
+
+    def isochoric_energy(self, I1, I2):
+        return self.mu / 2 * (I1 - 3) + self.mu * (I1 - 3.001) ** 1.5
+"""
+
+
+def test_a_law_without_a_finite_stress_is_named(tmp_path, capsys):
+    (tmp_path / "root.py").write_text(NOT_FINITE)
+    rows = "\n".join(f"uniaxial,{l:.3f},{800 * (l - l**-2):.4f}" for l in np.linspace(0.9, 1.3, 9))
+    (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_Pa\n{rows}\n")
+    words = ["curves", f"{tmp_path}/root.py:Root", str(tmp_path / "c.csv"), "--out", str(tmp_path / "out")]
+    assert main(words) == 2 and "Root: the stress is not finite on these curves" in capsys.readouterr().err

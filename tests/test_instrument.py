@@ -126,6 +126,30 @@ def test_a_friction_above_the_loss_modulus_is_found(size):
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
 
 
+def test_exact_data_have_exact_errors_of_the_instrument():
+    storage, loss = generalised_maxwell.moduli(TRUTH, OMEGA)
+    for size in (0.0, 0.3):
+        s = Sweep(OMEGA, storage, loss + size * FRICTION, friction=FRICTION, friction_error=2e-7)
+        fit, _ = corrected(s)
+        found = fit.details["instrument"]
+        assert found["friction_off_by_N_m_s"] == pytest.approx(size * 2e-7, abs=1e-12)
+        assert not any("was not found" in w for w in fit.warnings)
+
+
+def test_a_misfit_is_told_after_a_correction_too():
+    """G'' weighs as much as it did; a corrected sweep is no sweep whose phase scatters."""
+    G = 300 + 100 * (1j * OMEGA) ** 0.4
+    s = Sweep(OMEGA, G.real, G.imag, friction=1e-3 * FRICTION, friction_error=1e-9)
+    fit, better = corrected(s)
+    plain = viscoelastic.closed_form(s._replace(friction=None), 2)
+    assert not better.sd_estimated and not better.noise_given
+    for f in (plain, fit):
+        assert any(w.startswith(viscoelastic.MISSES) for w in f.warnings) == any(
+            w.startswith(viscoelastic.MISSES) for w in plain.warnings
+        )
+    assert fit.uncertainty.noise == pytest.approx(plain.uncertainty.noise, rel=0.2)
+
+
 def test_errors_of_the_instrument_that_are_not_found_are_not_called_zero(monkeypatch):
     monkeypatch.setattr(instrument, "ROUNDS", 1)
     s = sweep(5e-4, 0)._replace(friction=FRICTION, friction_error=2e-7)

@@ -189,6 +189,14 @@ def test_a_spectrum_says_that_more_may_relax_after_the_test(longest, told):
     assert any("nothing tells how much of it relaxes later" in w for w in fit.warnings) == told
 
 
+@pytest.mark.parametrize("sd", [None, 0.01, 0.15])
+def test_relaxation_after_the_test_is_told_whatever_the_weights(sd):
+    s = box_spectrum(np.geomspace(1e-2, 1e2, 31), 1e-3, 1e4, 0.01)
+    if sd:
+        s = s._replace(storage_sd=sd * s.storage, loss_sd=sd * s.loss)
+    assert any("nothing tells how much of it relaxes later" in w for w in models.spectrum_fit(s).warnings)
+
+
 def test_no_start_of_scipy_is_below_the_spectrum():
     s = read_sweep(ROOT / "data" / GIVEN["lion's mane"])
     found = relaxation_spectrum.fit(s)

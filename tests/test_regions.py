@@ -1,5 +1,7 @@
 """Other numbers in parts of a body: every law, sets of elements from mesh files, scene files, bad regions."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import meshio
@@ -9,6 +11,7 @@ import pytest
 import liverjax as lj
 from liverjax.core.struct import replace
 from liverjax.scenes.by_element import law_of_elements
+from liverjax.scenes.regions import select_elements
 
 pytestmark = pytest.mark.quick_to_compile
 
@@ -143,6 +146,18 @@ def test_regions_of_a_scene_file(tmp_path):
 def test_a_border_that_goes_through_elements_is_told(tmp_path):
     with pytest.warns(UserWarning, match=r"region.0: x_min = 0.013 goes through elements.* the region begins at 0.0"):
         _load(tmp_path, "[[region]]\nwhere = {x_min = 0.013}\nlaw = {bulk = 6000.0}")
+
+
+def test_bounds_on_the_surface_or_outside_of_the_body_are_not_told():
+    """A round body ends before its bounding box does; a bound beside it cuts no element."""
+    mesh = lj.shapes.cylinder(0.01, 0.02, 0.005)
+    half = float(np.median(np.unique(np.asarray(mesh.points)[:, 2])))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for where in ({"z_min": half, "y_min": -1.0, "y_max": 1.0}, {"z_max": half, "x_min": -0.01, "x_max": 0.01}):
+            assert len(select_elements(mesh, where, None))
+    with pytest.warns(UserWarning, match="x_min = 0.001 goes through elements"):
+        select_elements(mesh, {"x_min": 0.001, "y_min": -1.0}, None)
 
 
 @pytest.mark.slow

@@ -24,6 +24,8 @@ from liverjax import laws
 
 #: Most rounds of fit and correction, and most halvings of a correction that would leave a modulus of 0 or less.
 ROUNDS, HALVINGS = 20, 30
+#: Step in standard deviations of the prior that is none: exact data have no error with which to compare.
+SETTLED = 1e-6
 
 
 class Nuisance(NamedTuple):
@@ -175,9 +177,8 @@ def _with_noise_as_measured(sweep: Sweep) -> Sweep:
     """
     if sweep.storage_sd is not None:
         return sweep
-    noise = sweep.point_scatter
-    storage_sd, loss_sd = (d * (noise if 0 < noise < 1 else 1.0) for d in sweep.deviations)
-    return sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd, sd_estimated=True)
+    storage_sd, loss_sd = sweep.deviations
+    return sweep._replace(storage_sd=storage_sd, loss_sd=loss_sd, sd_before=True)
 
 
 def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarray, Fit, bool]:
@@ -194,13 +195,13 @@ def _errors_of_instrument(fit: Fit, sweep: Sweep) -> tuple[np.ndarray, np.ndarra
         own = d - J @ np.linalg.lstsq(J, d, rcond=1e-12)[0]  # the part that the modes cannot fit
         precision = own.T @ own / noise**2 + np.eye(len(known))
         # The prior is on the whole error; the residuals show the part that is not corrected yet.
-        step = np.linalg.solve(precision, own.T @ r / noise**2 - values)
+        whole = np.linalg.solve(precision, own.T @ r / noise**2 - values)
         covariance = np.linalg.inv(precision)
-        step = _halved_until_positive(sweep, known, values, step)
+        step = _halved_until_positive(sweep, known, values, whole)
         values = values + step
         fit = _fitted_again(fit, _shifted(sweep, known, values))
-        if np.all(np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))):
-            return values, covariance, fit, bool(np.any(step))
+        if np.all(np.abs(whole) < np.maximum(1e-3 * np.sqrt(np.diag(covariance)), SETTLED)):
+            return values, covariance, fit, True
     return values, covariance, fit, False
 
 

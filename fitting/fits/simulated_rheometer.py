@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.fits import sample_inertia
-from fitting.fits.honesty.alike_points import OF_INDEPENDENT, SHARED, with_alike_points
+from fitting.fits.honesty.alike_points import INDEPENDENT, OF_INDEPENDENT, SHARED, with_alike_points
 from fitting.fits.honesty.long_times import INTERVAL
 from fitting.fits.viscoelastic import MISSES, OPTIMIZERS, SHORT, BestPoint, Fit, Kind, by_importance, fit_at, timed
 from fitting.methods import uncertainty
@@ -172,6 +172,7 @@ KEPT = (
     "models_compared",
     "band_sensitivity",
     "band_scatter",
+    INDEPENDENT,
     OF_INDEPENDENT,
     "consistency",
     "instrument",
@@ -235,7 +236,7 @@ def through_torsion(
     fit = fit_at(sweep, at, kind, (running, compiling), details)
     if simulation.is_linear and kind.prior is None:
         fit = fit._replace(uncertainty=_with_biases(fit, (law, data[2], scales), simulation))
-    return _as_told_before(with_alike_points(fit, sweep), start)
+    return _as_told_before(with_alike_points(fit, sweep) if INDEPENDENT in start.details else fit, start)
 
 
 def _as_told_before(fit: Fit, start: Fit) -> Fit:

@@ -174,6 +174,10 @@ def _log_splits(n: int, parts: np.ndarray | int) -> np.ndarray:
     return np.where(low <= top, log(n) - log(low + 1) - log(np.maximum(top - low, 0) + 1), -np.inf)
 
 
+#: What a sentence on structured residuals says of the errors.
+NOT_CONTAINED = "the standard errors do not contain it"
+
+
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
     """Runs test of the residuals of G' and of G'' in the order of the frequency: numbers, and a sentence."""
     numbers, told = {}, []
@@ -186,5 +190,5 @@ def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple
         return numbers, []
     return numbers, [
         f"structured misfit: the residuals {' and those '.join(told)}; the model misses something that is no noise, "
-        "and the standard errors do not contain it: use the total errors, or another --model"
+        f"and {NOT_CONTAINED}: use the total errors, or another --model"
     ]

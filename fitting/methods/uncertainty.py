@@ -222,7 +222,7 @@ def cautions(sweep: Sweep, u: Estimate, model: str = "prony") -> list[str]:
             f"the ratios add up to {ratios:.4g}: the equilibrium modulus {equilibrium:.3g} Pa cannot be distinguished "
             "from zero (a fluid); measure at lower frequencies"
         )
-    if sweep.storage_sd is not None and not (sweep.noise_given or sweep.sd_estimated):
+    if sweep.storage_sd is not None and not (sweep.noise_given or sweep.sd_estimated or sweep.sd_before):
         out.append(
             f"the deviations in the file ({100 * sweep.relative_deviation:.2g} %) are no noise: the points scatter by "
             f"{100 * sweep.point_scatter:.2g} % only. They are used as weights, and as the spread between samples: "

@@ -35,6 +35,7 @@ class Sweep(NamedTuple):
     friction_error: float = 0.0  # this deviation [N m s]
     grey: np.ndarray | None = None  # (k, 3) [rad/s, Pa, Pa] points left out that show the instrument
     sd_estimated: bool = False  # the deviations are weights, from the scatter of the points themselves
+    sd_before: bool = False  # they are weights: the size of the moduli before a part of the instrument was taken off
 
     @property
     def deviations(self) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +50,7 @@ class Sweep(NamedTuple):
     @property
     def noise_given(self) -> bool:
         """Whether deviations are given and are the noise of each point, not the spread between samples."""
-        if self.storage_sd is None or self.sd_estimated:
+        if self.storage_sd is None or self.sd_estimated or self.sd_before:
             return False
         return self.relative_deviation < LARGE or not self.point_scatter < self.relative_deviation / SHARED
 
@@ -304,7 +305,9 @@ def without_inertia(sweep: Sweep, radius: float | None = None, height: float | N
     times = found.modulus[k] / np.abs(G[k])
     empty = int(np.sum(~raw_torque.with_raw_columns(raw)))
     if empty:
-        shows += f" ({empty} of {len(G)} points have an empty cell in the raw columns: theirs is that of the others)"
+        shows += (
+            f" ({empty} of {len(G)} points have an empty cell in the raw columns: their inertia is that of the others)"
+        )
     note = f"the raw {shows}; at {omega[k] / (2 * np.pi):.3g} Hz it needs {times:.3g} times the torque of the sample"
     if not lost.any():
         return sweep._replace(notes=(*sweep.notes, note))

@@ -281,8 +281,8 @@ def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: fl
     """A note if the strain falls and rises again under a constant stress: the instrument's inertia rings."""
     from scipy.ndimage import median_filter
 
-    largest = float(np.max(np.abs(stress)))
-    held = (np.abs(stress) > (1 - HELD) * largest) & (time >= start)
+    largest = float(stress[np.argmax(np.abs(stress))])
+    held = (stress / largest > 1 - HELD) & (time >= start)
     first = int(np.argmax(held))
     length = int(np.argmin(np.append(held[first:], False)))
     t, v = time[first : first + length], np.abs(strain[first : first + length])

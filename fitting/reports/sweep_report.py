@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 #: Part of a standard error up to which closed form and simulation count as equal.
 AGREED = 0.1
 STEMS = ("ratios", "relaxation_times")
-MARK = "* moves by more than its error without the first or the last half decade"
+MARK = "* moves by more than independent noise explains without the first or the last half decade"
 
 
 def numbers(values: Any) -> Any:

@@ -237,8 +237,9 @@ def _cautions(organ: Organ, found: Found, drawn: WaveMap | None) -> list[str]:
     if drawn is not None and drawn.chi2 / drawn.components > 1 + ROUGH + BY_CHANCE * np.sqrt(2 / drawn.components):
         told.append(
             f"chi2 of the map is {drawn.chi2 / drawn.components:.3g} per equation: "
-            f"{'coarse voxels (mesh_bias), ' if any_coarse else ''}edges sharper than the map, a ratio "
-            "of the moduli at several frequencies that is not the same everywhere, or a body that does not move like a "
+            f"{'coarse voxels (mesh_bias), ' if any_coarse else ''}edges sharper than the map, "
+            "noise that is larger in a part of the organ, a ratio of the moduli at several frequencies that is not the "
+            "same everywhere, or a body that does not move like a "
             "viscous solid; its deviations are too small then, so compare it with regions and with one frequency alone"
         )
     return told
@@ -326,7 +327,8 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
         told.append(
             f"{hertz:g} Hz: chi2 = {ratio:.3g} per equation with uniform {uniform}: unless the data are smoothed"
             f"{' or the voxels coarse' if coarse else ''}, the "
-            "moduli may be wrong by more than their errors; look for voxels that were not measured, and at the labels"
+            "moduli may be wrong by more than their errors; look for voxels that were not measured or are noisier, and "
+            "at the labels"
         )
     elif ratio > TOO_FAR and not alike:
         told.append(

@@ -61,16 +61,23 @@ _APART = 0.02
 
 def _warn_of_cut_elements(mesh: TetMesh, elements: np.ndarray, where: dict[str, float], name: str) -> None:
     """Warn of each bound that goes through elements: they are left out whole, so the region is smaller than stated."""
-    every, own = np.asarray(mesh.points), np.asarray(mesh.points)[np.asarray(mesh.tetrahedra)[elements]]
+    points, tets = np.asarray(mesh.points), np.asarray(mesh.tetrahedra)
+    size = np.ptp(points, axis=0).max()
+    inside = {
+        key: (points[:, "xyz".index(key[0])] - bound) * (1 if key.endswith("min") else -1) >= -1e-9 * size
+        for key, bound in where.items()
+    }
     for key, bound in where.items():
-        axis, first = "xyz".index(key[0]), key.endswith("min")
-        x, whole = own[..., axis], every[:, axis]
-        ends = (max(bound, whole.min()), x.min()) if first else (x.max(), min(bound, whole.max()))
-        if ends[1] - ends[0] > _APART * np.ptp(x):
+        x, first = points[:, "xyz".index(key[0])], key.endswith("min")
+        beside = np.all([inside[other][tets].all(axis=1) for other in where if other != key] or [True], axis=0)
+        cut = beside & inside[key][tets].any(axis=1) & ~inside[key][tets].all(axis=1)
+        own = x[tets[elements]]
+        end = own.min() if first else own.max()
+        if np.any(cut) and abs(end - bound) > _APART * np.ptp(own):
             warnings.warn(
                 f"{name}: {key} = {bound:g} goes through elements, which are left out: the region "
-                f"{'begins' if first else 'ends'} at {ends[1] if first else ends[0]:.4g} m; put a layer of nodes there "
-                "(cells of the mesh), or use an element set",
+                f"{'begins' if first else 'ends'} at {end:.4g} m; put a layer of nodes there (cells of the mesh), or "
+                "use an element set",
                 stacklevel=3,
             )
 

@@ -256,6 +256,11 @@ def _law(value: object, where: str = "[law]") -> Law:
     for table in tables:
         if not isinstance(table, dict) or "name" not in table:
             raise InputError(where + ' needs name = "…": python -m liverjax laws lists them')
+        if ".py:" in str(table["name"]):
+            raise InputError(
+                f"{where} name = {table['name']!r}: a scene file takes the included laws only (python -m liverjax laws "
+                "lists them); put a law of your own into the scene in Python: dataclasses.replace(scene, law=…)"
+            )
         law = laws.create(table["name"], **{k: v for k, v in table.items() if k not in ("name", "continued_below")})
         made.append(laws.continued(law, table["continued_below"]) if "continued_below" in table else law)
     return made[0] if len(made) == 1 else laws.Sum(laws=tuple(made))

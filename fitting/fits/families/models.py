@@ -112,7 +112,7 @@ def spectrum_fit(sweep: Sweep, found: relaxation_spectrum.GridSpectrum | None = 
     fit = viscoelastic.fitted(sweep, solution, kind, 0.0, 0.0, {"spectrum": details})
     if solid:
         lowest = sweep.angular_frequency[0] * np.sqrt(10.0) ** np.arange(3)
-        noise = sweep.relative_deviation if sweep.noise_given else fit.uncertainty.noise
+        noise = fit.uncertainty.noise * float(np.median(sweep.deviations[0] / sweep.storage))
         told = limits.still_relaxing(moduli(u, lowest)[0], noise, float(np.max(found.times)))
         fit = fit._replace(warnings=(*fit.warnings, *told))
     return _finished(fit, made)

@@ -10,43 +10,54 @@ import numpy as np
 from fitting.fits.viscoelastic import EXACT, Fit
 from fitting.methods import host, uncertainty
 from fitting.methods.estimate import Estimate, errors_and_correlation, wider
-from fitting.methods.noise.alike_noise import along_rows
+from fitting.methods.noise.alike_noise import LOST, Alike, along_rows
 from fitting.readers.frequency_sweep import Sweep
 
 #: Key in `Fit.details`: numbers of independent noise that would measure as much as the moduli.
 INDEPENDENT = "independent_moduli"
 #: Key in `Fit.details`: the standard errors of independent noise, by name.
 OF_INDEPENDENT = "errors_of_independent_noise"
+#: What a sentence on structured residuals says of the errors then.
+CONTAINED = "the standard errors contain it as noise that neighbours share"
 #: Start of the sentence on such noise.
 SHARED = "neighbouring frequencies share their noise"
 
 
 def with_alike_points(fit: Fit, sweep: Sweep) -> Fit:
-    """The fit with the errors of noise that neighbouring frequencies share, if its residuals show any.
-
-    Spectra, whose errors are those of a prior, and sweeps that repeat their frequencies are returned as they are.
-    """
-    r, J, n = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian), len(sweep.angular_frequency)
-    numbers = fit.parameters or fit.uncertainty
-    known = np.all(np.isfinite(numbers.standard_errors)) and fit.kind.effective is None and len(r) == 2 * n
-    if not known or len(np.unique(sweep.angular_frequency)) < n or np.max(fit.relative_errors(sweep)) < EXACT:
-        return fit
-    alike = along_rows([n, n], r, J, fit.uncertainty.noise, np.linalg.pinv(J))
+    """The fit with the errors of noise that neighbouring frequencies share, if its residuals show any."""
+    repeated = len(np.unique(sweep.angular_frequency)) < len(sweep.angular_frequency)
+    alike = None if repeated else alike_of(fit)
     if alike is None:
         return fit
     u, own = np.asarray(fit.solution.u), fit.parameters
-    modes = _not_below(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, alike.root)
+    modes = not_below(fit.uncertainty, partial(uncertainty.parameter_vector, maxwell=fit.kind.maxwell), u, alike.root)
     if own is not None and fit.kind.values is not None:
-        own = _not_below(own, fit.kind.values, u, alike.root)
+        own = not_below(own, fit.kind.values, u, alike.root)
     told = (
-        f"{SHARED}, or the model misses something: {2 * n} moduli measure as much as {alike.independent:.0f} of "
-        "independent noise; the standard errors are those of such noise"
+        f"{SHARED}, or the model misses something: {2 * len(fit.storage)} moduli measure as much as "
+        f"{alike.independent:.0f} of independent noise; the standard errors are those of such noise"
     )
     details = fit.details | {INDEPENDENT: float(alike.independent)}
     return fit._replace(uncertainty=modes, parameters=own, warnings=(*fit.warnings, told), details=details)
 
 
-def _not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
+def alike_of(fit: Fit) -> Alike | None:
+    """The noise that neighbouring frequencies, all different, share; None if the residuals show none.
+
+    Spectra, whose errors are those of a prior, and exact data are not looked at.
+    """
+    r, J, n = np.asarray(fit.solution.residuals), np.asarray(fit.solution.jacobian), len(fit.storage)
+    numbers = fit.parameters or fit.uncertainty
+    known = np.any(np.isfinite(numbers.standard_errors)) and fit.kind.effective is None and len(r) == 2 * n
+    if not known or np.sqrt(np.mean(r**2)) < EXACT * max(1.0, fit.uncertainty.noise):
+        return None
+    size = np.linalg.norm(J, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    inverse = np.linalg.pinv(J / size, rcond=LOST) / size[:, None]
+    return along_rows([n, n], r, J, fit.uncertainty.noise, inverse)
+
+
+def not_below(estimate: Estimate, natural_of: Callable, u: np.ndarray, root: np.ndarray) -> Estimate:
     """The estimate with errors by noise at least as large as those of a square root (p, k) of the covariance of u. What
     all points share is added as before.
     """

@@ -57,7 +57,9 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         r, J = zip(*rows, strict=True)
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
-    for modes in range(fit.modes, fit.modes + 1 + together.MORE):  # a common fit of such tests may have too few
+    # A common fit of tests that contradict each other may have too few modes.
+    more = together.MORE if together.disagreements(fit.shares) else 0
+    for modes in range(fit.modes, fit.modes + 1 + more):
         starts = _starts_at_the_others(fit, k, modes)
         if modes == fit.modes:
             starts = np.concatenate([np.append(np.asarray(fit.solution.u), 0.0)[None], starts])

@@ -6,7 +6,7 @@ import numpy as np
 
 from fitting.fits import viscoelastic
 from fitting.fits.honesty import chance_of_ends
-from fitting.fits.honesty.alike_points import OF_INDEPENDENT, SHARED, with_alike_points
+from fitting.fits.honesty.alike_points import CONTAINED, INDEPENDENT, OF_INDEPENDENT, SHARED, with_alike_points
 from fitting.fits.honesty.long_times import with_interval
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.viscoelastic import FLUID, MISSES, Fit
@@ -42,8 +42,9 @@ def honest(fit: Fit, sweep: Sweep, dense: Spectrum) -> Fit:
         )
         details["residuals"] = runs
         told += structured
-        if structured:  # one sentence on one thing
+        if structured and INDEPENDENT in details:  # one sentence on one thing
             warnings = [w for w in warnings if not w.startswith(SHARED)]
+            told = [w.replace(kramers_kronig.NOT_CONTAINED, CONTAINED) for w in told]
     if found.far and any(w.startswith(MISSES) for w in warnings):
         told = [w for w in told if KRAMERS_KRONIG not in w]
         warnings = [w for w in warnings if not w.startswith(MISSES)] + [_nearest(fit, sweep, found.misfit)]
@@ -182,8 +183,8 @@ def _moved_most(fit: Fit) -> list[str]:
     if not told:
         return []
     return [
-        f"{'; '.join(told)}: more than their standard errors and more than noise explains, so the ends of the band "
-        "decide them: take the total errors, or measure a wider band"
+        f"{'; '.join(told)}: more than independent noise explains, so the ends of the band decide them: take the total "
+        "errors, or measure a wider band"
     ]
 
 
@@ -194,4 +195,8 @@ _RUNS_AWAY = 10.0
 def _relative_change(change: float, value: float) -> str:
     if not value:
         return f"{change:+.2g}"
-    return f"{100 * change / value:+.2g} %" if abs(change) < _RUNS_AWAY * abs(value) else "more than tenfold"
+    return (
+        f"{100 * change / value:+.{2 if abs(change) < 0.995 * abs(value) else 3}g} %"
+        if abs(change) < _RUNS_AWAY * abs(value)
+        else "more than tenfold"
+    )

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.special
 
 from fitting.fits import time_tests, together
+from fitting.fits.honesty import alike_points
 from fitting.fits.time_tests import TimeFit
 from fitting.fits.together import Measured, Together
 from fitting.fits.viscoelastic import SHORT, Fit, Kind
@@ -173,7 +174,8 @@ def with_interval(fit: AFit, tests: Sequence[Measured], noises: Sequence[float],
     error = equilibrium_error(fit.uncertainty)
     details: Content = fit.details or {}
     points = sum(len(together.reported_numbers(test)[1]) for test in tests)
-    independent = details.get(time_tests.INDEPENDENT, points) / points
+    known = (details[key] for key in (time_tests.INDEPENDENT, alike_points.INDEPENDENT) if key in details)
+    independent = float(next(known, points)) / points
     found = equilibrium_interval(tests, noises, model, error / factor, independent)
     if found is None:
         return fit

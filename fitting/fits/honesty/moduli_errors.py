@@ -7,6 +7,7 @@ and Tsai 1989, Biometrika 76, 297).
 
 import numpy as np
 
+from fitting.fits.honesty import alike_points
 from fitting.fits.viscoelastic import Fit, mean_square, number_of_parameters
 from fitting.methods import generalised_maxwell, host
 from fitting.methods.estimate import Estimate, errors_and_correlation, estimated, wider
@@ -83,4 +84,8 @@ def _of_one_model(fit: Fit, omega: np.ndarray, noise_given: bool) -> Estimate:
         return arrays_of(u).concatenate(halves, axis=-1)
 
     names = [f"{part} at {at:.3g} rad/s" for part in ("storage", "loss") for at in omega]
-    return estimated(names, of, fit.solution, 2 * len(fit.storage), noise_given, fit.kind.effective)
+    found = estimated(names, of, fit.solution, 2 * len(fit.storage), noise_given, fit.kind.effective)
+    if alike_points.INDEPENDENT not in fit.details:
+        return found
+    alike = alike_points.alike_of(fit)
+    return found if alike is None else alike_points.not_below(found, of, np.asarray(fit.solution.u), alike.root)

@@ -31,9 +31,9 @@ def error_shares(fit: Fit | TimeFit) -> dict[str, dict[str, float]]:
     """Errors by their source, then by the names of `edges.values`.
 
     The share of the band's ends is the larger of the two changes, if noise does not explain it (`edges.decided_by`);
-    the square of what noise causes is subtracted from its square, and it is at most as
-    large as the number. The share of long times is that of the farther end
-    of `long_times.equilibrium_interval`, as a standard deviation. That of short times is what `short_times` says.
+    the square of what noise causes is subtracted from its square, and it is at most as large as the number. The share
+    of long times is that of the farther end of `long_times.equilibrium_interval`, as a standard deviation. That of
+    short times is what `short_times` says.
     """
     known = edges.values(fit)
     noise = {name: error for name, (_, error) in known.items()}

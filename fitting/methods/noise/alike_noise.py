@@ -33,6 +33,8 @@ LEAST = 0.2
 OUTLIER = 5.0
 #: Part of an unknown's derivatives that the chosen groups must have.
 SHOWN = 1e-9
+#: Singular value of the scaled derivatives, over the largest, of a direction that is lost.
+LOST = 1e-6
 #: Rows of C that are made at a time.
 ROWS = 500
 
@@ -80,20 +82,31 @@ def _alike_noise(
     shown = np.linalg.norm(J[np.concatenate(chosen)], axis=0) > SHOWN * np.linalg.norm(J, axis=0)
     if sum(map(len, chosen)) <= shown.sum():
         return None
+    basis = _determined(J[np.ix_(np.concatenate(chosen), shown)])
     limit = OUTLIER * 1.4826 * float(np.median(np.abs(r)))
     clipped = np.clip(r, -limit, limit) if limit > 0 else r
-    data = [(clipped[own], J[np.ix_(own, shown)]) for own in chosen]
+    data = [(clipped[own], J[np.ix_(own, shown)] @ basis) for own in chosen]
     alone, _ = _probability_at(data, far, "3/2", 1.0, 0.0)
     choices = itertools.product(ORDERS, lengths, PARTS)
     tried = [(*_probability_at(data, far, order, l, a), order, l, a) for order, l, a in choices]
     best, level, order, length, part = max(tried)
     # Not larger: nor is it if both are -inf. The level says less: it is small for noise smoother than the function.
-    if not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
+    if not np.isfinite(alone) or not best > alone + GAIN or np.sqrt(np.mean(r**2)) < LEAST:
         return None
     parts = [_of_unknowns(places[own], (order, length, part), inverse[:, own]) for own in groups]
     values, vectors = np.linalg.eigh(sum(middle for middle, _ in parts))
     root = max(1.0, level) * vectors * np.sqrt(np.maximum(values, 0.0))
     return Alike(float(length), part, max(1.0, level), root, best - alone, sum(count for _, count in parts))
+
+
+def _determined(J: np.ndarray) -> np.ndarray:
+    """Directions (p, k) of the unknowns that the derivatives J (n, p) determine. A number at its bound loses one, and a
+    determinant of roundoff would decide then.
+    """
+    size = np.linalg.norm(J, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    _, values, directions = np.linalg.svd(J / size, full_matrices=False)
+    return directions[values > LOST * values[0]].T / size[:, None]
 
 
 def along_rows(counts: list[int], r: np.ndarray, J: np.ndarray, deviation: float, inverse: np.ndarray) -> Alike | None:
