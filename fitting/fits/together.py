@@ -378,23 +378,28 @@ def _residuals_alone(fit: Together, k: int) -> np.ndarray:
     # Infinite deviations exclude a test.
     data = [(at, y, scales if j == k else np.full(len(y), np.inf)) for j, (at, y, scales) in enumerate(parts)]
     evaluate = partial(tests_evaluated, list(map(name_of, fit.tests)), fit.kind)
-    count = len(parts[k][1])
+    count, u = len(parts[k][1]), np.asarray(fit.solution.u)[None]
     every, own = (ResolvedBand(resolved_by(tests)) for tests in (fit.tests, [fit.tests[k]]))
-    best, lowest = np.empty(0), np.inf
+    starts = np.concatenate([u, starts_of_all(fit.tests, every, fit.modes, fit.kind)[1:]])
+    best = np.asarray(from_starts(evaluate, starts, data).residuals)
+    free, share = starts.shape[1], fit.shares[k]
+    noise = _size_of_noise(best, count - min(free, count / 2))
+    if share.noise <= APART * noise and share.misfit < MISSED:
+        return best
+    lowest = _criterion_alone(best, count, free)
     for modes in range(fit.modes, fit.modes + MORE + 1):
         # Moduli far from the others' are far from the starts of all tests.
-        starts = [starts_of_all(fit.tests, every, modes, fit.kind), starts_of_all([fit.tests[k]], own, modes, fit.kind)]
-        if modes == fit.modes:
-            starts.append(np.asarray(fit.solution.u)[None])
-        r, free = np.asarray(from_starts(evaluate, np.concatenate(starts), data).residuals), starts[0].shape[1]
-        if len(best) and free > count / 2:
-            break
-        noise = max(_size_of_noise(r, count), QUIETEST)
-        criterion = 2 * count * np.log(noise) + free * np.log(count)
-        if not criterion < lowest - CLEARLY * (len(best) > 0):
-            break
-        best, lowest = r, criterion
+        starts = starts_of_all([fit.tests[k]], own, modes, fit.kind)
+        r, free = np.asarray(from_starts(evaluate, starts, data).residuals), starts.shape[1]
+        criterion = _criterion_alone(r, count, free)
+        if free <= count / 2 and criterion < lowest - CLEARLY:
+            best, lowest = r, criterion
     return best
+
+
+def _criterion_alone(r: np.ndarray, count: int, free: int) -> float:
+    """Bayesian information criterion of a fit with `free` numbers to the `count` numbers of one test."""
+    return float(2 * count * np.log(max(_size_of_noise(r, count), QUIETEST)) + free * np.log(count))
 
 
 def shares_by_rows(

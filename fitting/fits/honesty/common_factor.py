@@ -57,14 +57,15 @@ def factor_of(fit: Together, k: int) -> tuple[float, float, float] | None:
         r, J = zip(*rows, strict=True)
         return np.concatenate(r, axis=-1), np.concatenate(J, axis=-2)
 
+    counts, common = [len(y) for _, y, _ in data], np.append(np.asarray(fit.solution.u), 0.0)[None]
+    if fit.kind.values is not None:  # a springpot: starts of modes are none of its own
+        return _certain(from_starts(evaluate, common), counts)
     # A common fit of tests that contradict each other may have too few modes.
-    more = together.MORE if together.disagreements(fit.shares) else 0
+    more, answer = together.MORE if together.disagreements(fit.shares) else 0, None
     for modes in range(fit.modes, fit.modes + 1 + more):
         starts = _starts_at_the_others(fit, k, modes)
-        if modes == fit.modes:
-            starts = np.concatenate([np.append(np.asarray(fit.solution.u), 0.0)[None], starts])
-        found = from_starts(evaluate, starts)
-        answer = _certain(found, [len(y) for _, y, _ in data])
+        starts = np.concatenate([common, starts]) if modes == fit.modes else starts
+        answer = _certain(from_starts(evaluate, starts), counts)
         if answer is not None:
             break
     return answer
