@@ -167,7 +167,7 @@ def outliers(found: Samples) -> list[str]:
             for chance, name, ratio, mean in own
         )
         what = "its units and sizes"
-        if not any(name.split("[")[0] in _MODULI for _, name, _, _ in own):
+        if not any(name.endswith(("modulus", "springpot")) for _, name, _, _ in own):  # no number has a unit of stress
             what = "its temperature, the unit of its frequency, and the sample"
         source = Path(found.sweeps[sample].source).name
         out.append(f"{source}: {which}: check {what}; it widens the population's intervals")
@@ -176,10 +176,6 @@ def outliers(found: Samples) -> list[str]:
     name = next((n for n in ("shear_modulus", *found.populations) if n in found.populations), "")
     known, logs, _ = _known_logarithms(found, name)
     return _of_another_unit(logs, [Path(found.sweeps[k].source).name for k in known], name)
-
-
-#: Numbers that are moduli.
-_MODULI = ("shear_modulus", "equilibrium_modulus", "relaxing_modulus", "modulus", "viscosity")
 
 
 def _known_logarithms(found: Samples, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

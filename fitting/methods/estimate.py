@@ -31,9 +31,9 @@ class Estimate(NamedTuple):
     codes: tuple[int, ...] = ()  # worst code of each simulation
     seconds: float = 0.0
     mesh_bias: np.ndarray | None = None  # (P,) part of the values that the simulation's mesh causes; None: not known
-    mesh_over_noise: float | None = None  # root mean square of the mesh's error in the data, over their noise
     time_step_bias: np.ndarray | None = None  # (P,) part of the values that its time steps cause
     shared: np.ndarray | None = None  # (P, s) columns of `root` from errors common to all points: gap, instrument
+    mesh_over_noise: float | None = None  # root mean square of the mesh's error in the data, over their noise
 
     @property
     def covariance(self) -> np.ndarray:

@@ -282,7 +282,7 @@ def _ringing(time: np.ndarray, stress: np.ndarray, strain: np.ndarray, start: fl
     from scipy.ndimage import median_filter
 
     largest = float(stress[np.argmax(np.abs(stress))])
-    held = (stress / largest > 1 - HELD) & (time >= start)
+    held = (stress * np.sign(largest) > (1 - HELD) * abs(largest)) & (time >= start)
     first = int(np.argmax(held))
     length = int(np.argmin(np.append(held[first:], False)))
     t, v = time[first : first + length], np.abs(strain[first : first + length])

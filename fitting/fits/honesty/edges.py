@@ -195,8 +195,7 @@ _RUNS_AWAY = 10.0
 def _relative_change(change: float, value: float) -> str:
     if not value:
         return f"{change:+.2g}"
-    return (
-        f"{100 * change / value:+.{2 if abs(change) < 0.995 * abs(value) else 3}g} %"
-        if abs(change) < _RUNS_AWAY * abs(value)
-        else "more than tenfold"
-    )
+    part = change / value
+    if abs(part) >= _RUNS_AWAY:
+        return "more than tenfold"
+    return f"{100 * part:+.2g} %" if abs(part) < 0.995 else f"{100 * part:+.3g} %"  # not 1e+02 %
