@@ -170,6 +170,40 @@ def test_a_sphere_between_the_points_of_contact_is_told(cells, told):
     assert any("in the body between the points at which contact is tested" in sentence for sentence in said) == told
 
 
+@pytest.mark.parametrize(
+    ("shape", "start", "way", "told"),
+    [
+        (
+            "sphere",
+            [0.05, 0.05, 0.125],
+            -0.075,
+            "obstacle.0 has its centre in the body in step 1, in which it moves 0.075",
+        ),
+        ("sphere", [0.05, 0.05, 0.125], -0.15, "obstacle.0 went through the body in step 1"),
+        ("cylinder", [0.05, 0.05, 0.125], -0.075, "obstacle.0 has its centre in the body"),
+        ("cylinder", [0.3, 0.05, 0.125], -0.15, "obstacle.0 went through the body"),
+        ("sphere", [0.05, 0.05, 0.125], -0.006, None),
+        ("sphere", [0.15, 0.05, 0.125], -0.15, None),
+        ("cylinder", [0.05, 0.15, 0.125], -0.15, None),
+    ],
+)
+def test_an_obstacle_that_passes_the_surface_within_a_step_is_told(shape, start, way, told):
+    """A sphere of 20 mm in a cube of 100 mm touches nothing: the force was 0 N, and nothing was said."""
+    mesh = lj.shapes.box((0.1, 0.1, 0.1), (8, 8, 8))
+    obstacle = lj.Obstacle(
+        triangles=lj.boundary.boundary_triangles(mesh),
+        shape=shape,
+        radius=0.02,
+        position=np.array(start),
+        axis=np.array([1.0, 0.0, 0.0]) if shape == "cylinder" else np.array([0.0, 0.0, 1.0]),
+        by=np.array([0.0, 0.0, way]),
+    )
+    said = cautions_of_run(replace(scene(mesh), physics=(obstacle,)), run(mesh, [np.eye(3)], [1.0]))
+    assert [sentence for sentence in said if "it passed the surface between two steps" in sentence] == said
+    assert len(said) == (told is not None)
+    assert told is None or said[0].startswith(told)
+
+
 def test_a_lagged_pressure_that_goes_up_and_down_is_told():
     sponge = lj.Porosity(bulk=400.0, limit_bulk=2200.0, fluid_fraction=0.5, permeability=2e-5, scheme="lagged")
     still = replace(scene(BOX, dt=0.1, steps=6), porosity=sponge)

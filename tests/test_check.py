@@ -74,6 +74,15 @@ MISTAKES = {
         """,
         "energy is that of its parts",
     ),
+    "a jump": (
+        """
+        isochoric_derivatives = None
+
+        def isochoric_energy(self, I1, I2):
+            return self.mu / 2 * (I1 - 3) * jnp.where(I1 > 3.2, 2.0, 1.0)
+        """,
+        "the energy jumps",
+    ),
     "not objective": (
         """
         def energy(self, F):
@@ -118,7 +127,7 @@ MISTAKES = {
 
 
 #: One of a wrong derivative, of a wrong value, and of a state that no derivative has. The others run with -m slow.
-FIRST = ("wrong sign", "wrong beyond moderate stretches", "wrong modulus stated", "NaN at rest", "not objective")
+FIRST = ("wrong sign", "wrong beyond moderate stretches", "wrong modulus stated", "NaN at rest", "a jump")
 
 
 @pytest.mark.parametrize("mistake", [m if m in FIRST else pytest.param(m, marks=pytest.mark.slow) for m in MISTAKES])

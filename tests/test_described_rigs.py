@@ -228,6 +228,7 @@ def test_the_commands_take_a_description(tmp_path):
         ({"radius": "wide"}, "radius = 'wide' is not a number"),
         ({"radius": 10.0}, "radius = 10 cannot be that of a sample"),
         ({"radius": 0.001, "height": 0.02}, "height = 0.02 m is 20 radii, and glued samples are computed up to 10"),
+        ({"radius": 0.001, "height": 0.02, "poisson": 0.4}, r"the tensile stress over 2.8 \(2 times 1 \+ poisson\)"),
         ({"radus": 0.01}, "did you mean radius"),
         ({"poisson": 0.5}, "must be from 0 to 0.4995"),
         ({"drive": "torque"}, "use displacement or force"),

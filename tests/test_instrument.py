@@ -57,6 +57,8 @@ def test_what_is_corrected_comes_nearer_and_has_an_honest_error():
 
 def test_a_prior_holds_what_the_data_do_not_say():
     s = sweep(0.0, 1)._replace(inertia=1e-9 * SHARE)
+    (told,) = [note for note in corrected(s)[1].notes if "inertia" in note]  # it said "corrected for it"
+    assert told.startswith("the data do not tell the instrument's inertia: its standard error stays 3")
     found = corrected(s)[0].details["instrument"]
     assert found["standard_error"] == pytest.approx(0.03, rel=1e-6) and abs(found["inertia_off_by"]) < 1e-4
 

@@ -15,7 +15,7 @@ import pytest
 import liverjax as lj
 from liverjax.__main__ import main
 from liverjax.core import program_cache
-from liverjax.jobs import output, resumable_parts
+from liverjax.jobs import long_run, output, resumable_parts
 from liverjax.scenes import scene_file
 from liverjax.simulation.run import Result
 from liverjax.solvers.problem import StepStatistics
@@ -169,6 +169,17 @@ def test_parts_of_another_scene_are_refused(scene, tmp_path, monkeypatch, capsys
     assert "of another run (not the same numbers)" in capsys.readouterr().err
     assert main(["simulate", str(scene), "--every", "0"]) == 2
     assert "--every 0 must be above 0" in capsys.readouterr().err
+
+
+def test_the_result_of_another_scene_is_not_replaced_by_resume(scene, tmp_path, capsys):
+    """It was computed anew and replaced, without a word."""
+    out = tmp_path / "result.h5"
+    with h5py.File(out, "w") as file:
+        file.attrs["scene"] = SCENE.replace("770.0", "700.0")
+    assert main(["simulate", str(scene), "--resume", "--out", str(tmp_path)]) == 2
+    assert "result.h5 is the result of another scene: name another --out, or leave --resume" in capsys.readouterr().err
+    long_run.refuse_unfinished(out, resume=False, text=SCENE)
+    long_run.refuse_unfinished(out, resume=True, text=SCENE.replace("770.0", "700.0"))
 
 
 @pytest.mark.parametrize("steps", [5, 8125, 8126, 40_000])

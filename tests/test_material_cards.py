@@ -86,12 +86,20 @@ def test_cards_read_back_are_the_model(model, tmp_path):
     assert any("fluid" in t for t in told) == (model is FLUID)
 
 
+@pytest.mark.parametrize("card", ["febio", "abaqus", "ansys", "sofa"])
+def test_cards_say_which_times_they_hold(card):
+    """The modes of a springpot follow it over the measured band; a card alone does not show that."""
+    text = getattr(material_cards, card)(SOLID)
+    assert "Modes of 0.03 to 0.27 s: faster and slower relaxation is not in this card." in text
+
+
 def test_the_card_of_sofa_is_the_equilibrium(tmp_path):
     field = ET.fromstring("<s>" + material_cards.sofa(SOLID) + "</s>")[0]
     mu, lame = (float(v) for v in field.get("ParameterSet").split())
     # Its energy has lambda/2 (ln J)^2: nu = lambda / (2 (lambda + mu)).
     assert lame / (2 * (lame + mu)) == pytest.approx(material_cards.POISSON, abs=1e-9)
     assert mu == pytest.approx(770 * (1 - 0.568)) and field.get("materialName") == "NeoHookean"
+    assert "of these modes" in material_cards.sofa(SOLID)
     numbers = re.search(r"each mode: (.*) -->", material_cards.sofa(SOLID))[1]
     assert numbers == "0.235 0.27; 0.333 0.03"
 

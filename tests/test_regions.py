@@ -166,6 +166,15 @@ def test_a_scene_file_with_a_region_runs(tmp_path):
     assert np.isfinite(np.asarray(lj.simulate(scene).check().positions)).all()
 
 
+def test_regions_that_lie_over_each_other_may_add_to_each_other(tmp_path):
+    """Only what later regions replace everywhere changes nothing."""
+    half, more = "[[region]]\nwhere = {x_min = 0.02}\n", "[[region]]\nwhere = {x_min = 0.0}\n"
+    for first, second in ((half, half), (more, half), (half, more)):
+        law = "law = {mu = [1500.0, 900.0]}\n" if first is not more else "law = {bulk = 6000.0}\n"
+        scene = _load(tmp_path, f"{first}{law}{second}law = {{bulk = 5000.0}}\n")
+        assert len(scene.region) == 2
+
+
 @pytest.mark.parametrize(
     ("region", "words"),
     [
@@ -179,6 +188,7 @@ def test_a_scene_file_with_a_region_runs(tmp_path):
         ("[[region]]\nwhere = {x_min = 0.039}\nlaw = {bulk = 1.0}", "no whole element"),
         ("[[region]]\nwhere = {x_min = 0.1}\nlaw = {bulk = 1.0}", "meets no node"),
         ("[[region]]\nwhere = 3\nlaw = {bulk = 1.0}", "must be a table"),
+        (2 * "[[region]]\nwhere = {x_min = 0.02}\nlaw = {bulk = 1.0}\n", "region.0 changes nothing: later regions"),
         ("[[region]]\nplace = {x_min = 0.02}\nlaw = {bulk = 1.0}", "unknown key 'place'"),
     ],
 )

@@ -1,5 +1,7 @@
 """Supports: springs against what they must balance, sliding planes against the same body turned."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +45,20 @@ def pulled(mesh: lj.TetMesh, value, **more) -> lj.Scene:
     triangles = jnp.asarray(lj.boundary.boundary_triangles(mesh, part(mesh, z_min=SIDE)))
     traction = (lj.Traction(triangles=triangles, value=jnp.array(value)),)
     return lj.Scene(mesh=mesh, law=LAW, traction=traction, **more)
+
+
+def test_a_physics_that_needs_the_time_step_says_so():
+    """A physics of one's own ended in a TypeError where a scene has no dt."""
+
+    @lj.struct
+    class Damper(ElasticSupport):
+        """In name only."""
+
+        in_time: ClassVar[bool] = True
+
+    damper = Damper(triangles=jnp.zeros((0, 3), jnp.int32), normal=1.0, tangential=1.0)
+    with pytest.raises(InputError, match=r"\[solve\] has no dt, which \w+.0 needs"):
+        lj.simulate(pulled(box(), [0.0, 0.0, 30.0], physics=(damper,)))
 
 
 @pytest.mark.slow

@@ -43,6 +43,8 @@ def test_headings_of_other_programs_are_read(header, tmp_path):
         ("time_s,D(t) [1/Pa]", "compliance", 3.0),
         ("time_s,tensile creep compliance (1/kPa)", "compliance", 3e-3),
         ("time_s,tensile stress [kPa],tensile strain [%]", "stress", 1e3 / 3),
+        ("time_s,compressive stress [kPa],compressive strain [%]", "stress", 1e3 / 3),
+        ("time_s,nominal stress [kPa],engineering strain [%]", "stress", 1e3 / 3),
         ("time_s,E(t) [Pa],G(t) [kPa]", "modulus", None),
     ],
 )
@@ -130,3 +132,21 @@ def test_errors_of_a_test_in_time_contain_the_size_of_the_sample(sizes, tmp_path
     for name in ("shear_modulus", "equilibrium_modulus"):
         assert total[name] == pytest.approx(np.hypot(size * found[name], noise[name]), rel=1e-6)
     assert total["ratios"] == noise["ratios"] and total["relaxation_times"] == noise["relaxation_times"]
+
+
+def test_a_strain_in_percent_without_a_unit_is_told(tmp_path):
+    """A strain of 5, meant as 5 %, made moduli a hundred times too small."""
+    rows = "".join(f"{k},5,{90 - k}\n" for k in range(9))
+    (tmp_path / "t.csv").write_text("time_s,strain,stress_Pa\n" + rows)
+    _, notes = read_columns(tmp_path / "t.csv")
+    assert any("the strain reaches 500 %: if it is in percent, name it strain_%" in note for note in notes)
+    (tmp_path / "t.csv").write_text("time_s,strain_%,stress_Pa\n" + rows)
+    columns, notes = read_columns(tmp_path / "t.csv")
+    assert columns["strain"][0] == 0.05 and not any("percent" in note for note in notes)
+
+
+def test_a_balance_shows_forces_in_grams(tmp_path):
+    rows = "".join(f"{k},{0.1 * k},{9 * k}\n" for k in range(9))
+    (tmp_path / "t.csv").write_text("time_s,displacement_mm,force_g\n" + rows)
+    force = read_columns(tmp_path / "t.csv")[0]["force"]
+    assert np.allclose(force, 9 * np.arange(9) * 9.80665e-3)  # standard gravity, CGPM 1901

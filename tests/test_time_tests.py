@@ -215,6 +215,11 @@ BAD = {
     "unit": ("time_s,relaxation_modulus [bar]\n" + ROWS, [], "unit 'bar' of modulus is not known"),
     "text": ("time_s,relaxation_modulus_Pa\n0.1,900\n1,soft\n", [], "line 3: '1,soft' has a cell that is no number"),
     "order": ("time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n0.5,6\n2,5\n3,5\n", [], "follows"),
+    "stamps": (
+        "time_s,relaxation_modulus_Pa\n0.1,9\n1,7\n1,6\n2,5\n3,5\n",
+        [],
+        "two rows have the time 1 s: write times with more digits, or one row of their mean",
+    ),
     "backwards": (
         "time_s,relaxation_modulus_Pa\n3,5\n2,6\n1,7\n0.5,8\n",
         [],
@@ -330,6 +335,19 @@ def test_empty_cells_and_thousands_of_records(text, tmp_path):
     found = read_time_test(tmp_path / "a.csv", "relaxation")
     assert found.answer[found.used].tolist() == [1200.5, 1100.25, 987.5, 950]
     assert any("1 of 5 rows are left out: a cell in them is empty" in n for n in found.notes)
+
+
+def test_an_offset_that_one_row_shows_is_told(tmp_path):
+    """6 Pa of an untared sensor, 5 % of the peak, made the equilibrium modulus a tenth too large, without a word."""
+    t = np.concatenate([np.linspace(0, 1, 11), np.geomspace(1.1, 100, 40)])
+    strain = 0.05 * np.minimum(t, 1.0)
+    rng = np.random.default_rng(3)
+    stress = driven(SOLID, t, strain, "relaxation") * (1 + 0.01 * rng.standard_normal(len(t)))
+    for offset in (0.0, 6.0, -6.0):
+        write(tmp_path / "t.csv", "time_s,strain,stress_Pa", t, strain, stress + offset)
+        said = [n for n in read_time_test(tmp_path / "t.csv", "relaxation").notes if "offset of the sensor" in n]
+        assert len(said) == (offset != 0)
+        assert offset == 0 or said[0].startswith(f"the stress is {offset:g} Pa at 0 s, before the load")
 
 
 HELD = np.concatenate([np.zeros(200), np.linspace(0, 1, 11)[1:], np.ones(3000)])

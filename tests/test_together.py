@@ -161,6 +161,14 @@ def test_a_wrong_unit_of_one_test_is_named(scale):
     assert not any("try another --model" in w for w in fit.warnings)
 
 
+@pytest.mark.parametrize(("relative", "explained"), [(0.0, False), (0.03, True)])
+def test_a_factor_that_sizes_of_samples_explain_is_no_alarm(relative, explained):
+    fit = springpots_in_time.choose_together(wide_and_long(1.05, 0), "prony", relative=relative)
+    (told,) = [w for w in fit.warnings if "the tests agree if" in w]
+    assert ("sizes of samples differ so much" in told) == explained
+    assert ("look for another temperature" in told) != explained
+
+
 def test_a_common_fit_with_too_few_modes_does_not_hide_the_factor():
     """The sweep shows the fast mode, the relaxation, ten times as stiff, the slow one: both together allow one mode."""
     both = Maxwell(np.float64(1000.0), np.array([0.3, 0.3]), np.array([20.0, 0.05]))

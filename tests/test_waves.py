@@ -545,6 +545,16 @@ def test_scales_that_no_tissue_has_are_told(moduli, words):
     assert len(said) == bool(words) and all(words in s for s in said)
 
 
+@pytest.mark.parametrize(("hertz", "told"), [([376.991, 565.487], True), ([60.0, 90.0], False), ([62.8, 94.2], False)])
+def test_frequencies_in_radians_are_told(hertz, told):
+    """A liver at 1.8 m/s becomes one at 11 m/s, which a stiff tissue may have, and its modulus 39 times as large."""
+    G = np.array([123e3 + 27e3j, 129e3 + 29e3j])[:, None]
+    own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array(hertz)), density=DENSITY)
+    found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
+    said = waves_report._of_scales(own, found)
+    assert [s.startswith("the frequencies") and "if they are in rad/s" in s for s in said] == [True] * told
+
+
 def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
     """A loss that noise makes negative: of a nearly elastic phantom."""
     file = tmp_path / "sweep_whole.csv"

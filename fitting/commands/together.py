@@ -28,11 +28,11 @@ def run(options: argparse.Namespace) -> int:
         for note in test.notes:
             print(f"note: {Path(test.source).name}: {note}", file=sys.stderr)
     writable(options.out, ("fit.json", "fit.png"))
-    with named_bar(f"{len(tests)} tests") as told:
-        found = springpots_in_time.choose_together(tests, options.model, options.modes, told)
     default = Simulation()
     rig = Simulation(radius=options.radius or default.radius, height=options.height or default.height)
     relative = total_error.of_geometry(rig, None)
+    with named_bar(f"{len(tests)} tests") as told:
+        found = springpots_in_time.choose_together(tests, options.model, options.modes, told, relative)
     together_report.write(options.out, found, relative)
     print(together_report.table(found, relative))
     if options.cards:

@@ -22,6 +22,8 @@ from fitting.readers.frequency_sweep import Sweep, some
 from fitting.rigs import compression
 from liverjax import laws
 
+#: Standard error of an error of the instrument, over that before, from which the data do not tell it.
+UNTOLD = 0.9
 #: Most rounds of fit and correction, and most halvings of a correction that would leave a modulus of 0 or less.
 ROUNDS, HALVINGS = 20, 30
 #: Step in standard deviations of the prior that is none: exact data have no error with which to compare.
@@ -102,6 +104,9 @@ def without_error_of_inertia(fit: Fit, sweep: Sweep) -> tuple[Fit, Sweep]:
     notes = [
         f"the instrument's {n.name} is {n.compared(v)} (standard error {n.told(e)}, prior {n.told(1.0)}), and the "
         "moduli are corrected for it"
+        if e < UNTOLD
+        else f"the data do not tell the instrument's {n.name}: its standard error stays {n.told(e)}, of {n.told(1.0)} "
+        "before, and the moduli have this error"
         for n, v, e in zip(known, values, np.sqrt(np.diag(covariance)), strict=True)
     ]
     corrected = corrected._replace(notes=(*sweep.notes, *notes))

@@ -179,13 +179,18 @@ NOT_CONTAINED = "the standard errors do not contain it"
 
 
 def structure(omega: np.ndarray, storage: np.ndarray, loss: np.ndarray) -> tuple[dict, list[str]]:
-    """Runs test of the residuals of G' and of G'' in the order of the frequency: numbers, and a sentence."""
+    """Runs test of the residuals of G' and of G'' in the order of the frequency: numbers, and a sentence. Repeats of a
+    frequency may share their noise, and count once.
+    """
     numbers, told = {}, []
+    omega, storage, loss = merged(omega, storage, loss)
     for name, residuals in (("storage_modulus", storage), ("loss_modulus", loss)):
         runs, chance = runs_probability(np.sign(residuals))
         numbers[name] = {"runs": runs, "probability": chance}
         if chance < CHANCE:
-            told.append(f"of {name} change sign {runs - 1} times over {len(omega)} points (by chance: {chance:.1g})")
+            told.append(
+                f"of {name} change sign {runs - 1} times over {len(omega)} frequencies (by chance: {chance:.1g})"
+            )
     if not told:
         return numbers, []
     return numbers, [

@@ -16,8 +16,8 @@ from fitting.readers.frequency_sweep import some as some
 from fitting.readers.frequency_sweep import within as within
 from fitting.readers.frequency_sweep import without_inertia as without_inertia
 from fitting.readers.scattering_phase import weighed_by_scatter
-from fitting.readers.tables.complex_moduli import MODULI, column_in_si, fault_of, storage_and_loss, to_shear
-from fitting.readers.tables.sweep_columns import Column, is_tensile
+from fitting.readers.tables.complex_moduli import column_in_si, fault_of, storage_and_loss, to_shear
+from fitting.readers.tables.sweep_columns import MODULI, Column, is_tensile
 from fitting.readers.tables.sweep_headings import known_unit
 from fitting.readers.tables.sweep_tables import Table, choose_table, tables_of
 from fitting.readers.tables.text_tables import split_line as split_line
@@ -136,7 +136,10 @@ def _sweep(path: str, table: Table, notes: list[str]) -> Sweep:
 
 
 #: A note on frequencies that several lines have, after their number.
-REPEATED = "frequencies are repeated; each line counts as a measurement of its own"
+REPEATED = (
+    "frequencies are repeated; each line counts as a measurement of its own, unless the lines of a frequency share "
+    "their noise"
+)
 
 #: Differences within one sweep, of the temperature [K] and of the strain (largest over smallest), that get a note.
 WARMER, STRAINED = 2.0, 1.5

@@ -148,6 +148,7 @@ def of_columns(
 BEGINS_LOADED = (
     "the first row, at 0 s, is under load already: a step from rest at 0 s is assumed. If the load rose before it, or "
     "the sample was loaded before, give those rows too: what relaxed until then is missing from G0 otherwise. If it "
+    "was held under an earlier load until its stress was steady, take that strain and that stress off all rows. If it "
     "was a step, ramp = 0 in a description, or (relaxation and creep alone) --ramp 0, says so"
 )
 
@@ -330,7 +331,7 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
     rest = np.isfinite(test.answer) & (test.time < test.begun) & ~((test.time == 0) & (test.answer == 0))
     count, size = int(rest.sum()), float(np.nanmax(np.abs(test.answer)))
     if count < RESTING:
-        return test.answer, []
+        return test.answer, _of_one_row_at_rest(test, size)
     mean, error = float(np.mean(test.answer[rest])), float(np.std(test.answer[rest], ddof=1)) / np.sqrt(count)
     if not abs(mean) > max(3 * error, OFFSET * size):
         return test.answer, []
@@ -338,6 +339,21 @@ def _without_offset(test: TimeTest) -> tuple[np.ndarray, list[str]]:
     return test.answer - mean, [
         f"the {what} of the {count} rows before the load is {mean:.3g}{unit} on average, "
         f"{100 * abs(mean) / size:.2g} % of the largest: it is taken off all rows, as an offset of the sensor"
+    ]
+
+
+def _of_one_row_at_rest(test: TimeTest, size: float) -> list[str]:
+    """A note if the answer where the load begins is not 0: one or two rows do not tell an offset from noise."""
+    k = int(np.argmax(test.time >= test.begun))
+    here, load = float(test.answer[k]), abs(float(test.driven[k])) / float(np.max(np.abs(test.driven)))
+    noise = noise_of_series(test.answer[np.isfinite(test.answer) & (test.time > test.begun)])
+    if load > AT_REST or not abs(here) > max(_IN_NOISE * noise, (OFFSET + 2 * load) * size):
+        return []
+    what, unit = ("stress", " Pa") if test.kind == "relaxation" else ("strain", "")
+    return [
+        f"the {what} is {here:.3g}{unit} at {test.time[k]:.3g} s, before the load, {100 * abs(here) / size:.2g} % of "
+        f"the largest: if it is an offset of the sensor, it changes all moduli: take it off all rows, or give {RESTING}"
+        " or more rows before the load"
     ]
 
 

@@ -44,7 +44,8 @@ TIME_TEST_UNITS = {
     "tensile stress": {"Pa": 1.0} | MODULUS_UNITS,
     "torque": _TORQUE,
     "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "°": np.pi / 180},
-    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "kN": 1e3},
+    "force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "kN": 1e3}
+    | {"g": 9.80665e-3, "gf": 9.80665e-3, "kgf": 9.80665},
     "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2},
 }
 #: Units of indentation curves.

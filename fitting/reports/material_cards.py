@@ -32,6 +32,12 @@ def write(folder: Path, model: Maxwell) -> list[str]:
     return told
 
 
+def _span(model: Maxwell) -> str:
+    """What a card leaves out."""
+    times = np.asarray(model.relaxation_times)
+    return f"Modes of {times.min():.3g} to {times.max():.3g} s: faster and slower relaxation is not in this card."
+
+
 def _bulk(shear: float) -> float:
     return 2 * shear * (1 + POISSON) / (3 * (1 - 2 * POISSON))
 
@@ -49,7 +55,7 @@ def febio(model: Maxwell) -> str:
     return "\n".join(
         [
             '<?xml version="1.0" encoding="UTF-8"?>',
-            "<!-- SI units: Pa, s. Set the density of your tissue. -->",
+            f"<!-- SI units: Pa, s. Set the density of your tissue. {_span(model)} -->",
             '<febio_spec version="4.0">',
             "  <Material>",
             '    <material id="1" name="tissue" type="viscoelastic">',
@@ -77,6 +83,7 @@ def abaqus(model: Maxwell) -> str:
     return "\n".join(
         [
             "** SI units: Pa, s. Add *DENSITY.",
+            f"** {_span(model)}",
             "*MATERIAL, NAME=TISSUE",
             "*HYPERELASTIC, NEO HOOKE, MODULI=INSTANTANEOUS",
             f"{_written_number(float(G0) / 2)}, {_written_number(2 / _bulk(float(G0)))}",
@@ -92,7 +99,7 @@ def ansys(model: Maxwell) -> str:
     G0, ratios, times = model
     pairs = [_written_number(v) for pair in zip(ratios, times, strict=True) for v in pair]
     data = [f"TBDATA,{k + 1},{','.join(pairs[k : k + 6])}" for k in range(0, len(pairs), 6)]
-    lines = ["! SI units: Pa, s. Add MP,DENS.", "TB,HYPER,1,1,2,NEO"]
+    lines = ["! SI units: Pa, s. Add MP,DENS.", f"! {_span(model)}", "TB,HYPER,1,1,2,NEO"]
     lines.append(f"TBDATA,1,{_written_number(float(G0))},{_written_number(2 / _bulk(float(G0)))}")
     for option in ("SHEAR", "BULK"):
         lines += [f"TB,PRONY,1,1,{len(ratios)},{option}", *data]
@@ -110,7 +117,8 @@ def sofa(model: Maxwell) -> str:
     what = "equilibrium" if shear == rest else "instantaneous (the model is a fluid)"
     modes = "; ".join(f"{_written_number(g)} {_written_number(t)}" for g, t in zip(ratios, times, strict=True))
     return (
-        f"<!-- SI units: Pa, s. The {what} shear modulus: SOFA has no Prony series of its own.\n"
+        f"<!-- SI units: Pa, s. The {what} shear modulus of these modes: SOFA has no Prony series of its own.\n"
+        f"     {_span(model)}\n"
         f"     G0 {_written_number(float(G0))}; ratio and relaxation time of each mode: {modes} -->\n"
         '<TetrahedronHyperelasticityFEMForceField materialName="NeoHookean" '
         f'ParameterSet="{_written_number(shear)} {_written_number(_bulk(shear) - 2 * shear / 3)}" />\n'

@@ -342,6 +342,15 @@ def _of_residuals(hertz: float, each: Regions, f: int, uniform: str, coarse: boo
 SLOW, FAST = 0.4, 15.0
 
 
+def _in_radians(hertz: np.ndarray) -> bool:
+    """Whether no frequency is a whole number, and all are whole numbers, to five digits, times 2 pi."""
+
+    def whole(x: np.ndarray) -> np.ndarray:
+        return np.abs(x - np.round(x)) < 1e-5 * x
+
+    return bool(np.all(whole(hertz / (2 * np.pi)) & ~whole(hertz)))
+
+
 def _of_scales(organ: Organ, found: Found) -> list[str]:
     """Sentences on speeds that no soft tissue has, and on moduli that change with frequency as no material's do.
 
@@ -355,6 +364,11 @@ def _of_scales(organ: Organ, found: Found) -> list[str]:
         told.append(
             f"waves of {omega[odd[0]] / (2 * np.pi):g} Hz run at {speeds[odd[0]]:.2g} m/s, and in soft tissue at "
             f"{SLOW:g} to {FAST:g} m/s: check the spacing (metres) and the frequencies (Hz, not rad/s)"
+        )
+    elif _in_radians(omega / (2 * np.pi)):
+        told.append(
+            f"the frequencies {', '.join(f'{f:.6g}' for f in omega / (2 * np.pi))} are whole numbers times 2 pi: if "
+            "they are in rad/s, moduli are 39 times too large; give them in Hz"
         )
     for a, b in itertools.pairwise(range(len(omega))):
         span = np.log(omega[b] / omega[a])

@@ -233,8 +233,8 @@ def _glued_curve(described: Described, largest: float, path: str) -> tuple[Calla
     if height > _SLENDER * radius:
         raise InputError(
             f"{path}: height = {height:g} m is {height / radius:.3g} radii, and glued samples are computed up to "
-            f"{_SLENDER:g}: the ends of so slender a sample hardly matter, so give its shear stress, a third of the "
-            "tensile stress, and strain as a table of its own"
+            f"{_SLENDER:g}: the ends of so slender a sample hardly matter, so give its shear stress, the tensile "
+            f"stress over {2 * (1 + described.poisson):.4g} (2 times 1 + poisson), and strain as a table of its own"
         )
     at = largest * np.array(_GRID if largest <= _LARGE * height else _FINER_GRID)
     nu = described.poisson

@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
         scene = unloaded(scene).scene
     target = options.out / "result.h5"
     writable(options.out, (target.name,))
-    long_run.refuse_unfinished(target, options.resume)
+    long_run.refuse_unfinished(target, options.resume, text)
     bar = tqdm(total=scene.solve.steps, unit="step", disable=None, leave=False)  # on a terminal only
     report = None if bar.disable else lambda _: bar.update()
     try:

@@ -15,7 +15,7 @@ ADVICE = {
     STALLED: "the residual stopped falling above the tolerance: take a looser one (in float32, with very stiff "
     "springs or with very short time steps, rounding may allow no smaller residual), float64, or else smaller steps",
     NOT_FINITE: "a residual was not finite, usually an inverted element: take smaller loads or steps, or a law with "
-    "continued_below",
+    "continued_below; if it is a law of your own, look at it with `python -m liverjax check`",
     INDEFINITE: "the stiffness has a negative eigenvalue and no equilibrium was reached (it buckles, collapses, or is "
     "stiff in bulk): take linear_solver = 'direct' or volumetric = 'mixed' if bulk is far above mu, else "
     "kind = 'dynamic', smaller steps or robust = 'projected'",

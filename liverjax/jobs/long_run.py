@@ -37,15 +37,23 @@ class Ran(NamedTuple):
     beside: Mapping[str, tuple[np.ndarray, str]] = {}  # further datasets of the result: name -> values, unit
 
 
-def refuse_unfinished(out: Path, resume: bool) -> None:
-    """Refuse results in the place of a run that was stopped, unless it goes on.
+def refuse_unfinished(out: Path, resume: bool, text: str | None = None) -> None:
+    """Refuse results in the place of a run that was stopped, unless it goes on; and to go on with another scene's.
 
     Raises:
-        InputError: parts on disk without `resume`.
+        InputError: parts on disk without `resume`; with it, a finished result of a scene file with another text.
     """
     folder = resumable_parts.beside(out)
     if folder.exists() and not resume:
         raise InputError(f"{folder} holds an unfinished run: go on with --resume, or remove it")
+    if resume and not folder.exists() and out.exists() and text is not None:
+        try:
+            with h5py.File(out) as file:
+                before = file.attrs.get("scene", text)
+        except OSError:
+            return
+        if before != text:
+            raise InputError(f"{out} is the result of another scene: name another --out, or leave --resume out")
 
 
 def run(

@@ -151,6 +151,7 @@ def check(law: Law) -> Check:
     programs = [jax.jit(lambda law, F, what=what: getattr(law, what)(F)) for what in _PROGRAMS]
     energy, stress, tangent = (partial(program, law) for program in programs)
     more, stable = _stability(law, tangent)
+    more += _jumps(law, energy)
     F, D, first = _finite_samples((energy, stress, tangent))
     rows, errors = [first], {}
     W, P, A = (_as_numbers(f, F) for f in (energy, stress, tangent))
@@ -384,6 +385,36 @@ def _stability(law: Law, tangent: Callable) -> tuple[list[Row], dict]:
             text, passed = "not even at rest", False
         rows.append(Row(f"stable in {test.replace('_', ' ')}", text, "", passed))
     return rows, ranges
+
+
+#: Part of its change within a step by which an energy misses the work of the stress, from which a jump is looked for;
+#: the parts into which the step is cut then. A jump stays in one of them, the error of a smooth energy falls.
+_MISSED, _PARTS = 0.05, 32
+
+
+def _jumps(law: Law, energy: Callable) -> list[Row]:
+    """A row on an energy that jumps: it misses the work of the stress, which no check at single states shows."""
+    stress = jax.jit(partial(homogeneous.nominal_stress, law))
+
+    def missed(test: str, driven: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Change of the energy without the work, and the change, over each step (n - 1,) [Pa]."""
+        F = np.asarray(homogeneous.deformation_gradient(test, driven))
+        P, W = _as_numbers(stress, F), _as_numbers(energy, F)
+        with np.errstate(all="ignore"):
+            work = 0.5 * np.einsum("eij,eij->e", P[1:] + P[:-1], np.diff(F, axis=0))
+            return np.nan_to_num(np.abs(np.diff(W) - work), posinf=0.0), np.abs(np.diff(W))
+
+    for test, what in homogeneous.TESTS.items():
+        driven = SHEARS if what == "shear" else STRETCHES
+        gap, change = missed(test, driven)
+        for k in np.flatnonzero(gap > _MISSED * change + 1e-9 * np.nan_to_num(change).max()):
+            finer = np.linspace(driven[k], driven[k + 1], _PARTS + 1)
+            parts, _ = missed(test, finer)
+            if parts.max() > 0.5 * gap[k]:
+                at = finer[int(np.argmax(parts))]
+                found = f"by {parts.max():.3g} Pa at {what} {at:.3g} in {test.replace('_', ' ')}"
+                return [Row("the energy jumps", found, "its stress does not know it", False)]
+    return []
 
 
 def _work_is_positive(test: str, driven: np.ndarray, P: np.ndarray) -> np.ndarray:

@@ -46,6 +46,34 @@ def elements_at(mesh: TetMesh, points: np.ndarray, name: str) -> tuple[np.ndarra
     return element, L[:, np.arange(len(points)), element]
 
 
+def around_a_point(corners: np.ndarray) -> np.ndarray:
+    """Whether tetrahedra with corners (E, 4, 3) hold the origin."""
+    a, b, c, d = np.moveaxis(corners, 1, 0)
+
+    def volume(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+        return np.einsum("ei,ei->e", p, np.cross(q, r))
+
+    parts = np.stack([volume(b, c, d), -volume(a, c, d), volume(a, b, d), -volume(a, b, c)])
+    return _all_alike(parts)
+
+
+def on_a_line(corners: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Whether tetrahedra with corners (E, 4, 3) meet the line through the origin along an axis (3,)."""
+    flat = corners @ np.linalg.svd(axis[None])[2][1:].T  # seen along the axis: (E, 4, 2)
+    met = np.zeros(len(flat), bool)
+    for face in ([1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]):
+        a, b, c = np.moveaxis(flat[:, face], 1, 0)
+        parts = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))])
+        met |= _all_alike(parts)
+    return met
+
+
+def _all_alike(parts: np.ndarray) -> np.ndarray:
+    """Whether the parts (n, E) of sizes that are not 0 have one sign."""
+    whole = parts.sum(axis=0)
+    return (whole != 0) & ((np.sign(whole) * parts).min(axis=0) >= -_INSIDE * np.abs(whole))
+
+
 def weights(mesh: TetMesh, element: np.ndarray, L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (n, m) of elements (m,), and the values of their functions at barycentric coordinates L (4, m)."""
     nodes = np.stack([np.asarray(a) for a in mesh.element_nodes[: 4 if mesh.order == 1 else 10]])[:, element]

@@ -137,5 +137,5 @@ def _not_too_many(tetrahedra: int, names: str) -> None:
 
 def _positive(name: str, values: Sequence[float]) -> None:
     if not all(np.isfinite(v) and v > 0 for v in values):
-        shown = values[0] if len(values) == 1 else list(values)
+        shown = values[0] if len(values) == 1 else [float(v) for v in values]
         raise InputError(f"shape {name} = {shown} must be positive and finite: give lengths in metres")

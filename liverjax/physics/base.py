@@ -228,6 +228,8 @@ class Physics:
     section: ClassVar[str] = ""
     #: Whether it makes nodes move together: the factorisation cannot treat them.
     ties: ClassVar[bool] = False
+    #: Whether it needs the time step, `step.dt`: a scene without one is then refused.
+    in_time: ClassVar[bool] = False
     #: Whether its forces have an energy; those of friction have none.
     conservative: ClassVar[bool] = True
     keys: ClassVar[tuple[str, ...]] = ()

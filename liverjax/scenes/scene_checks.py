@@ -51,6 +51,7 @@ def check_time_and_mass(scene: Scene) -> None:
             (scene.viscosity is not None, "viscosity"),
             (scene.porosity is not None, "porosity"),
             (histories, "a history"),
+            *((physics.in_time, name) for name, physics in named_physics(scene)),
         ):
             if present:
                 raise InputError(f"[solve] has no dt, which {what} needs: give the time step in seconds")

@@ -12,7 +12,8 @@ from liverjax.elements.gradients import volume_ratios
 from liverjax.mesh.nodal import nodal_volumes
 from liverjax.mesh.tetrahedra import TetMesh
 from liverjax.physics.attached.ligament import Ligament
-from liverjax.physics.contact.obstacle import Obstacle, missed_depth, touches_without_pressure
+from liverjax.physics.contact.obstacle import Obstacle, centre_in_body, missed_depth, touches_without_pressure
+from liverjax.physics.contact.passage import passes_through
 from liverjax.physics.contact.pressed import PressedObstacle
 from liverjax.physics.loads import follows, nodal_tractions
 from liverjax.scenes import regions
@@ -239,6 +240,38 @@ def _of_histories(scene: Scene, result: Result) -> list[str]:
 BETWEEN = 0.25
 
 
+def _between_points(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: jax.Array) -> list[str]:
+    """A sentence if the body is in the obstacle, `moved` (T, 3), between its points of contact."""
+    last = len(moved) - 1
+    for k in {int(jnp.argmax(jnp.linalg.norm(moved, axis=1))), last}:
+        x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
+        between, approach = missed_depth(obstacle, scene.mesh, x, moved[k])
+        if between > BETWEEN * approach:
+            return [
+                f"{name} is {between:.2g} m in the body between the points at which contact is tested, of an "
+                f"approach of {approach:.2g} m: the triangles are too large for its radius; refine the mesh there"
+            ]
+    return []
+
+
+def _lost_contact(name: str, obstacle: Obstacle, scene: Scene, result: Result, moved: np.ndarray) -> str:
+    """A sentence if the obstacle, at 0, `moved` (T + 1, 3), passed the surface of the body within a step."""
+    ways = np.linalg.norm(np.diff(moved, axis=0), axis=1)
+    radius, last = float(np.asarray(obstacle.radius)), len(ways)
+    farthest = int(np.argmax(np.linalg.norm(moved, axis=1)))
+    for k in sorted({farthest, last, *(np.flatnonzero(ways > radius) + 1)} - {0}):
+        before = scene.mesh.points if k == 1 else result.positions[k - 2]
+        both = np.stack([np.asarray(before), np.asarray(result.positions[k - 1])])
+        ends = centre_in_body(obstacle, scene.mesh, both[1], moved[k])
+        if ends or passes_through(obstacle, scene.mesh, both, moved[k - 1 : k + 1]):
+            return (
+                f"{name} {'has its centre in' if ends else 'went through'} the body in step {k}, in which it moves "
+                f"{ways[k - 1]:.2g} m, with a radius of {radius:.2g} m: it passed the surface between two steps, so "
+                "that forces of contact are missing or act to the wrong side; take more steps"
+            )
+    return ""
+
+
 def _of_contacts(scene: Scene, result: Result) -> list[str]:
     """A sentence on every round obstacle that is in the body between the points at which contact is tested."""
     said, steps = [], len(result.times)
@@ -250,17 +283,12 @@ def _of_contacts(scene: Scene, result: Result) -> list[str]:
             continue
         dt = 0.0 if scene.solve.dt is None else scene.solve.dt
         place = partial(physics.displacement, steps=scene.solve.steps, dt=dt)
-        moved = jax.vmap(place)(jnp.arange(1, steps + 1)) if found is None else found[number]
-        farthest = int(jnp.argmax(jnp.linalg.norm(moved, axis=1)))
-        for k in {farthest, steps - 1}:
-            x = jnp.asarray(result.positions[k], scene.mesh.points.dtype)
-            between, approach = missed_depth(physics, scene.mesh, x, moved[k])
-            if between > BETWEEN * approach:
-                said.append(
-                    f"{name} is {between:.2g} m in the body between the points at which contact is tested, of an "
-                    f"approach of {approach:.2g} m: the triangles are too large for its radius; refine the mesh there"
-                )
-                break
+        if found is None:
+            first, moved = place(0), jax.vmap(place)(jnp.arange(1, steps + 1))
+        else:
+            first, moved = jnp.zeros(3), found[number]
+        lost = _lost_contact(name, physics, scene, result, np.concatenate([first[None], moved]))
+        said += [lost] if lost else _between_points(name, physics, scene, result, moved)
     return said
 
 

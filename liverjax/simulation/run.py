@@ -97,7 +97,8 @@ def _run_part(
 ) -> tuple[Result, State]:
     sizes = force_sizes(scene)
     kept, _ = beginning(equations(scene, state, numbers[0], sizes))
-    advance = _step_by_step(scene, sizes, report, None, differentiable=False)
+    # Inlined, it is traced once, for its shapes and for its program.
+    advance = jax.jit(_step_by_step(scene, sizes, report, None, differentiable=False), inline=True)
 
     def unless_over(carry, k):
         nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(advance, carry, k)[1])

@@ -249,11 +249,15 @@ def choose_together(
     model: str,
     modes: int | str = "auto",
     progress: Callable[[str], None] = lambda text: None,
+    relative: float = 0.0,
 ) -> Together:
-    """The model of the lowest criterion for several tests; arguments as in `choose_in_time` and `together.fit`."""
+    """The model of the lowest criterion for several tests; arguments as in `choose_in_time` and `together.fit`.
+
+    `relative`: relative error of all moduli of a test by the size of its sample.
+    """
     prony = together.fit(tests, modes, progress)
     fit = prony if model == "prony" else _best_of_models(tests, model, prony, progress)
-    fit = fit._replace(warnings=(*fit.warnings, *common_factor.told(fit)))
+    fit = fit._replace(warnings=(*fit.warnings, *common_factor.told(fit, relative)))
     return with_interval(fit, fit.tests, [s.noise for s in fit.shares])
 
 

@@ -19,10 +19,11 @@ from fitting.methods.least_squares import Solution, from_starts
 CERTAIN, LEAST = 4.0, 0.005
 
 
-def told(fit: Together) -> list[str]:
+def told(fit: Together, relative: float = 0.0) -> list[str]:
     """A sentence on the test whose factor makes all tests agree; none if the tests agree, or if no factor helps.
 
-    A factor of a few percent hides in ratios and times: each test is then followed nearly as well as by itself.
+    A factor of a few percent hides in ratios and times: each test is then followed nearly as well as by itself. Sizes
+    of samples, with an error `relative` of the moduli of each test, explain a small one.
     """
     if fit.kind.effective is not None:
         return []
@@ -32,10 +33,16 @@ def told(fit: Together) -> list[str]:
         return []
     k = min(known, key=lambda k: known[k][2])
     factor, error, _ = known[k]
-    return [
+    said = (
         f"the tests agree if all moduli of {fit.shares[k].source or fit.shares[k].name} are {factor:.3g} ± {error:.1g} "
-        "times those of the others: look for another temperature, another sample, or a wrong size of it, and fit the "
-        "tests one by one until then"
+        "times those of the others: "
+    )
+    if abs(np.log(factor)) < 2 * np.sqrt(2) * relative:
+        return [said + "sizes of samples differ so much, and are in the errors that are stated with them"]
+    return [
+        said
+        + "look for another temperature, another sample, or a wrong size of it, and fit the tests one by one until "
+        "then"
     ]
 
 

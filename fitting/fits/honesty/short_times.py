@@ -35,8 +35,9 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
         return fit
     ratio = fall / max(next_fall, 1e-300)
     if ratio > LEAST_SLOWING:
+        what = "stress" if test.kind == "relaxation" else "relaxation modulus"
         told = (
-            f"the stress falls by {100 * fall / whole:.2g} % in the first half decade of the record, and by "
+            f"the {what} falls by {100 * fall / whole:.2g} % in the first half decade of the record, and by "
             f"{100 * max(next_fall, 0.0) / whole:.2g} % in the next: nothing tells how much relaxed before {first:.3g} "
             "s, and G0 does not contain it; begin earlier, or compare --model auto"
         )
@@ -45,7 +46,7 @@ def with_short_times(fit: TimeFit, test: TimeTest) -> TimeFit:
     if missing <= SHOWN * error:
         return fit
     told = (
-        f"G0 may be {missing:.2g} Pa larger, if the stress fell before {first:.3g} s as it falls after: the chosen "
+        f"G0 may be {missing:.2g} Pa larger, if the modulus fell before {first:.3g} s as it falls after: the chosen "
         "modes do not contain it (it is in the total error); begin earlier, or compare --model auto"
     )
     return fit._replace(warnings=(*fit.warnings, told), details=fit.details | {MISSING: float(missing)})

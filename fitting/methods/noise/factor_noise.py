@@ -14,6 +14,8 @@ _FALL = 1.92
 HIDDEN = 0.1
 #: Singular values below this part of the factors' size are roundoff: the unknowns take up all factors.
 _ROUNDOFF = 1e-8
+#: Least part of the squared residuals beside the factors: what exact repeats leave is roundoff, of any size.
+_SAME = 1e-12
 
 
 class FactorNoise(NamedTuple):
@@ -52,9 +54,9 @@ def factors_of_series(
     U, S, _ = np.linalg.svd(beside.T @ F, full_matrices=False)
     y, m = beside.T @ r, beside.shape[1]
     along = (U.T @ y) ** 2
-    rest = max(float(y @ y) - float(along.sum()), 0.0)
-    if rest + along.sum() <= 0:
+    if not y @ y > 0:
         return None
+    rest = max(float(y @ y) - float(along.sum()), _SAME * float(y @ y))
     S = np.where(_ROUNDOFF * np.linalg.norm(F) < S, S, 0.0)
 
     def at(q: float) -> tuple[float, float]:

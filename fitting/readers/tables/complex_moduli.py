@@ -1,10 +1,8 @@
 """Storage and loss moduli from the columns that a file has: the moduli themselves, |G*|, the phase, tan(delta)."""
 
-import re
-
 import numpy as np
 
-from fitting.readers.tables.sweep_columns import Column, is_angular, is_tensile, pair_of
+from fitting.readers.tables.sweep_columns import MODULI, Column, is_angular, is_tensile, names_shear, pair_of
 from fitting.readers.tables.sweep_headings import UNITS, known_unit
 from fitting.readers.units import FREQUENCY_UNITS, MODULUS_UNITS, PER_SECOND
 from liverjax.core.errors import InputError
@@ -78,16 +76,12 @@ def fault_of(column: Column, written: float, value: float, smallest: float, larg
     return f"{column.name} = {written:g} {problem}", remedy
 
 
-def _names_shear(column: Column) -> bool:
-    return re.search(r"shear|(^|[^A-Za-z])[Gg]([^A-Za-z]|$)", column.name) is not None
-
-
 def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
     """Divide moduli of tension or bending by 3, in place; a note says so."""
     moduli = [q for q in columns if q.split("_")[0] in MODULI]
     tensile = [q for q in moduli if is_tensile(columns[q][0])]
     if tensile:  # "tensile_storage_modulus, loss_modulus": both are of tension
-        sheared = [columns[q][0].name for q in moduli if q not in tensile and _names_shear(columns[q][0])]
+        sheared = [columns[q][0].name for q in moduli if q not in tensile and names_shear(columns[q][0])]
         if sheared:
             raise InputError(
                 f"column {columns[tensile[0]][0].name} is of tension or bending and {sheared[0]} of shear: name both "
@@ -100,10 +94,6 @@ def to_shear(columns: dict[str, tuple[Column, np.ndarray]]) -> list[str]:
         return []
     names = " and ".join(dict.fromkeys(columns[q][0].name for q in tensile))
     return [f"{names} are of tension or bending: G = E / 3 is taken, as of an incompressible material"]
-
-
-#: Quantities in pascals.
-MODULI = ("storage", "loss", "complex")
 
 
 def storage_and_loss(values: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:

@@ -37,6 +37,10 @@ def pair_of(quantities: Collection[str]) -> tuple[str, str] | None:
     return next((pair for pair in PAIRS if set(pair) <= set(quantities)), None)
 
 
+#: Quantities in pascals.
+MODULI = ("storage", "loss", "complex")
+
+
 def is_complete(columns: list[Column]) -> bool:
     """Whether the columns are enough for a sweep."""
     quantities = {c.quantity for c in columns}
@@ -101,6 +105,11 @@ def is_tensile(column: Column) -> bool:
     name = re.sub('[′’`´″”"]', "'", column.name.lower())
     words = r"\b(tensile|young|flexural|bending|compressive|zug|biege)|(?:^|[\s(\[|_])e('|\*)"
     return bool(re.match(r"\s*e[_ ]|\s*epp?\b|\s*[(|]?e\b", name) or re.search(words, name))
+
+
+def names_shear(column: Column) -> bool:
+    """Whether the heading names a modulus of shear, G."""
+    return re.search(r"shear|(^|[^a-z])g([^a-z]|$)", column.name.lower()) is not None
 
 
 #: Units of temperature: factor and offset to kelvin.

@@ -8,6 +8,7 @@ import numpy as np
 
 from fitting.readers import raw_torque
 from fitting.readers.tables.sweep_columns import (
+    MODULI,
     NEEDED,
     Column,
     columns_beside,
@@ -15,6 +16,8 @@ from fitting.readers.tables.sweep_columns import (
     first_missing,
     header_columns,
     is_complete,
+    is_tensile,
+    names_shear,
 )
 from fitting.readers.tables.sweep_headings import DEVIATION_WORDS
 from fitting.readers.tables.text_tables import decimal_sign, find_delimiter, means_nothing, split_cells, to_number
@@ -104,7 +107,9 @@ def tables_of(path: str, lines: list[str]) -> list[Table]:
             f"{shown!r}); add that header, separated by commas, or export the sweep as CSV"
         )
     lacks = first_missing(named[best])
-    raise InputError(f"{path}: no column for {lacks} in the header {shown!r}; add {NEEDED[lacks]}")
+    viscous = any(c.quantity == "viscosity" for c in named[best])
+    hint = "; viscosities are not read: |G*| is omega |eta*|, a column complex_modulus_Pa" if viscous else ""
+    raise InputError(f"{path}: no column for {lacks} in the header {shown!r}; add {NEEDED[lacks]}{hint}")
 
 
 def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
@@ -135,6 +140,7 @@ def _search(path: str, lines: list[str]) -> tuple[list[Table], list[int]]:
             beside = tuple((c, _cells_of(c.place, own, delimiter, sign)) for c in others)
             unread = raw_torque.without_unit(cells, units[-1] if units else [])
             told = (*_nameless_deviations(cells), *_perhaps_thousands(own, columns, sign), *unread)
+            told += tuple(_perhaps_tensile(cells, columns))
             tables.append(Table(name, columns, rows, numbers, raw, unit, beside, told))
         free = k
     return tables, headers
@@ -150,6 +156,23 @@ def _nameless_deviations(cells: list[str]) -> list[str]:
     return [
         f"columns {', '.join(map(repr, found))} are not used: they do not say of what they are the deviations; name "
         "them storage_modulus_sd_Pa and loss_modulus_sd_Pa"
+    ]
+
+
+#: Words of headings that a DMA writes, whose samples are stretched, pressed or bent, and a rheometer does not.
+_OF_DMA = re.compile(r"(static|dynamic|dyn\.?) (force|strain|stress|displacement)|^(sample )?length\b|stiffness", re.I)
+
+
+def _perhaps_tensile(cells: list[str], columns: list[Column]) -> list[str]:
+    """A note if the moduli state neither shear nor tension, and another heading is one of tests in tension."""
+    moduli = [c for c in columns if c.quantity in MODULI]
+    sign = next((c for c in cells if _OF_DMA.search(c.replace("_", " ").strip('" '))), None)
+    if sign is None or any(is_tensile(c) or names_shear(c) for c in moduli):
+        return []
+    names = " and ".join(dict.fromkeys(c.name for c in moduli))
+    return [
+        f"{names} are taken as moduli of shear, G; the column {sign.strip()!r} is one of tests in tension, compression "
+        "or bending: if these are moduli E, three times as large, name them E' and E''"
     ]
 
 
@@ -203,7 +226,7 @@ def _with_unit_row(columns: list[Column], lines: list[str], k: int, delimiter: s
     for ahead in range(k, min(k + 2, len(lines))):
         cells = split_cells(lines[ahead], delimiter)
         units = {c.place: cells[c.place].strip('"[]() ') for c in columns if c.place < len(cells)}
-        moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in ("storage", "loss", "complex")]
+        moduli = [units.get(c.place) in MODULUS_UNITS for c in columns if c.quantity in MODULI]
         if any(moduli):
             return [c._replace(unit=units.get(c.place) or c.unit) for c in columns], ahead + 1
         if any(re.match(r"[-+]?\d", cell) for cell in cells):

@@ -30,6 +30,12 @@ WORDS = (
     ("youngs modulus", "tensile modulus"),
     ("tensile stress", "tensile stress"),
     ("tensile strain", "tensile strain"),
+    ("compressive stress", "tensile stress"),
+    ("compressive strain", "tensile strain"),
+    ("engineering stress", "tensile stress"),
+    ("engineering strain", "tensile strain"),
+    ("nominal stress", "tensile stress"),
+    ("nominal strain", "tensile strain"),
     ("e(t)", "tensile modulus"),
     ("tensile creep compliance", "tensile compliance"),
     ("creep compliance d(t)", "tensile compliance"),
@@ -102,6 +108,8 @@ TENSILE = {
 }
 
 
+#: No soft tissue is sheared or stretched so far [1] in a test of its viscoelasticity.
+LARGE = 1.0
 #: TRIOS writes two times, since the test began and since the experiment began. The time of the test is used.
 OWN_TIME = "step time"
 
@@ -123,6 +131,10 @@ def read_columns(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], list[s
     if np.any(np.diff(time) <= 0) or time[0] < 0:
         k = int(np.argmax(np.diff(time) <= 0)) + 1
         order = f"time {time[k]:g} s follows {time[k - 1]:g} s" if time[0] >= 0 else f"time {time[0]:g} s is negative"
+        if time[0] >= 0 and time[k] == time[k - 1]:
+            raise InputError(
+                f"{path}: two rows have the time {time[k]:g} s: write times with more digits, or one row of their mean"
+            )
         raise InputError(f"{path}: {order}; let the rows begin at 0 s or later and rise in time")
     return columns, notes
 
@@ -320,6 +332,9 @@ def _in_si(path, found, rows, units):
         if unit is None:
             unit = next(iter(TIME_TEST_UNITS[quantity]))
             notes.append(f"the column of {quantity} states no unit; {unit} is taken")
+            most = float(np.nanmax(np.abs(rows[:, j]), initial=0.0))
+            if quantity.endswith("strain") and most > LARGE:
+                notes[-1] += f", so that the strain reaches {100 * most:.4g} %: if it is in percent, name it strain_%"
         if not _known_column(quantity, unit):
             raise InputError(f"{path}: unit {unit!r} of {quantity} is not known; {_known_units(quantity)}")
         columns[quantity] = rows[:, j] * TIME_TEST_UNITS[quantity][_plain_heading(unit)]

@@ -42,6 +42,7 @@ def check_region_elements(scene: Scene) -> None:
         if not region.law and not region.viscosity and not region.porosity:
             raise InputError(f"region.{k} changes nothing: give e.g. law = {{mu = 2000.0}}")
     _check_own_laws(scene.region)
+    _check_hidden(scene.region)
 
 
 def _check_law(law: Law, region: Region, name: str) -> None:
@@ -104,6 +105,26 @@ def check_region_porosity(porosity: Porosity | None, region: Region, name: str) 
         check_sponge(replace(porosity, **own))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
+
+
+def _check_hidden(regions: tuple[Region, ...]) -> None:
+    """Refuse a region whose numbers later regions replace in all of its elements."""
+    taken: dict[str, np.ndarray] = {}
+    for k, region in reversed(list(enumerate(regions))):
+        elements, names = np.asarray(region.elements), sorted(_names_of(region))
+        if all(name in taken and np.isin(elements, taken[name]).all() for name in names):
+            raise InputError(
+                f"region.{k} changes nothing: later regions give all of its elements the same numbers anew; leave it "
+                "out, or give other places"
+            )
+        taken |= {name: np.union1d(taken.get(name, elements), elements) for name in names}
+
+
+def _names_of(region: Region) -> set[str]:
+    """The numbers that a region changes."""
+    own = {"law"} if isinstance(region.law, Law) else {f"law.{name}" for name in changed_numbers(region)}
+    own |= {f"viscosity.{name}" for name in region.viscosity or {}}
+    return own | {f"porosity.{name}" for name in region.porosity or {}}
 
 
 def _check_own_laws(regions: tuple[Region, ...]) -> None:
