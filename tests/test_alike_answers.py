@@ -74,6 +74,7 @@ def test_the_posterior_counts_independent_answers(model, monkeypatch):
     assert np.all(np.isfinite(own.standard_errors)) and own.freedom < 40
 
 
+@pytest.mark.slow
 def test_a_spectrum_keeps_its_own_errors():
     time, rng = np.geomspace(0.1, 600, 100), np.random.default_rng(2)
     fit = choose_in_time(_relaxation(time, 0.01 * _autoregression(rng, len(time), 0.9)), "spectrum")
@@ -95,6 +96,7 @@ def test_noise_of_constant_size_is_neither_shared_nor_in_proportion():
     assert np.all((ratio > 0.6) & (ratio < 1.7)), ratio  # the scatter of 12 draws is known to 21 %
 
 
+@pytest.mark.slow
 def test_noise_that_grows_with_time_is_in_the_errors():
     """The interval of G_inf held the truth in 16 of 20 draws; its errors are at most 1.3 times too small now."""
     time = np.concatenate([[0.0], np.arange(0.5, 100.1, 0.5)])

@@ -157,7 +157,12 @@ def test_a_number_that_is_forgotten_in_the_energy_is_named(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "stated, agrees", [("self.mu", True), ("self.mu + 4 * self.k / 15", True), ("2 * self.mu", False)]
+    "stated, agrees",
+    [
+        pytest.param("self.mu", True, marks=pytest.mark.slow),
+        ("self.mu + 4 * self.k / 15", True),
+        pytest.param("2 * self.mu", False, marks=pytest.mark.slow),
+    ],
 )
 def test_fibres_that_go_slack_have_a_stiffness_for_each_side(stated, agrees, tmp_path, monkeypatch):
     """W = k/2 max(I4 - 1, 0)^2: stretched fibres add 4 k along themselves; at rest JAX takes a quarter of it."""

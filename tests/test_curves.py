@@ -280,6 +280,7 @@ def test_errors_hold_where_noise_grows_with_the_stress():
     assert exact[1] > 1.2 * equal[1]  # what an equal noise would give
 
 
+@pytest.mark.slow
 def test_errors_of_a_law_contain_uneven_noise():
     """Fung and Demiray's law with 5 % of each stress as noise: 36 and 32 % of the 95 % intervals held."""
     stretch, rng = np.linspace(1.02, 1.5, 15), np.random.default_rng(1)

@@ -61,7 +61,7 @@ def test_given_deviations_change_the_weights_not_the_answer():
 
 
 @pytest.mark.parametrize("draws", [12, pytest.param(24, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_noise_in_percent_does_not_make_moduli_too_small(given, draws):
     """Weighed by the measured moduli, points that are low by chance count most: G0 came out 2 % low of 10 % noise."""
     omega, found = np.geomspace(0.1, 100, 100), []
@@ -237,7 +237,7 @@ def test_a_number_of_modes_that_breaks_down_leaves_the_others(monkeypatch):
         viscoelastic.choose_modes(s, generalised_maxwell.spectrum(s))
 
 
-@pytest.mark.parametrize("modes", [2, 25])
+@pytest.mark.parametrize("modes", [pytest.param(2, marks=pytest.mark.slow), 25])
 def test_the_picture_holds_its_table_and_its_legends_cover_nothing(modes):
     s = melt()
     u = generalised_maxwell.starts(s, modes, generalised_maxwell.spectrum(s), count=2)[0]

@@ -75,6 +75,7 @@ def test_a_plane_shear_wave_and_its_order(verified):
     )
 
 
+@pytest.mark.slow
 def test_lumped_masses_cost_quadratic_elements_their_order():
     assert 1.8 < np.log2(off(20, 2, "lumped") / off(40, 2, "lumped")) < 2.2
 

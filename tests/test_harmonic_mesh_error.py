@@ -75,7 +75,7 @@ def off(wave, elements):
 
 @pytest.mark.parametrize(
     "wave",
-    [plane, pytest.param(torsional, marks=pytest.mark.slow), pytest.param(about_a_sphere, marks=pytest.mark.slow)],
+    [pytest.param(w, marks=pytest.mark.slow) for w in (plane, torsional, about_a_sphere)],
 )
 def test_ten_quadratic_elements_a_wave(wave, verified):
     """They leave a few thousandths of the motion, by h^3; the estimate says how much, and where."""

@@ -33,7 +33,7 @@ def test_springpots_by_element_are_factors():
     assert np.abs(np.asarray(whole.displacement[:, :, 0]) - standing(z, MU * m)).max() < 0.02 * 2e-4
 
 
-@pytest.mark.parametrize("part", ["all", "isochoric"])
+@pytest.mark.parametrize("part", [pytest.param("all", marks=pytest.mark.slow), "isochoric"])
 def test_springpots_about_a_stretched_state(part):
     """Spring, springpot and limit beside each other in the stretched slab: all numbers by mpmath from the energy."""
     mpmath = pytest.importorskip("mpmath")

@@ -178,6 +178,7 @@ def test_exact_data_are_moved_by_no_end():
     assert not edges.moved(f) and not any("half decade" in w or "structured" in w for w in f.warnings)
 
 
+@pytest.mark.slow
 def test_noise_alone_is_not_told_to_be_an_end_and_a_wrong_model_is():
     right = [honest_modes(two_modes(0.02, seed=k), 2) for k in range(12)]
     told = [any("half decade moves" in w for w in f.warnings) for f in right]
@@ -337,7 +338,7 @@ def test_data_that_contradict_themselves_are_told_and_sound_ones_are_not():
     assert [bool(far) for far in told] == [False, True, True]
 
 
-@pytest.mark.parametrize("noises", [(0.01, 0.05), (0.05, 0.01)])
+@pytest.mark.parametrize("noises", [(0.01, 0.05), pytest.param((0.05, 0.01), marks=pytest.mark.slow)])
 def test_storage_and_loss_have_noise_of_their_own(noises):
     """One relative noise for both made errors of G0 2.7 times too large and those of the ratio too small."""
     hertz = np.logspace(-1, 1.2, 24)

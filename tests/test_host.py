@@ -73,7 +73,7 @@ def test_the_closed_form_compiles_nothing(tmp_path, model):
     assert len(COMPILED) > before  # it does count
 
 
-@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+@pytest.mark.parametrize("kind", ["relaxation", pytest.param("creep", marks=pytest.mark.slow)])
 def test_every_model_of_a_test_in_time_compiles_nothing(tmp_path, kind):
     """Springpots and spectra too: for each of them a program took ten seconds."""
     time, file, before = np.geomspace(0.1, 100, 12), tmp_path / "test.csv", len(COMPILED)

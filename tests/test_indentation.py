@@ -65,7 +65,7 @@ def _shared(rng: np.random.Generator, n: int, part: float = 0.7) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("kind", ["shared", "larger with the force"])
+@pytest.mark.parametrize("kind", ["shared", pytest.param("larger with the force", marks=pytest.mark.slow)])
 def test_intervals_hold_with_noise_that_is_not_independent_or_equal(kind):
     """Errors of equal, independent noise held 57 and 84 % of the 95 % intervals of the modulus."""
     depth = np.linspace(0.0, 7e-4, 160)

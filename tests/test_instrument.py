@@ -75,6 +75,7 @@ def test_a_misfit_that_poses_as_inertia_is_not_corrected():
 FRICTION = 0.4 * OMEGA  # [Pa] by one standard deviation: 40 Pa at the end, half of the loss modulus
 
 
+@pytest.mark.slow
 def test_friction_and_inertia_are_found_together():
     """Both within their errors, which are those of least squares with the priors as rows."""
     z = []
@@ -113,7 +114,7 @@ def test_the_error_of_friction_is_that_of_scipy():
     assert "the instrument's friction is 1" in better.notes[-1] and "larger than what it subtracted" in better.notes[-1]
 
 
-@pytest.mark.parametrize("size", [2.0, 40.0])
+@pytest.mark.parametrize("size", [pytest.param(2.0, marks=pytest.mark.slow), 40.0])
 def test_a_friction_above_the_loss_modulus_is_found(size):
     """The first linear step is far too long; and the noise is that of all that was measured, 0.4 % of it."""
     z = []

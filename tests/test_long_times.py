@@ -126,6 +126,7 @@ def test_the_share_of_long_times_is_in_the_total_error(tmp_path, capsys):
     assert abs(rest - REST) < 2 * total and content[INTERVAL][0] <= REST
 
 
+@pytest.mark.slow
 def test_a_fluid_that_has_relaxed_is_not_told_to_be_a_solid(tmp_path, capsys):
     """No modulus is left at the end of the record: 0 to 30 % of G0 was said of it once, from a start never fitted."""
     time, rng = np.logspace(-2, 2.5, 90), np.random.default_rng(0)

@@ -38,6 +38,7 @@ def test_one_step_of_newton_is_the_chapters_scheme():
     assert np.array_equal(counted.positions, one.positions)
 
 
+@pytest.mark.slow
 def test_one_step_of_newton_says_when_its_residual_is_above_the_tolerance():
     scene = hanging(steps=1, newton="one_step")
     large = lj.simulate(scene)

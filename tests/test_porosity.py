@@ -72,7 +72,6 @@ def _terzaghi(steps: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.core
 def test_consolidation_in_few_steps():
     """The series has the error of the steps. That of layers is left: 0.0105, 0.0075 and 0.0043 with 6, 12 and 24.
 

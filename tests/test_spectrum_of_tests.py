@@ -39,7 +39,7 @@ def sweep_of(noise: float = 0.01, scale: float = 1.0, seed: int = 1) -> Sweep:
     return Sweep(omega, G.real * factor[0], G.imag * factor[1])
 
 
-@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+@pytest.mark.parametrize("kind", [pytest.param("relaxation", marks=pytest.mark.slow), "creep"])
 def test_the_spectrum_of_a_test_in_time_has_the_moduli_of_the_material(kind):
     found = spectrum_of_tests.spectrum_in_time(in_time(kind), NEAR)
     assert found.converged and found.relative_errors.mean() < 0.005

@@ -367,6 +367,7 @@ def test_unusable_tables_are_refused(files, table, sentence):
         sweep.read_sweep(files / "scene.toml", files / "rows.csv")
 
 
+@pytest.mark.slow
 def test_writes_that_fail_keep_what_was_computed(processor, files):
     """A limit on the size of files, where a full disk would be: the same failing write."""
     table = sweep.read_sweep(files / "scene.toml", files / "rows.csv", chunk=2)

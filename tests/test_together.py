@@ -108,6 +108,7 @@ def wide_and_long(factor: float, seed: int) -> list[Sweep | TimeTest]:
     return [Sweep(omega, storage, loss, source="sweep.csv"), test._replace(answer=noisy)]
 
 
+@pytest.mark.slow
 def test_total_errors_contain_the_sizes_of_the_samples():
     """Each test has a factor of its own: errors of noise held G0 in 3 of 10 such fits, and the second ratio in 7."""
     hits, by_noise = [], []
