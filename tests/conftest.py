@@ -55,6 +55,8 @@ QUICK = {
         "names",
         "raw_torque",
         "rheometer",
+        "rheometer_notes",
+        "rheometer_tables",
         "stretches",
     )
 }

@@ -87,61 +87,6 @@ def test_places_in_a_mesh():
     assert np.all(outside[inside] < 1e-9) and np.all(outside[~inside] > 0)
 
 
-_BAD = {
-    "x,y,z,ux,uy\n0,0,0,1,1": "no column uz",
-    "ux,uy,uz\n0,0,0": "either a column node or columns x,y,z",
-    "node,ux,uy,uz\n900,0,0,0": "node 900 is not in the mesh",
-    "node,ux,uy,uz\n1.5,0,0,0": "node 1.5 is not in the mesh",
-    "x,y,z,ux,uy,uz\n60,40,40,0,0,0": "is --unit right",
-    "x,y,z,ux,uy,uz\n,0,0,0,0,0": "place x,y,z is not finite",
-    "node,ux,uy,uz\n1,,,": "no displacement is measured",
-    "node,ux,uy,uz\n1,inf,0,0": "row 1 is infinite",
-    "\ufeffnode,ux,uy,uz\n2,-inf,0,0": "row 1 is infinite",
-    "node,ux,uy,uz\n1,0,-999,0": "row 1: uy = -999 m in a body of 0.0",
-    "x,y,z,ux,uy,uz" + "\n0.071,0.02,0.02,0,0,0" * 4: "4 of 4 points lie outside of the mesh",
-    "node,ux,uy,uz,sd\n1,0,0,0,0": "sd must be positive",
-    "node,ux,uy,uz,time\n1,0,0,0,1": "has no dt",
-    "node,ux,uy,uz,kind\n1,0,0,0,1": "column 'kind' is not known",
-    "node,ux,uy,uz\n5,1e-3,0,O.001\n6,1e-3,,0": "row 1: uz = 'O.001' is no number: correct it, or leave it empty",
-    "node,ux,uy,uz\n# points\n5,1e-3,,0\n\n6,0.001mm,0,0": "row 2: ux = '0.001mm' is no number",
-    "node,ux,uy,uz\n5,1e-3,,0\n6,1e-3,0,0\n5,1e-3,,0\n6,1e-3,0,0": "row 3 repeats row 1 (2 of 4 rows are copies)",
-    "": "is empty: export it again",
-    "node;ux;uy;uz\n5;1e-3;0;0;7": "row 1 has 5 cells under 4 headings",
-}
-
-
-@pytest.mark.parametrize("content", _BAD)
-def test_bad_displacements_are_one_sentence(tmp_path, content, capsys):
-    _scene(tmp_path)
-    (tmp_path / "u.csv").write_text(content)
-    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "1e-4"]
-    assert main([*command, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err.strip()
-    assert _BAD[content] in error and "\n" not in error, error
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        (["--noise", "0"], "--noise 0 must be above 0"),
-        ([], "no column sd"),
-        (["--noise", "1e-4", "--name", "law.nu"], "not a number of the scene"),
-        (["--noise", "1e-4", "--parameters", "law.mu,law.x"], "not a number of the scene"),
-        (["--noise", "1e-4", "--name", "body.gravity"], "needs one number"),
-        (["--noise", "1e-4", "--unit", "mile"], "--unit 'mile' is not known"),
-        (["--noise", "1e-4", "--length", "-1"], "--length -1 must be above 0"),
-    ],
-)
-def test_bad_options_are_one_sentence(tmp_path, more, words, capsys):
-    scene = _scene(tmp_path)
-    file = tmp_path / "u.csv"
-    np.savetxt(file, [[1, 0, 0, 0]], delimiter=",", header="node,ux,uy,uz", comments="")
-    assert scene.mesh.number_of_nodes == len(SURFACE)
-    assert main(["field", str(tmp_path / "scene.toml"), str(file), *more, "--out", str(tmp_path / "o")]) == 2
-    assert words in capsys.readouterr().err
-    assert main(["field", str(tmp_path / "scene.toml"), "--noise", "1"]) == 2
-
-
 def test_the_prior_has_the_covariance_it_states():
     """sd^2 exp(-r / length) in the middle of a body that is large beside the length, and a true transpose."""
     mesh = lj.shapes.box((0.2, 0.2, 0.2), (10, 10, 10))
@@ -442,22 +387,6 @@ def test_few_numbers_of_several_scenes(problem):
     assert found.standard_errors[0] < 20
 
 
-@pytest.mark.parametrize(
-    "written",
-    [
-        "node;UX;UY;UZ\n5;0,001;;-2e-4\n6;0;0,25;1\n",
-        "# node,ux,uy,uz\n5,1e-3,,-2e-4\n# no more points\n6,0,0.25,1\n",
-        "node\tux\tuy\tuz\n5\t1e-3\tnan\t-2e-4\n6\t0\t0.25\t1\n",
-    ],
-    ids=["spreadsheet", "savetxt", "tabs"],
-)
-def test_tables_of_displacements_of_other_programs(tmp_path, written):
-    (tmp_path / "u.csv").write_text(written)
-    found = displacements.read_displacements(tmp_path / "u.csv", _scene(tmp_path), 1e-4, "mm")
-    assert found.nodes[:, 0].tolist() == [5, 6] and found.components == 5
-    assert np.allclose(found.measured, 1e-3 * np.array([[1e-3, 0, -2e-4], [0, 0.25, 1]]), rtol=1e-14)
-
-
 def test_chance_in_the_residuals_of_a_map_is_no_warning():
     """Of 240 components chi2 is 1 +- 0.09 each."""
     for chi2, told in ((1.01, False), (1.25, False), (1.3, True)):
@@ -479,33 +408,6 @@ def test_a_fit_that_misses_the_data_says_so():
     assert said is not None and "the mesh's error in the data is 3 times the noise: refine the mesh" in said
     said = field_report.misfit_sentence(found._replace(chi2=240.0, standard_errors=np.array([np.inf])))
     assert said is not None and said.startswith("no values of law.mu explain the displacements")
-
-
-def test_places_in_another_unit_than_the_displacements_are_refused(tmp_path):
-    scene = _scene(tmp_path, mu=1000.0)
-    points = np.asarray(scene.mesh.points)
-    rows = np.column_stack([points, 1e3 * 1e-3 * points])  # the displacements alone in mm
-    np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header="x,y,z,ux,uy,uz", comments="")
-    with pytest.raises(lj.InputError, match=r"all points lie within .* --unit mm is for x, y, z and ux"):
-        displacements.read_displacements(tmp_path / "u.csv", scene, 1e-5, "mm")
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the mesh moves")
-@pytest.mark.filterwarnings("ignore:residuals of points")
-def test_displacements_in_another_unit_are_told(tmp_path, capsys):
-    """Ten times too large: a modulus of a tenth, with a small error. The misfit tells."""
-    scene = _scene(tmp_path, mu=1000.0)
-    _write(tmp_path / "u.csv", scene, 5e-5)
-    rows = np.loadtxt(tmp_path / "u.csv", delimiter=",", skiprows=1)
-    head = (tmp_path / "u.csv").read_text().splitlines()[0]
-    rows[:, [head.split(",").index(name) for name in ("ux", "uy", "uz")]] *= 10
-    np.savetxt(tmp_path / "u.csv", rows, delimiter=",", header=head, comments="")
-    command = ["field", str(tmp_path / "scene.toml"), str(tmp_path / "u.csv"), "--noise", "5e-5"]
-    main([*command, "--parameters", "law.mu", "--out", str(tmp_path / "out")])
-    assert "per component, so the fit misses the displacements" in capsys.readouterr().err
-    found = json.loads((tmp_path / "out" / "field.json").read_text())
-    assert found["chi2_per_component"] > 1.5 and "look at the unit" in found["warnings"][0]
 
 
 @pytest.mark.slow

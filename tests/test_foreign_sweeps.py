@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from conftest import ROOT
-from test_rheometer import _workbook
+from test_rheometer_tables import _workbook
 
 from fitting.__main__ import main
 from fitting.readers.rheometer import read_sweep

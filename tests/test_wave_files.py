@@ -7,7 +7,8 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from test_waves import HERTZ, H, plane_waves, written
+from test_wave_commands import written
+from test_waves import HERTZ, H, plane_waves
 
 from fitting.waves import wave_field
 from liverjax.core.errors import InputError

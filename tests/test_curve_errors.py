@@ -1,0 +1,142 @@
+"""Errors of laws fitted to curves: uneven noise, factors of tests, what the data do not tell."""
+
+import numpy as np
+import pytest
+from test_curves import KNOWN, synthetic
+
+import liverjax as lj
+from fitting.fits import stress_stretch
+from fitting.methods.noise.uneven_noise import growing_root, uneven_root
+from fitting.readers import curves
+from liverjax.laws import homogeneous
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+@pytest.mark.slow
+def test_standard_errors_are_the_scatter_of_repeated_fits():
+    law = lj.laws.FungDemiray(c1=500.0, c2=2.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    fits = [stress_stretch.fit(candidate, synthetic(law, 0.03, seed), starts=4) for seed in range(20)]
+    values = np.stack([f.values for f in fits])
+    stated = np.mean([f.standard_errors for f in fits], axis=0)
+    # A standard deviation from 20 draws is known to 1/sqrt(38) = 16 %: three of these.
+    assert np.allclose(values.std(axis=0, ddof=1), stated, rtol=0.49)
+    assert np.all(np.abs(values.mean(axis=0) - [500.0, 2.0]) < 3.5 * stated / np.sqrt(20))
+
+
+def test_errors_hold_where_noise_grows_with_the_stress():
+    """Least squares with y = a x + b x^2 and noise in proportion to y: b has 1.2 times the error of equal noise."""
+    x, rng, true = np.linspace(0.05, 1.0, 25), np.random.default_rng(0), np.array([1.0, 20.0])
+    J = np.stack([x, x**2], axis=1)
+    sd = 0.05 * (J @ true)
+    exact = np.sqrt(np.diag(np.linalg.pinv(J) @ np.diag(sd**2) @ np.linalg.pinv(J).T))
+    errors, held = [], []
+    for _ in range(400):
+        y = J @ true + sd * rng.standard_normal(25)
+        p = np.linalg.pinv(J) @ y
+        errors.append(np.linalg.norm(uneven_root(J, y - J @ p, np.eye(2)), axis=1))
+        held.append(np.abs(p - true) < 2.07 * errors[-1])
+    # HC3 is larger than the exact error by the leverage of few points: here a tenth.
+    assert np.all(np.sqrt(np.mean(np.square(errors), axis=0)) / exact < 1.25)
+    assert np.all(np.mean(held, axis=0) > 0.91)
+    equal = np.sqrt(np.mean(sd**2) * np.diag(np.linalg.inv(J.T @ J)))
+    assert exact[1] > 1.2 * equal[1]  # what an equal noise would give
+
+
+@pytest.mark.slow
+def test_errors_of_a_law_contain_uneven_noise():
+    """Fung and Demiray's law with 5 % of each stress as noise: 36 and 32 % of the 95 % intervals held."""
+    stretch, rng = np.linspace(1.02, 1.5, 15), np.random.default_rng(1)
+    law = lj.laws.FungDemiray(c1=500.0, c2=10.0, bulk=None)
+    exact = np.asarray(homogeneous.response(law, "uniaxial", stretch))
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    F = np.asarray(homogeneous.deformation_gradient("uniaxial", stretch, stretch))
+    z = []
+    for _ in range(6):
+        noisy = exact * (1 + 0.05 * rng.standard_normal(15))
+        found = stress_stretch.fit(candidate, [curves.Curve("a", "uniaxial", F, (0, 0), noisy, 0)])
+        z.append((found.values - [500.0, 10.0]) / found.standard_errors)
+    assert np.sqrt(np.mean(np.square(z))) < 2.0, z
+
+
+def test_factors_of_two_tests_are_in_the_errors_or_told():
+    """Mooney's law in tension and equibiaxial tension, a factor of 10 % on each test, 2 % of noise: errors of the noise
+    alone held 45 % of the intervals, and nothing was said.
+    """
+    stretch, rng, true = np.linspace(1.02, 1.4, 12), np.random.default_rng(3), np.array([300.0, 200.0])
+    law = lj.laws.MooneyRivlin(c10=300.0, c01=200.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("mooney_rivlin")
+    missed, shown = [], 0
+    for _ in range(6):
+        two = []
+        for test in ("uniaxial", "equibiaxial"):
+            exact = np.asarray(homogeneous.response(law, test, stretch)) * (1 + 0.1 * rng.standard_normal())
+            noisy = exact + 0.02 * np.abs(exact).mean() * rng.standard_normal(12)
+            F = np.asarray(homogeneous.deformation_gradient(test, stretch, stretch))
+            two.append(curves.Curve(test, test, F, (0, 0), noisy, 0))
+        found = stress_stretch.fit(candidate, two)
+        held = np.abs(found.values - true) < 2.07 * found.standard_errors
+        told = any("a factor of its own" in sentence for sentence in found.warnings)
+        missed.append((not held.all(), not held.all() and not told))
+        shown += any("each test seems to have a factor" in sentence for sentence in found.warnings)
+    assert np.sum(missed, axis=0)[0] <= 3 and np.sum(missed, axis=0)[1] == 0 and shown, missed
+
+
+@pytest.mark.slow
+def test_numbers_of_the_other_sign_that_shear_cannot_tell_apart_are_told():
+    """Ogden's law with alpha = 6: in simple shear alpha = -6 is the same, in tension 0.3 times the stress."""
+    law = lj.laws.Ogden(mu=(333.3,), alpha=(6.0,), bulk=None)
+    (shear,) = (c for c in synthetic(law, 0.02, 0) if c.label.startswith("simple"))
+    (candidate,) = stress_stretch.candidates("ogden", terms=1)
+    told = [s for s in stress_stretch.fit(candidate, [shear], 32).warnings if s.startswith("other numbers follow")]
+    assert len(told) == 1 and "add a test of tension or compression" in told[0]
+    every = stress_stretch.fit(candidate, synthetic(law, 0.02, 0), 32).warnings
+    assert not [s for s in every if s.startswith("other numbers follow")]
+
+
+def test_a_parameter_without_data_is_told():
+    law = lj.laws.NeoHookean(mu=770.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("fung_demiray")
+    small = [c for c in synthetic(law, 0.02) if c.test == "simple_shear"]
+    assert any("leave c2 free" in w for w in stress_stretch.fit(candidate, small).warnings)
+
+
+def test_errors_hold_at_a_point_through_which_the_law_goes():
+    """A law that stiffens: the last point has a leverage near 1, so its residual does not show its noise."""
+    x, rng, true = np.linspace(0.1, 1.0, 10), np.random.default_rng(0), np.array([1.0, 1.0])
+    J = np.stack([x, x * np.exp(16 * (x - 0.5))], axis=1)
+    size, held, alone = J @ true, [], []
+    for _ in range(200):
+        y = size * (1 + 0.05 * rng.standard_normal(10))
+        p = np.linalg.pinv(J) @ y
+        roots = [of(J, J @ p - y, *more, np.eye(2)) for of, more in ((uneven_root, ()), (growing_root, (J @ p,)))]
+        errors = [np.linalg.norm(root, axis=1) for root in roots]
+        held.append(np.abs(p - true) < 2.31 * np.maximum(*errors))
+        alone.append(np.abs(p - true) < 2.31 * errors[0])
+    # 200 draws: the binomial spread is 0.016 at 95 %.
+    assert np.all(np.mean(held, axis=0) > 0.9) and np.mean(alone, axis=0)[1] < 0.8, (
+        np.mean(held, 0),
+        np.mean(alone, 0),
+    )
+    even = [growing_root(J, J @ (np.linalg.pinv(J) @ e) - e, size, np.eye(2)) for e in rng.standard_normal((100, 10))]
+    assert np.mean([np.any(root) for root in even]) < 0.3  # equal noise is seen as such
+
+
+def test_as_many_parameters_as_points_is_told():
+    curve = synthetic(KNOWN["yeoh"], 0.05)[0]
+    three = curve._replace(F=curve.F[[0, 13, 26]], stress=curve.stress[[0, 13, 26]])
+    (candidate,) = stress_stretch.candidates("yeoh")
+    found = stress_stretch.fit(candidate, [three])
+    assert np.isnan(found.standard_errors).all() and any("as many parameters" in w for w in found.warnings)
+
+
+def test_laws_that_tie_are_named_with_their_moduli():
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    best = stress_stretch.fit(candidate, synthetic(KNOWN["neo_hookean"], 0.01))
+    other, far = (
+        best._replace(aicc=best.aicc + d, label=n, shear_modulus=m) for d, n, m in ((2, "b", 900.0), (9, "c", 5.0))
+    )
+    (told,) = stress_stretch.tied_laws([best, other, far], "curves")
+    assert told.startswith("b follow the curves as well as neo_hookean does") and "with G0 from 7" in told
+    assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")

@@ -1,0 +1,151 @@
+"""Scenes of harmonic motion from files: what they may have, and refusals in one sentence."""
+
+import json
+
+import h5py
+import jax
+import jax.numpy as jnp
+import meshio
+import numpy as np
+import pytest
+from test_harmonic import FILE, slab
+
+import liverjax as lj
+from liverjax.__main__ import main
+from liverjax.core.struct import replace
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def test_scene_files(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE + "frequencies = [40.0, 60.0]\n")
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["simulate", str(scene), *out, "--vtu", "--mesh-error"]) == 0
+    assert "60 Hz: at most" in capsys.readouterr().out
+    expected = lj.harmonic(lj.load_scene(scene))
+    with h5py.File(tmp_path / "out" / "result.h5") as file:
+        assert np.array_equal(file["displacement"][()], expected.displacement)
+        assert file["mesh_error/displacement"].shape == expected.displacement.shape
+        assert file["mesh_error/reactions"].shape == expected.reactions.shape
+    shown = meshio.read(tmp_path / "out" / "vtu" / "frequency_002.vtu").point_data["displacement_imaginary"]
+    assert np.array_equal(shown, np.asarray(expected.displacement[1]).imag)
+    # About the last state of a run in time: there it is pulled by 10 %.
+    still = FILE.split("[[displaced]]")[0]
+    pulled = "[[fixed]]\nwhere = {x_max = 0.0}\n[[displaced]]\nwhere = {x_min = 0.03}\nby = [0.003, 0.0, 0.0]\n"
+    (tmp_path / "still.toml").write_text(still + pulled)
+    assert main(["simulate", str(tmp_path / "still.toml"), "--out", str(tmp_path / "still")]) == 0
+    assert main(["simulate", str(scene), *out, "--about", str(tmp_path / "still" / "result.h5")]) == 0
+    assert "relaxed body" not in capsys.readouterr().out
+    with h5py.File(tmp_path / "out" / "result.h5") as file, h5py.File(tmp_path / "still" / "result.h5") as state:
+        about = lj.harmonic(lj.load_scene(scene), about=state["positions"][-1])
+        assert np.array_equal(file["displacement"][()], about.displacement)
+    assert np.abs(about.displacement - expected.displacement).max() > 1e-7
+    with h5py.File(tmp_path / "still" / "result.h5", "a") as file:
+        file.attrs["status"] = [1]
+    assert main(["simulate", str(scene), *out, "--about", str(tmp_path / "still" / "result.h5")]) == 2
+    assert "its last step is" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "told"), [(0.1, True), (1e4, False)])
+def test_a_run_that_has_not_rested_is_told(tmp_path, capsys, seconds, told):
+    """Four fifths of its stiffness relax in 100 s: after 0.1 s the forces are five times those at rest."""
+    viscous = FILE.split("[[displaced]]")[0] + "[viscosity]\nratios = [0.8]\nrelaxation_times = [100.0]\n"
+    pulled = "[[fixed]]\nwhere = {x_max = 0.0}\n[[displaced]]\nwhere = {x_min = 0.03}\nby = [0.003, 0.0, 0.0]\n"
+    (tmp_path / "pull.toml").write_text(f"{viscous}{pulled}history = [[0, 0], [0.1, 1]]\n[solve]\ndt = {seconds}\n")
+    (tmp_path / "waves.toml").write_text(
+        viscous + "[[displaced]]\nwhere = {x_max = 0.0}\nby = [0.0, 1e-5, 0.0]\n"
+        '[solve]\nkind = "harmonic"\nfrequencies = [40.0]\n'
+    )
+    assert main(["simulate", str(tmp_path / "pull.toml"), "--out", str(tmp_path)]) == 0
+    about = ["--about", str(tmp_path / "result.h5"), "--out", str(tmp_path / "out")]
+    assert main(["simulate", str(tmp_path / "waves.toml"), *about]) == 0
+    assert ("the relaxed body has other forces in the state of --about" in capsys.readouterr().out) == told
+    with h5py.File(tmp_path / "out" / "result.h5") as file:
+        assert len(json.loads(file.attrs["warnings"])) == told
+
+
+HEAVY = FILE.replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]") + "frequencies = [40.0]\n"
+
+
+@pytest.mark.slow
+def test_a_scene_file_with_gravity_moves_about_its_state_of_rest(tmp_path):
+    (tmp_path / "scene.toml").write_text(HEAVY)
+    assert main(["simulate", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "out")]) == 0
+    still = FILE.split("[[displaced]]")[0].replace("density = 1000.0", "density = 1000.0\ngravity = [-3.0, 0.0, 0.0]")
+    still += "[[fixed]]\nwhere = {x_max = 0.0}\n"
+    (tmp_path / "still.toml").write_text(still)
+    rest = lj.simulate(lj.load_scene(tmp_path / "still.toml")).check().positions[-1]
+    expected = lj.harmonic(lj.load_scene(tmp_path / "scene.toml"), about=rest).displacement
+    with h5py.File(tmp_path / "out" / "result.h5") as file:
+        found = file["displacement"][()]
+    # Newton's tolerance of 1e-8; without the state the motion is another one.
+    assert np.allclose(found, expected, rtol=1e-5, atol=1e-10)
+    scene = lj.load_scene(tmp_path / "scene.toml")
+    bare = lj.harmonic(scene, about=scene.mesh.points).displacement
+    assert np.abs(bare - expected).max() > 1e-3 * np.abs(expected).max()
+    # In Python as from the command line.
+    assert np.allclose(lj.harmonic(scene).displacement, expected, rtol=1e-5, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_gravity_has_a_derivative_through_the_state_of_rest(tmp_path):
+    (tmp_path / "scene.toml").write_text(HEAVY)
+    scene = lj.load_scene(tmp_path / "scene.toml")
+    sharp = replace(scene, solve=replace(scene.solve, tolerance=1e-12))
+
+    @jax.jit
+    def moved(g):
+        body = replace(scene.body, gravity=g * jnp.array([-1.0, 0.0, 0.0]))
+        return jnp.sum(jnp.abs(lj.harmonic(replace(sharp, body=body)).displacement) ** 2)
+
+    slope, h = jax.grad(moved)(3.0), 1e-3
+    assert np.isclose(slope, (moved(3.0 + h) - moved(3.0 - h)) / (2 * h), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("[[support]]\nwhere = {x_max = 0.0}\nnormal = 1e3\nhistory = [[0, 0], [1, 1]]\n", "support.0.history is for"),
+        (
+            "[[obstacle]]\nshape = 'plane'\nposition = [0.05, 0, 0]\naxis = [-1, 0, 0]\nby = [-0.03, 0, 0]\n",
+            "obstacle.0.by is for runs in time",
+        ),
+        ("", "body.history is for runs in time"),
+    ],
+)
+def test_what_moves_in_time_is_no_harmonic_motion(tmp_path, capsys, part, words):
+    scene, text = tmp_path / "scene.toml", FILE + "frequencies = [60.0]\n"
+    heavy = "density = 1000.0\nhistory = [[0, 0, 0, -9.81], [1, 0, 0, -9.81]]"
+    scene.write_text(text + part if part else text.replace("density = 1000.0", heavy))
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "out")]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "more", "words"),
+    [
+        ("", [], "frequencies = [60.0] (Hz) go together"),
+        ("frequencies = 60.0\n", [], "must be a list"),
+        ("frequencies = []\n", [], "frequencies = [] holds no frequency"),
+        ('frequencies = [60.0]\nreduced = "model.h5"\n', [], "reduced is for runs in time"),
+        ("frequencies = [-60.0]\n", [], "frequencies"),
+        ("frequencies = [60.0]\n", ["--png"], "--png is for runs in time"),
+        ("frequencies = [60.0]\ndt = 0.01\n", [], "[solve] dt is for runs in time"),
+        ("frequencies = [60.0]\n", ["--about", "none.h5"], "holds no positions"),
+    ],
+)
+def test_bad_scene_files_are_refused(tmp_path, capsys, line, more, words):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(FILE + line)
+    assert main(["simulate", str(scene), "--out", str(tmp_path / "out"), *more]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_runs_in_time_refuse_a_harmonic_scene():
+    scene = slab(2, 1)
+    with pytest.raises(lj.InputError, match=r"call lj\.harmonic"):
+        lj.simulate(replace(scene, solve=lj.Solve(kind="harmonic", frequencies=jnp.array([60.0]))))
+    with pytest.raises(lj.InputError, match="needs frequencies_Hz"):
+        lj.harmonic(scene)

@@ -1,0 +1,96 @@
+"""The command that makes and uses a reduced model; refusals in one sentence."""
+
+import argparse
+import inspect
+
+import h5py
+import numpy as np
+import pytest
+
+import liverjax as lj
+from liverjax.__main__ import main
+from liverjax.commands import reduce
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+SCENE = """
+[mesh]
+shape = "box"
+size = [0.03, 0.01, 0.01]
+cells = [3, 1, 1]
+
+[law]
+name = "neo_hookean"
+mu = 800.0
+bulk = 3000.0
+
+[body]
+density = 1000.0
+gravity = [0.0, 0.0, -1.0]
+
+[[fixed]]
+where = {x_max = 0.0}
+
+[solve]
+"""
+
+
+def test_the_commands_make_and_use_a_model_and_turn_to_the_full_one(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "rows.csv").write_text("law.mu,body.gravity.2\n700,-1.2\n900,-0.8\n800,-0.4\n800,-1.0\n")
+    model = ["--out", str(tmp_path / "model.h5")]
+    assert main(["reduce", str(tmp_path / "scene.toml"), str(tmp_path / "rows.csv"), *model, "--modes", "3"]) == 0
+    assert "3 modes" in (said := capsys.readouterr().out) and "no correction: too few rows" in said
+    found = {}
+    for name, lines in (("full", ""), ("used", 'reduced = "model.h5"'), ("refused", REFUSED)):
+        (tmp_path / f"{name}.toml").write_text(SCENE + lines)
+        assert main(["simulate", str(tmp_path / f"{name}.toml"), "--out", str(tmp_path / name)]) == 0
+        said = capsys.readouterr().out
+        assert ("estimated error" in said) == (name != "full") and ("the full model runs" in said) == (
+            name == "refused"
+        )
+        with h5py.File(tmp_path / name / "result.h5") as file:
+            found[name] = file["positions"][()], file["reactions"][()].sum(axis=(0, 1))
+    assert np.array_equal(found["full"][0], found["refused"][0])
+    moved = np.abs(found["full"][0] - found["full"][0][0, :1]).max()
+    assert 0 < np.abs(found["used"][0] - found["full"][0]).max() < 0.01 * moved
+    # The weight hangs on the held nodes, whichever model: 3 g of tissue.
+    assert np.allclose(found["full"][1], [0, 0, 3e-3], rtol=0, atol=1e-9)
+    # A run that was stopped there is not thrown away by a reduced one.
+    (tmp_path / "used" / "result.h5.parts").mkdir()
+    assert main(["simulate", str(tmp_path / "used.toml"), "--out", str(tmp_path / "used")]) == 2
+    assert "holds an unfinished run" in capsys.readouterr().err and (tmp_path / "used" / "result.h5.parts").exists()
+
+
+def test_the_command_has_the_defaults_of_the_function():
+    parsers = argparse.ArgumentParser().add_subparsers()
+    reduce.add(parsers)
+    found = parsers.choices["reduce"].parse_args(["scene.toml", "rows.csv"])
+    defaults = inspect.signature(lj.reduce_scene).parameters
+    for option, argument in (("tolerance", "tolerance"), ("modes", "most_modes"), ("runs", "runs")):
+        assert getattr(found, option) == defaults[argument].default
+
+
+@pytest.mark.slow
+def test_one_row_makes_a_model_without_correction(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text("law.mu\n800\n")
+    arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path / "model.h5")]
+    assert main(["reduce", *arguments]) == 0
+    assert "1 modes" in (said := capsys.readouterr().out) and "no correction: too few rows" in said
+    assert lj.load_reduced(tmp_path / "model.h5").correction is None
+
+
+def test_a_model_is_not_written_over_a_folder(tmp_path, capsys):
+    """That is known before the runs."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "row.csv").write_text("law.mu\n800\n")
+    arguments = [str(tmp_path / "scene.toml"), str(tmp_path / "row.csv"), "--out", str(tmp_path)]
+    assert main(["reduce", *arguments]) == 2 and "is a folder: name a file" in capsys.readouterr().err
+
+
+REFUSED = """
+reduced = "model.h5"
+reduced_tolerance = 1e-9
+"""

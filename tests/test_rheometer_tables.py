@@ -1,0 +1,144 @@
+"""Exports of rheometers with several tables, workbooks and JSON."""
+
+import json
+
+import numpy as np
+import pytest
+from test_rheometer import HEADER, RHEOCOMPASS, ROWS, TRIOS, _write
+
+from fitting.readers.curves import read_curves
+from fitting.readers.rheometer import read_sweep
+from liverjax import InputError
+
+
+def _trios(temperatures, rows=ROWS):
+    """An export with one step a temperature, G' higher by the step's number."""
+    steps = ["[Parameters]\nTemperature limit\t620.000 [°C]"]
+    for k, t in enumerate(temperatures):
+        numbers = "\n".join(f"{f}\t{float(s) + k}\t{l}" for f, s, l in (r.split(",") for r in rows.split()))
+        title = f"[Step]\nStep name\tFrequency sweep ({t:.1f} °C)\nNumber of points\t3"
+        steps.append(f"{title}\nAngular frequency\tStorage modulus\tLoss modulus\nrad/s\tPa\tPa\n{numbers}")
+    return "\n".join(steps) + "\n"
+
+
+def test_a_file_of_many_tables_names_them_and_one_is_chosen(tmp_path):
+    path = _write(tmp_path, _trios((150, 20, -20)), "export.txt")
+    s = read_sweep(path)
+    (note,) = s.notes
+    assert s.storage[0] == 300 and "3 tables: 1 'Frequency sweep (150.0 °C)', 2 'Frequency sweep (20.0 °C)'" in note
+    assert "table 1 'Frequency sweep (150.0 °C)' is used, the first with most frequencies, 3" in note
+    assert "--table" in note
+    for wanted, place in (("2", 1), ("(20.0 °C)", 1), ("-20", 2), ("frequency sweep (-20.0 °c)", 2), ("150", 0)):
+        chosen = read_sweep(path, table=wanted)
+        assert chosen.storage[0] == 300 + place and f"table {place + 1} '" in chosen.notes[0]
+    for wanted, sentence in (("20.0", "in the names of 2 tables"), ("37 °C", "is no table"), ("4", "is no table")):
+        with pytest.raises(InputError, match=f"--table .*{sentence}.*2 'Frequency sweep"):
+            read_sweep(path, table=wanted)
+    assert read_sweep(_write(tmp_path, HEADER + ROWS), table="1").notes == ()
+
+
+def test_tables_are_named_as_every_instrument_does(tmp_path):
+    assert "1 'Amplitude sweep - 1', 2 'Frequency sweep - 2'" in read_sweep(_write(tmp_path, TRIOS)).notes[0]
+    two = RHEOCOMPASS + RHEOCOMPASS.replace("sweep 1", "sweep 2")
+    assert "1 'Frequency sweep 1', 2 'Frequency sweep 2'" in read_sweep(_write(tmp_path, two)).notes[0]
+    plain = "# liver\n" + HEADER + ROWS + "\n# kidney\n" + HEADER + ROWS
+    assert "1 'liver', 2 'kidney'" in read_sweep(_write(tmp_path, plain)).notes[0]
+
+
+TRIOS_JSON = {
+    "Schema": {"Url": "https://software.tainstruments.com/schemas/TRIOSJSONExportSchema"},
+    "Results": {
+        "Processed": {
+            "ResultsSteps": [{"Id": "a", "Name": "Amplitude - 1"}, {"Id": "b", "Name": "Frequency sweep - 2"}],
+            "ColumnHeaders": {
+                "Angular frequency_rad/s": {
+                    "DisplayName": "Angular frequency",
+                    "ValueType": "Number",
+                    "Unit": {"Name": "rad/s"},
+                },
+                "Status bits": {"DisplayName": "Status bits", "ValueType": "Text"},
+                "Storage modulus_MPa": {"DisplayName": "Storage modulus", "Unit": {"Name": "MPa"}},
+                "Loss modulus_MPa": {"DisplayName": "Loss modulus", "Unit": {"Name": "MPa"}},
+                "Results Step Id": {"DisplayName": "Results Step Id", "ValueType": "Uuid"},
+            },
+            "Rows": [
+                {
+                    "Angular frequency_rad/s": omega,
+                    "Status bits": "0x12",
+                    "Storage modulus_MPa": storage,
+                    "Loss modulus_MPa": 1e-5,
+                    "Results Step Id": step,
+                }
+                for step, omega, storage in (("a", 6.28, 4e-4), ("b", 1, 3e-4), ("b", 10, 4e-4), ("b", 100, 5e-4))
+            ],
+        }
+    },
+}
+
+
+def test_trios_json(tmp_path):
+    s = read_sweep(_write(tmp_path, json.dumps(TRIOS_JSON), "export.json"))
+    assert s.angular_frequency.tolist() == [1, 10, 100] and np.allclose(s.storage, [300, 400, 500])
+    assert "1 'Amplitude - 1', 2 'Frequency sweep - 2'" in s.notes[0]
+    older = TRIOS_JSON | {"Results": TRIOS_JSON["Results"]["Processed"]}
+    assert len(read_sweep(_write(tmp_path, json.dumps(older), "older.json")).storage) == 3
+    for text in ('{"Results": []}', '{"a": 1}', "{", '{"Results": {"ColumnHeaders": {}, "Rows": [1]}}'):
+        with pytest.raises(InputError, match="is JSON, but not the export of TRIOS"):
+            read_sweep(_write(tmp_path, text, "other.json"))
+
+
+def _workbook(path, sheets):
+    """A minimal .xlsx: the parts that ECMA-376 asks for, texts inline."""
+    import zipfile
+    from xml.sax.saxutils import escape
+
+    main, package = "http://schemas.openxmlformats.org/spreadsheetml/2006/main", "http://schemas.openxmlformats.org"
+    links = f"{package}/officeDocument/2006/relationships"
+
+    def cell(value):
+        if isinstance(value, str):
+            return f'<c t="inlineStr"><is><t>{escape(value)}</t></is></c>'
+        return f"<c><v>{value!r}</v></c>"
+
+    def listed(numbers, kind, target):
+        each = (f'<Relationship Id="r{k}" Type="{links}/{kind}" Target="{target.format(k)}"/>' for k in numbers)
+        return f'<Relationships xmlns="{package}/package/2006/relationships">{"".join(each)}</Relationships>'
+
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("_rels/.rels", listed([1], "officeDocument", "xl/workbook.xml"))
+        names = "".join(f'<sheet name="{n}" sheetId="{k}" r:id="r{k}"/>' for k, n in enumerate(sheets, 1))
+        book = f'<workbook xmlns="{main}" xmlns:r="{links}"><sheets>{names}</sheets></workbook>'
+        file.writestr("xl/workbook.xml", book)
+        file.writestr("xl/_rels/workbook.xml.rels", listed(range(1, len(sheets) + 1), "worksheet", "sheet{}.xml"))
+        for k, rows in enumerate(sheets.values(), 1):
+            data = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in rows)
+            file.writestr(f"xl/sheet{k}.xml", f'<worksheet xmlns="{main}"><sheetData>{data}</sheetData></worksheet>')
+    return path
+
+
+def test_a_workbook_is_read_sheet_by_sheet(tmp_path):
+    rows = [[0.1 * 10**k, 300.5 * (k + 1), 30.25 * (k + 1)] for k in range(4)]
+    head = [["Angular frequency", "Storage modulus", "Loss modulus"], ["rad/s", "kPa", "kPa"]]
+    details = [["Filename", "sample"], ["Operator", "a\tb"]]
+    path = _workbook(tmp_path / "t.xlsx", {"Details": details, "Sweep - 1": head + rows[:3], "Sweep - 2": head + rows})
+    found = read_sweep(path)
+    np.testing.assert_array_equal(found.storage, 1e3 * np.array(rows)[:, 1])
+    assert any("table 2 'Sweep - 2' is used" in note for note in found.notes)
+    assert read_sweep(path, table="Sweep - 1").loss.tolist() == [30250, 60500, 90750]
+
+
+def test_workbooks_that_cannot_be_read_are_one_sentence(tmp_path, monkeypatch):
+    import sys
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "new.xlsx", "w") as file:
+        file.writestr("xl/workbook.xml", "<workbook/>")
+    old = _write(tmp_path, bytes.fromhex("d0cf11e0a1b11ae1") + bytes(504), "old.xls")
+    for path in (tmp_path / "new.xlsx", old):
+        with pytest.raises(InputError, match=r"cannot be read .*export the sheet of the frequency sweep as CSV"):
+            read_sweep(path)
+        with pytest.raises(InputError, match=r"is a spreadsheet workbook.*export the sheet of curves as CSV"):
+            read_curves([path])
+    monkeypatch.setitem(sys.modules, "python_calamine", None)  # as where it is not installed
+    with pytest.raises(InputError, match=r"pip install '\.\[excel\]'"):
+        read_sweep(old)

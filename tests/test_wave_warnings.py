@@ -1,0 +1,164 @@
+"""What data of waves may be instead: wrong units, wrong signs, gaps, noise alone."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_waves import DENSITY, HERTZ, H, plane_waves
+
+from fitting.reports import waves_report
+from fitting.waves import (
+    elastography,
+    wave_field,
+)
+from fitting.waves.files import components
+from liverjax.core.errors import InputError
+
+pytestmark = pytest.mark.quick_to_compile
+
+
+def test_gaps_within_the_organ_are_told():
+    field = plane_waves((9, 9, 13))
+    assert not elastography.notes_on_gaps(field)
+    field.displacement[0, [2, 4, 6], [4, 6, 4], [4, 6, 8], 1] = np.nan
+    (note,) = elastography.notes_on_gaps(field)
+    left = len(np.asarray(elastography.body_of(field).linear.tetrahedra)) / 6 / (4 * 4 * 6)
+    assert f"3 voxels within the organ have no displacement or are not in the mask, and {100 * left:.2g} % of" in note
+
+
+def test_columns_of_the_table_stay_apart_where_nothing_fits():
+    own = {"phase_velocity_m_s": [7.8], "chi2_per_component": [2.67e11]}
+    own |= {key: [1.0] for key in ("storage_Pa", "loss_Pa", "error_storage_Pa", "error_loss_Pa")}
+    direct = {"whole": {"storage_Pa": [None], "loss_Pa": [None]}}
+    blank = {"regions": None, "springpots": None, "map": None, "frequencies_Hz": [60.0]}
+    assert waves_report.table({"whole": own, "direct_inversion": direct, **blank}).split()[-3:] == [
+        "7.8",
+        "2.7e+11",
+        "none",
+    ]
+
+
+def test_a_frequency_of_noise_alone_is_named_and_a_number_at_its_bound():
+    field = plane_waves((9, 9, 9))
+    size = float(np.sqrt(np.mean(np.abs(field.displacement[0]) ** 2) / 2))
+    assert not waves_report._of_no_motion(field._replace(noise=np.array([0.05 * size])), 0)
+    (said,) = waves_report._of_no_motion(field._replace(noise=np.array([0.98 * size])), 0)
+    assert "are hardly larger than their noise" in said and said.endswith("leave this frequency out")
+    own = {"numbers": {"exponent": 1.0, "springpot": 2.0}, "standard_errors": {"exponent": None, "springpot": 0.1}}
+    blank = {"regions": None, "map": None, "frequencies_Hz": [], "whole": {}, "direct_inversion": {"whole": {}}}
+    spring = {"whole": own | {"model": "springpot", "frequencies": 3, "mean_relative_error": 0.043}}
+    last = waves_report.table(blank | {"springpots": spring}).splitlines()[-1]
+    assert "4.3 % off on average: exponent = 1 (at its bound), springpot = 2 ± 0.1" in last
+
+
+def test_a_springpot_that_misses_the_moduli_is_told(tmp_path):
+    """Solids of three materials at three frequencies: no springpot rises and falls so."""
+    rows = ["frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa"]
+    rows += ["50,3200,600,17,17", "75,2500,1900,17,17", "100,3800,300,17,17"]
+    (tmp_path / "s.csv").write_text("\n".join(rows) + "\n")
+    _, told = waves_report._springpots({"whole": tmp_path / "s.csv"})
+    assert any("misses the moduli over the frequencies by" in w for w in told)
+
+
+@pytest.mark.parametrize("noise", [0.0, 4e-7])
+@pytest.mark.parametrize(
+    ("order", "signs", "told"),
+    [
+        ((0, 2, 1), (1, 1, 1), "(x, z, y)"),
+        ((1, 2, 0), (1, 1, 1), "(z, x, y)"),
+        ((0, 1, 2), (-1, 1, 1), "-"),  # of x or of z: waves across y do not tell
+    ],
+)
+def test_components_that_do_not_follow_the_axes_are_told(noise, order, signs, told):
+    """Shear waves keep the volume; with exchanged components or a wrong sign they would not."""
+    field = plane_waves((9, 9, 9), noise=noise)
+    said = components.order_sentence(
+        field._replace(displacement=np.asarray(signs) * field.displacement[..., list(order)])
+    )
+    assert said is not None and told in said and "they change the volume much less" in said
+
+
+@pytest.mark.parametrize("noise", [0.0, 4e-7, 4e-6])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_components_that_follow_the_axes_are_never_accused(noise, sign):
+    """Noise changes the volume in every order alike; the sign of all together says nothing."""
+    field = plane_waves((9, 9, 9), noise=noise)
+    assert components.order_sentence(field._replace(displacement=sign * field.displacement)) is None
+
+
+@pytest.mark.parametrize(
+    ("moduli", "words"),
+    [
+        ([1338 + 400j, 6756 + 2000j], "to the power of 4"),  # fields of 3000 Pa, each with the other's frequency
+        ([6756 + 2000j, 1338 + 400j], "to the power of -4"),
+        ([3000 + 900j, 3300 + 990j], ""),
+        ([30 + 9j, 33 + 9j], "check the spacing"),
+        ([1e6 + 9e4j, 1.1e6 + 9e4j], "check the spacing"),
+    ],
+)
+def test_scales_that_no_tissue_has_are_told(moduli, words):
+    """The balance of forces has no scale: chi^2 is 1 with a wrong spacing, and with frequencies in another order."""
+    G = np.array(moduli)[:, None]
+    own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array([50.0, 75.0])), density=DENSITY)
+    found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
+    said = waves_report._of_scales(own, found)
+    assert len(said) == bool(words) and all(words in s for s in said)
+
+
+@pytest.mark.parametrize(("hertz", "told"), [([376.991, 565.487], True), ([60.0, 90.0], False), ([62.8, 94.2], False)])
+def test_frequencies_in_radians_are_told(hertz, told):
+    """A liver at 1.8 m/s becomes one at 11 m/s, which a stiff tissue may have, and its modulus 39 times as large."""
+    G = np.array([123e3 + 27e3j, 129e3 + 29e3j])[:, None]
+    own = SimpleNamespace(waves=SimpleNamespace(omega=2 * np.pi * np.array(hertz)), density=DENSITY)
+    found = SimpleNamespace(whole=SimpleNamespace(modulus=G, standard_errors=0.01 * np.abs(G) * (1 + 1j)))
+    said = waves_report._of_scales(own, found)
+    assert [s.startswith("the frequencies") and "if they are in rad/s" in s for s in said] == [True] * told
+
+
+def test_moduli_that_no_springpot_has_are_written_all_the_same(tmp_path):
+    """A loss that noise makes negative: of a nearly elastic phantom."""
+    file = tmp_path / "sweep_whole.csv"
+    file.write_text(
+        "frequency_Hz,storage_modulus_Pa,loss_modulus_Pa,storage_modulus_sd_Pa,loss_modulus_sd_Pa\n"
+        "40,3000,-30,24,22\n60,3000,4,9,8\n80,3000,1,5,4\n"
+    )
+    found, told = waves_report._springpots({"whole": file})
+    assert found == {} and len(told) == 1 and told[0].startswith("whole: no springpot is fitted over the frequencies")
+
+
+def test_a_field_that_holds_no_number_is_named(tmp_path):
+    field = plane_waves((6, 6, 6), noise=1e-7)
+    for part, words in ((slice(None), "its noise at 100 Hz cannot .* leave this field out"), (slice(0, 3), "")):
+        U = field.displacement.copy()
+        U[1, part] = np.nan
+        np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)
+        found = wave_field.read_waves(tmp_path / "w.npz")
+        if words:
+            with pytest.raises(InputError, match=words):
+                wave_field.with_noise(found, None)
+        else:
+            assert any("108 of 216 voxels are not measured at every frequency" in n for n in found.notes)
+
+
+def test_zeros_at_one_frequency_are_no_measurement(tmp_path):
+    """They were taken for motion: 2396 +- 35 for 3000."""
+    field = plane_waves((6, 6, 6), noise=1e-7)
+    U = field.displacement.copy()
+    U[1, :2] = 0.0
+    U[0, 4, 4, :, 2] = 0.0
+    np.savez(tmp_path / "w.npz", displacement=U, spacing=[H] * 3, frequencies=HERTZ)
+    found = wave_field.read_waves(tmp_path / "w.npz")
+    assert np.isnan(found.displacement[1, :2]).all() and np.isfinite(found.displacement[0, :2]).all()
+    assert any("72 voxels do not move in field 2, but in others" in n for n in found.notes)
+    assert any("field 1 has 6 components that are exactly 0" in n for n in found.notes)
+
+
+def test_zeros_around_the_organ_are_not_measured(tmp_path):
+    field = plane_waves((5, 6, 7), noise=1e-7)
+    U = np.zeros((2, 9, 9, 9, 3), complex)
+    U[:, 2:7, 1:7, 1:8] = field.displacement
+    U[0, 0, 0, 0, 0] = np.inf
+    np.savez(tmp_path / "zeros.npz", displacement=U, spacing=H, frequencies=HERTZ)
+    found = wave_field.read_waves(tmp_path / "zeros.npz")
+    assert found.mask.sum() == 5 * 6 * 7 and "do not move at all" in found.notes[0]
+    assert np.all(np.isfinite(found.displacement[:, found.mask]))
