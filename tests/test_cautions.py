@@ -8,6 +8,7 @@ import pytest
 
 import liverjax as lj
 from liverjax.__main__ import main
+from liverjax.core import status
 from liverjax.core.struct import replace
 from liverjax.simulation.cautions import cautions_of_run, cautions_of_waves, mesh_sentence
 from liverjax.simulation.mesh_error import MeshError
@@ -221,3 +222,5 @@ def test_a_body_whose_estimate_is_not_found_is_not_said_to_be_at_rest():
     assert "does not move" not in mesh_sentence(scene(BOX), result) and "not found" in mesh_sentence(scene(BOX), result)
     nothing = replace(error, positions=np.zeros((1, 8, 3)), found=np.array([True]))
     assert "the body does not move" in mesh_sentence(scene(BOX), replace(result, mesh_error=nothing))
+    failed = replace(result, status=np.array([status.NOT_FINITE]))
+    assert mesh_sentence(scene(BOX), failed).startswith("mesh error: the last step failed")

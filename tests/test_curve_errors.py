@@ -6,6 +6,7 @@ from test_curves import KNOWN, synthetic
 
 import liverjax as lj
 from fitting.fits import stress_stretch
+from fitting.fits.honesty.wrong_columns import structured_curves
 from fitting.methods.noise.uneven_noise import growing_root, uneven_root
 from fitting.readers import curves
 from liverjax.laws import homogeneous
@@ -140,3 +141,20 @@ def test_laws_that_tie_are_named_with_their_moduli():
     (told,) = stress_stretch.tied_laws([best, other, far], "curves")
     assert told.startswith("b follow the curves as well as neo_hookean does") and "with G0 from 7" in told
     assert "to 900 Pa" in told and not stress_stretch.tied_laws([best, far], "curves")
+
+
+def test_a_factor_of_a_test_is_no_misfit_of_the_law():
+    """A second sample 1.3 times as stiff: beside its factor, "the law misses something" was said too."""
+    rng, stretch = np.random.default_rng(5), np.linspace(1.02, 1.4, 25)
+    law = lj.laws.NeoHookean(mu=1000.0, bulk=None)
+    (candidate,) = stress_stretch.candidates("neo_hookean")
+    several = []
+    for k, factor in enumerate((1.0, 1.3, 0.95)):
+        exact = factor * np.asarray(homogeneous.response(law, "uniaxial", stretch))
+        F = np.asarray(homogeneous.deformation_gradient("uniaxial", stretch, stretch))
+        noisy = exact + 2.0 * rng.standard_normal(25)
+        several.append(curves.Curve(f"sample {k}", "uniaxial", F, (0, 0), noisy, 0))
+    found = stress_stretch.fit(candidate, several)
+    assert any(w.startswith(stress_stretch.OWN_FACTORS) for w in found.warnings)
+    assert not structured_curves(several, found)
+    assert structured_curves(several, found._replace(warnings=[]))

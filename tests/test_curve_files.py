@@ -252,3 +252,15 @@ def test_components_without_a_column_of_shear(tmp_path):
     np.savetxt(tmp_path / "b.csv", rows[:, [0, 1, 3]], delimiter=",", header="F11,F22,P11_Pa", comments="")
     with pytest.raises(InputError, match="has no column F33: give F11, F22 and F33"):
         curves.read_curves([tmp_path / "b.csv"])
+
+
+@pytest.mark.parametrize(
+    ("heading", "used"),
+    [("nominal_stress_sd_kPa", False), ("stress sd [kPa]", False), ("SD", False), ("sample", True), ("side_mm", True)],
+)
+def test_deviations_are_named_as_not_used(heading, used, tmp_path):
+    """The fit finds the noise from the residuals; a file with deviations gave the same numbers, without a word."""
+    rows = "".join(f"uniaxial,{l:g},{l - l**-2:g},0.02\n" for l in np.linspace(1.05, 1.5, 10))
+    (tmp_path / "c.csv").write_text(f"test,stretch,nominal_stress_kPa,{heading}\n{rows}")
+    found, notes = curves.read_curves([tmp_path / "c.csv"])
+    assert len(found) == 1 and [f"{heading} is not used" in note for note in notes] == [True] * (not used)

@@ -16,6 +16,20 @@ from liverjax.core.errors import InputError
 pytestmark = pytest.mark.quick_to_compile
 
 
+@pytest.mark.parametrize(
+    ("kind", "shape", "words"),
+    [
+        (np.float32, (6, 6, 6, 3, 2), "its numbers are real, and taken for labels: give the waves as complex numbers"),
+        (np.complex64, (6, 6, 6), r"displacement has shape \(6, 6, 6\): give complex numbers \(nx, ny, nz, 3\)"),
+    ],
+)
+def test_images_that_hold_no_waves_are_told_the_layout_of_images(kind, shape, words, tmp_path):
+    nibabel = pytest.importorskip("nibabel")
+    nibabel.save(nibabel.Nifti1Image(np.ones(shape, kind), np.diag([2.0, 2, 2, 1])), tmp_path / "w.nii")
+    with pytest.raises(InputError, match=words):
+        wave_field.read_waves(tmp_path / "w.nii", frequencies=[60.0])
+
+
 @pytest.mark.parametrize("ending", [".npz", ".h5", ".csv", ".nii", ".nii.gz"])
 def test_a_file_of_any_format_is_read_as_it_was_written(tmp_path, ending):
     field = plane_waves((5, 6, 7), noise=1e-7)

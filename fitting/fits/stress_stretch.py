@@ -181,6 +181,10 @@ def _of_other_minima(
     return of_other_minima(candidate.names, candidate.law, values, every, np.concatenate([c.F for c in curves]))
 
 
+#: Start of the sentence on factors of the tests.
+OWN_FACTORS = "each test seems to have a factor of its own"
+
+
 def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: int) -> list[str]:
     """Sentences on noise that n points of some tests share."""
     told = []
@@ -192,7 +196,7 @@ def _of_noise(alike: Alike | None, factors: FactorNoise | None, n: int, tests: i
         )
     if factors is not None and factors.shown:
         told.append(
-            f"each test seems to have a factor of its own, of {100 * factors.deviation:.2g} %, as by another sample or "
+            f"{OWN_FACTORS}, of {100 * factors.deviation:.2g} %, as by another sample or "
             f"a wrong size of it; the standard errors contain such factors of {tests} tests"
         )
     return told

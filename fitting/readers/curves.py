@@ -12,6 +12,8 @@ from fitting.readers.units import STRESS_UNITS
 from liverjax.core.errors import InputError
 from liverjax.laws import homogeneous
 
+#: Ends of headings of standard deviations.
+_SPREAD = re.compile(r"(?i)(^|[ _])(sd|std|stdev|se|sem|error|deviation)([ _]?[\[(].*|[ _][km]?Pa)?$")
 _INDICES = [f"{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 
 
@@ -58,6 +60,12 @@ def read_curves(files: list[Path], unit: str = "Pa") -> tuple[list[Curve], list[
         rows = _rows_of_curves(file)
         rows, left_out = _measured_rows(rows)
         notes += [f"{file.name}: rows without a stress are left out: {left_out}"] if left_out else []
+        spreads = [name for name in rows[0] if _SPREAD.search(name)]
+        if spreads:
+            notes.append(
+                f"{file.name}: {', '.join(spreads)} {'is' if len(spreads) == 1 else 'are'} not used: the noise is "
+                "found from the residuals"
+            )
         found, named = _components(file, rows, unit) if "F11" in rows[0] else _named_tests(file, rows, unit)
         curves += found
         if not named:

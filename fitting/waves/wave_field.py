@@ -174,18 +174,19 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
             raise InputError(f"{name}: real has shape {parts[0].shape} and imag {parts[1].shape}: give equal ones")
         U = parts[0] + 1j * parts[1]
     else:
-        known = ", ".join(sorted(key for key, value in found.items() if value is not None)) or "nothing"
+        if _is_image(name):
+            raise InputError(f"{name}: its numbers are real, and taken for labels: give the waves as {_layout(name)}")
+        known = ", ".join(sorted(k for k, v in found.items() if v is not None and k[0] != "(")) or "nothing"
         if "labels" in found and "displacement" not in found:
             known += " (real numbers are taken for labels)"
         raise InputError(
             f"{name}: it holds {known}: store the waves as displacement (complex), or real and imag, or phases"
         )
+    shape = U.shape
     if U.ndim == 4:
         U = U[None]
     if U.ndim != 5 or U.shape[-1] not in (1, 3):
-        raise InputError(
-            f"{name}: displacement has shape {U.shape}: give (F, nx, ny, nz, 3), frequencies first, components last"
-        )
+        raise InputError(f"{name}: displacement has shape {shape}: give {_layout(name)}")
     if not np.any(np.isfinite(U) & (U != 0)):
         raise InputError(f"{name}: displacement is zero or not a number everywhere: look at the file")
     if not np.iscomplexobj(U) or not np.any(np.isfinite(U) & (U.imag != 0)):
@@ -197,6 +198,17 @@ def _motion(name: str, found: Content) -> tuple[np.ndarray, list[str]]:
         return U, []
     blank = np.full(U.shape, np.nan + 0j)
     return np.concatenate([U, blank, blank], axis=-1), ["one component is measured: the other two are unknown"]
+
+
+def _is_image(name: str) -> bool:
+    return name.lower().endswith((".nii", ".nii.gz"))
+
+
+def _layout(name: str) -> str:
+    """How a file holds the waves."""
+    if _is_image(name):
+        return "complex numbers (nx, ny, nz, 3), with several frequencies (nx, ny, nz, F, 3)"
+    return "(F, nx, ny, nz, 3), frequencies first, components last"
 
 
 def _instants(name: str, field: str, values: Numbers) -> np.ndarray:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from liverjax.core import status
 from liverjax.core.compiled import compiled
 from liverjax.core.errors import InputError
 from liverjax.elements.gradients import volume_ratios
@@ -89,6 +90,8 @@ _SMALL = 0.02
 def mesh_sentence(scene: Scene, result: Result) -> str:
     """One line on the mesh error of the positions at the last step, with the remedy."""
     assert result.mesh_error is not None
+    if np.ravel(np.asarray(result.status))[-1] not in (status.CONVERGED, status.ONE_STEP):
+        return "mesh error: the last step failed, so that there is nothing of which to state it"
     u = np.asarray(result.positions[-1]) - np.asarray(scene.mesh.points)
     size = float(np.linalg.norm(u, axis=1).max())
     error = float(np.linalg.norm(np.asarray(result.mesh_error.positions[-1]), axis=1).max())

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from fitting.fits.stress_stretch import LawFit
+from fitting.fits.stress_stretch import OWN_FACTORS, LawFit
 from fitting.methods.kramers_kronig import CHANCE, runs_probability
 from fitting.readers.curves import Curve
 from liverjax.laws import Law, homogeneous
@@ -50,7 +50,9 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
         fit: the best fit.
         every: whether all laws were tried.
     """
-    misfit = [(c, (_model(fit.law, c) - c.stress) / c.scale) for c in curves]
+    # A factor of a test's own, which the fit has named already, is no error of the law.
+    named = any(sentence.startswith(OWN_FACTORS) for sentence in fit.warnings)
+    misfit = [(c, (_model(fit.law, c) * _nearest_factor(fit.law, c, named) - c.stress) / c.scale) for c in curves]
     runs = {c.label: runs_probability(np.sign(r)) for c, r in misfit}
     odd = [c for c, r in misfit if len(r) >= _FEWEST and np.abs(r).max() > _EXACT and runs[c.label][1] < CHANCE]
     if not odd:
@@ -70,6 +72,12 @@ def structured_curves(curves: list[Curve], fit: LawFit, every: bool = False) -> 
 def _model(law: Law, curve: Curve, F: np.ndarray | None = None) -> np.ndarray:
     P = np.asarray(_stress(law, jnp.asarray(curve.F if F is None else F)))
     return P[:, curve.component[0], curve.component[1]]
+
+
+def _nearest_factor(law: Law, curve: Curve, named: bool) -> float:
+    """The factor of a curve's stress that is nearest to the law; 1 if the curves have none."""
+    P = _model(law, curve) / curve.scale
+    return float(P @ (curve.stress / curve.scale) / (P @ P)) if named and P @ P > 0 else 1.0
 
 
 def _named_cause(curves: list[Curve], odd: list[Curve], fit: LawFit) -> str:
